@@ -1,0 +1,156 @@
+"""Where kernels run: the devices of this machine, and a backend for each.
+
+Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (platform and device number),
+``"opencl:<part of a device's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import re
+import threading
+from dataclasses import dataclass
+from types import ModuleType
+
+from gpusense._checks import show
+from gpusense.backends.base import Backend, BackendInfo
+
+__all__ = ["Backend", "BackendInfo", "Device", "devices", "get_backend"]
+
+# Measured speed classes, best first, of (backend, kind): see bench/RESULTS.md. A GPU beats any processor here; of the
+# two ways to drive one, OpenCL starts launches sooner. Warp's processor device uses a single thread.
+SPEED_CLASSES = (("opencl", "gpu"), ("warp", "gpu"), ("opencl", "cpu"), ("warp", "cpu"), ("numpy", "cpu"))
+
+_INSTALL_OPENCL = "pip install pyopencl pocl-binary-distribution"
+_INSTALL_WARP = "pip install warp-lang"
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device that is here, or one that could be.
+
+    Attributes:
+        backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
+        name: The device's own name, or what is absent.
+        kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
+        available: Whether a model can run on it.
+        reason: Why not, with the command that mends it; empty where it is available.
+        selection: What to pass as ``backend=``; empty where it is absent.
+    """
+
+    backend: str
+    name: str
+    kind: str
+    available: bool
+    reason: str
+    selection: str
+
+
+def devices() -> list[Device]:
+    """Every device of this machine, and every backend that is absent with the reason and the remedy."""
+    found = [Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
+    for backend, install in (("opencl", _INSTALL_OPENCL), ("warp", _INSTALL_WARP)):
+        module, reason = _module(backend)
+        if module is None:
+            found.append(Device(backend, f"{backend} (absent)", "cpu", False, f"{reason}: {install}", ""))
+            continue
+        listed = module.list_devices()
+        for info, _ in listed:
+            simulated = backend == "opencl" and module.is_simulator(info.name)
+            kind = "simulator" if simulated else info.kind
+            found.append(Device(backend, info.name, kind, True, "", info.selection))
+        if not listed:
+            found.append(
+                Device(backend, f"{backend} (no device)", "cpu", False, f"no driver offers a device: {install}", "")
+            )
+        elif backend == "warp" and all(info.kind == "cpu" for info, _ in listed):
+            reason = "Warp sees no CUDA device: install NVIDIA's driver"
+            found.append(Device("warp", "CUDA (absent)", "gpu", False, reason, ""))
+    return found
+
+
+def _module(backend: str) -> tuple[ModuleType | None, str]:
+    """The module of a backend, or the reason why it cannot be imported."""
+    library = {"opencl": "pyopencl", "warp": "warp"}[backend]
+    if importlib.util.find_spec(library) is None:
+        return None, f"{library} is not installed"
+    try:
+        return importlib.import_module(f"gpusense.backends._{backend}"), ""
+    except (ImportError, OSError) as error:
+        return None, f"{library} does not load ({error})"
+
+
+def get_backend(selection: str | Backend = "auto") -> Backend:
+    """The backend of a selection string; one and the same object for one device.
+
+    Args:
+        selection: See the module's docstring; a backend is returned as it is.
+
+    Raises:
+        TypeError: the selection is not a string.
+        ValueError: the selection names nothing, or a device that is absent. Nothing falls back in silence.
+    """
+    if not isinstance(selection, str):
+        if hasattr(selection, "compile") and hasattr(selection, "info"):
+            return selection
+        raise TypeError(f"backend: must be a selection string, got {show(selection)}")
+    with _LOCK:
+        return _open(_find(selection))
+
+
+_LOCK = threading.Lock()
+
+
+@functools.cache
+def _open(selection: str) -> Backend:
+    backend = selection.partition(":")[0]
+    if backend == "numpy":
+        from gpusense.backends._numpy import NumpyBackend
+
+        return NumpyBackend()
+    module, reason = _module(backend)
+    if module is None:
+        raise ValueError(f"backend: {reason}, got {selection!r}")
+    info, handle = next((info, handle) for info, handle in module.list_devices() if info.selection == selection)
+    made: Backend = (module.OpenCLBackend if backend == "opencl" else module.WarpBackend)(info, handle)
+    return made
+
+
+def _find(selection: str) -> str:
+    """The selection string of the one device that a user's selection means."""
+    head, _, rest = selection.partition(":")
+    if head not in ("auto", "numpy", "opencl", "warp") or (rest and head in ("auto", "numpy")):
+        raise ValueError(
+            "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', "
+            f"got {show(selection)}"
+        )
+    if head == "numpy":
+        return "numpy"
+    listed = [device for device in devices() if device.available]
+    if head == "auto":
+        real = [device for device in listed if device.kind != "simulator"]
+        return min(real, key=lambda device: SPEED_CLASSES.index((device.backend, device.kind))).selection
+    own = [device for device in listed if device.backend == head]
+    if not own:
+        reason = next(device.reason for device in devices() if device.backend == head)
+        raise ValueError(f"backend: {reason}, got {show(selection)}")
+    return _choose(head, rest, own, selection)
+
+
+def _choose(head: str, rest: str, own: list[Device], selection: str) -> str:
+    if not rest:
+        real = [device for device in own if device.kind != "simulator"]
+        if not real:
+            raise ValueError(f"backend: only simulators are present and must be named, got {show(selection)}")
+        return min(real, key=lambda device: device.kind != "gpu").selection
+    for device in own:
+        if device.selection == selection:
+            return selection
+    matches = [] if re.fullmatch(r"[\d:]+", rest) else [d for d in own if rest.lower() in d.name.lower()]
+    if head == "warp":
+        matches = [device for device in own if device.selection.startswith(f"warp:{rest}:")]
+    if not matches:
+        present = ", ".join(f"{device.selection} ({device.name})" for device in own)
+        raise ValueError(f"backend: must be a device that is present ({present}), got {show(selection)}")
+    return matches[0].selection

@@ -1,0 +1,65 @@
+"""The NumPy reference as a backend: buffers are arrays, kernels are the functions of ``gpusense.reference``."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends.base import BackendInfo, Launcher
+from gpusense.signatures import KERNELS
+
+
+def _memory() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 4 << 30
+
+
+class NumpyBackend:
+    """Runs the reference kernels on the host."""
+
+    def __init__(self) -> None:
+        memory = _memory()
+        self.info = BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
+
+    def upload(self, array: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """See Backend.upload."""
+        if out is None:
+            return array.ravel().copy()
+        out[: array.size] = array.ravel()
+        return out
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> np.ndarray:
+        """See Backend.empty."""
+        return np.zeros(count, dtype) if zero else np.empty(count, dtype)
+
+    def download(self, buffer: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """See Backend.download."""
+        out.ravel()[...] = buffer[: out.size]
+        return out
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """See Backend.compile."""
+        row = KERNELS[kernel]
+        body = getattr(importlib.import_module(f"gpusense.reference.{row.file}"), kernel)
+        real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
+
+        def launch(size: tuple[int, ...], *arguments: Any) -> None:
+            bound = []
+            for declared, value in zip(row.arguments, arguments, strict=True):
+                if declared.shape is None:
+                    dtype = declared.dtype(real)
+                    bound.append(int(value) if dtype.kind == "i" else dtype.type(value))
+                else:
+                    bound.append(value.reshape(-1, declared.width) if declared.width > 1 else value)
+            with np.errstate(all="ignore"):
+                body(flags, *bound)
+
+        return launch
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""

@@ -1,0 +1,155 @@
+"""OpenCL backend: any vendor's driver through pyopencl."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from gpusense.backends.base import BackendInfo, Launcher
+from gpusense.backends.cache import ProgramCache
+from gpusense.signatures import KERNELS, Kernel
+from gpusense.sources import assemble, relevant
+
+# Devices that check or emulate: correct, but no one wants to wait for them unasked.
+SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
+_OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+_ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+
+
+def is_simulator(name: str) -> bool:
+    """Whether a device of that name only imitates hardware."""
+    return any(word in name.lower() for word in SIMULATORS)
+
+
+def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
+    """All OpenCL devices of this machine, simulators included, in the order of the platforms."""
+    found = []
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError:
+        return []
+    for p, platform in enumerate(platforms):
+        try:
+            devices = platform.get_devices()
+        except cl.Error:
+            continue
+        found += [(_describe(f"opencl:{p}:{d}", device), device) for d, device in enumerate(devices)]
+    return found
+
+
+def _describe(selection: str, device: cl.Device) -> BackendInfo:
+    return BackendInfo(
+        selection=selection,
+        backend="opencl",
+        name=device.name.strip(),
+        kind="gpu" if device.type & cl.device_type.GPU else "cpu",
+        driver=f"{device.platform.name.strip()} {device.driver_version.strip()}",
+        memory=int(device.global_mem_size),
+        max_buffer=int(device.max_mem_alloc_size),
+        float64=bool(device.double_fp_config),
+    )
+
+
+class OpenCLBackend:
+    """One OpenCL device: a context, an in-order queue and the programs compiled for it."""
+
+    def __init__(self, info: BackendInfo, device: cl.Device) -> None:
+        self.info = info
+        self._device = device
+        self._context = cl.Context([device])
+        self._queue = cl.CommandQueue(self._context)
+        self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
+        self._cache = ProgramCache(info)
+        # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
+        rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
+        self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
+
+    def upload(self, array: np.ndarray, out: cl.Buffer | None = None) -> cl.Buffer:
+        """See Backend.upload."""
+        buffer = self.empty(array.size, array.dtype) if out is None else out
+        if array.size:
+            with _memory_errors():
+                cl.enqueue_copy(self._queue, buffer, np.ascontiguousarray(array))
+        return buffer
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> cl.Buffer:
+        """See Backend.empty."""
+        size = max(count, 1) * np.dtype(dtype).itemsize
+        if size > self.info.max_buffer:
+            raise MemoryError(
+                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
+            )
+        with _memory_errors():
+            buffer = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+            if zero:
+                cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
+        return buffer
+
+    def download(self, buffer: cl.Buffer, out: np.ndarray) -> np.ndarray:
+        """See Backend.download."""
+        if out.size:
+            with _memory_errors():
+                cl.enqueue_copy(self._queue, out, buffer)
+        return out
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """See Backend.compile."""
+        row = KERNELS[kernel]
+        flags = relevant(row.file, flags)
+        program = self._programs.get((row.file, flags))
+        if program is None:
+            program = self._programs[row.file, flags] = self._build(row.file, flags)
+        return _Launch(self._queue, cl.Kernel(program, kernel), row, "FLOAT64" in flags)
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""
+        self._queue.finish()
+
+    def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
+        if "FLOAT64" in flags and not self.info.float64:
+            raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
+        source = assemble(file, flags)
+        binary = self._cache.load(source, self.options)
+        if binary is not None:
+            try:
+                return cl.Program(self._context, [self._device], [binary]).build(self.options)
+            except cl.Error:
+                self._cache.discard(source, self.options)
+        try:
+            program = cl.Program(self._context, source).build(self.options, [self._device])
+        except cl.RuntimeError as error:
+            raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {error}") from error
+        self._cache.store(source, self.options, program.get_info(cl.program_info.BINARIES)[0])
+        return program
+
+
+class _Launch:
+    """Binds arguments by the signature table and enqueues."""
+
+    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel, row: Kernel, float64: bool) -> None:
+        self._queue, self._kernel, self._row = queue, kernel, row
+        real = np.dtype(np.float64 if float64 else np.float32)
+        self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
+
+    def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
+        bound = [
+            value if scalar is None else scalar(value) for scalar, value in zip(self._scalars, arguments, strict=True)
+        ]
+        group = (self._row.group, *(1 for _ in size[1:]))
+        rounded = (-(-size[0] // group[0]) * group[0], *size[1:])
+        self._kernel.set_args(*bound)
+        with _memory_errors():
+            cl.enqueue_nd_range_kernel(self._queue, self._kernel, rounded, group)
+
+
+class _memory_errors:
+    """Turns the driver's out-of-memory codes into MemoryError."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, cl.Error) and any(code in str(error) for code in _OUT_OF_MEMORY):
+            raise MemoryError(f"the OpenCL device is out of memory: {error}") from error

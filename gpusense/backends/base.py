@@ -1,0 +1,73 @@
+"""What a backend is: six verbs and no science.
+
+``upload``, ``empty``, ``download``, ``compile``, ``synchronize``, ``info``. A buffer is whatever the backend makes of
+it; models only pass buffers on. Kernels are asked for by name and flags, and are bound by the signature table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+Buffer = Any
+
+
+@dataclass(frozen=True)
+class BackendInfo:
+    """A device as a model sees it.
+
+    Attributes:
+        selection: What selects this device again, such as ``"opencl:0:0"``.
+        backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
+        name: The device's own name.
+        kind: ``"cpu"`` or ``"gpu"``.
+        driver: Version of the driver or library that compiles for it.
+        memory: Bytes of device memory.
+        max_buffer: Bytes of the largest buffer.
+        float64: Whether float64 kernels exist on it.
+    """
+
+    selection: str
+    backend: str
+    name: str
+    kind: str
+    driver: str
+    memory: int
+    max_buffer: int
+    float64: bool
+
+
+class Launcher(Protocol):
+    """A compiled kernel: call it with the global size and the arguments of its row, in order."""
+
+    def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
+        """Start one launch; buffers and scalars in the order of the signature table."""
+
+
+class Backend(Protocol):
+    """A device that holds buffers and runs kernels."""
+
+    @property
+    def info(self) -> BackendInfo:
+        """The device behind this backend."""
+
+    def upload(self, array: np.ndarray, out: Buffer | None = None) -> Buffer:
+        """Copy a C-contiguous array to the device, into the head of ``out`` where given."""
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
+        """A new buffer of ``count`` numbers, cleared only where asked.
+
+        Raises:
+            MemoryError: the device cannot hold it.
+        """
+
+    def download(self, buffer: Buffer, out: np.ndarray) -> np.ndarray:
+        """Wait for the device and copy the head of a buffer into a C-contiguous array."""
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """The kernel of that name, specialised by flags; compiled once and kept."""
+
+    def synchronize(self) -> None:
+        """Wait until every launch has finished."""

@@ -1,0 +1,211 @@
+"""Logs of the Carnegie Mellon Robot Navigation Toolkit (CARMEN): one message per line, metres and radians.
+
+=====================  =================================================================================
+message                fields after the name
+=====================  =================================================================================
+FLASER, RLASER         n, n ranges, laser x y theta, robot x y theta
+ROBOTLASER1 and 2      type, start angle, field of view, resolution, maximum range, accuracy, remission
+                       mode, n, n ranges, m, m remissions, laser x y theta, robot x y theta, tv, rv,
+                       forward and side safety distance, turn axis
+ODOM                   x y theta, tv, rv, acceleration
+=====================  =================================================================================
+
+Each ends in the time of measurement, the host and the logger's time. FLASER and ROBOTLASER1 come from the
+front laser, RLASER and ROBOTLASER2 from the rear one. Every other line is skipped.
+
+* ``Scan.time`` and ``Odometry.time`` are the time of measurement.
+* ``Scan.pose`` is the laser's pose. A log that went through SLAM holds the corrected pose there; in a raw one
+  it is the odometry's, and nothing in the file tells the two apart.
+* The scanner's mount is (0, 0, 0), since the poses are the laser's own.
+* FLASER and RLASER state no bearings. They start at -90 degrees, counter-clockwise, in steps of 180/n
+  degrees, or of 1, 0.5 or 0.25 degrees where that is within 1 %: 1 degree for 180 or 181 beams, 0.5 for 360
+  or 361.
+* ROBOTLASER states angles with six decimals. Where field of view and resolution agree to these, the bearings
+  are spaced by the field of view over n - 1, which multiplies no rounding error; else by the resolution.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.logs import Odometry, Pose, Scan
+from gpusense.scanner import Scanner
+
+_FRONT = (b"FLASER", b"ROBOTLASER1")
+_REAR = (b"RLASER", b"ROBOTLASER2")
+_KNOWN = (*_FRONT, *_REAR, b"ODOM")
+_MAX_LINE = 1 << 24
+_TAIL = 3  # time of measurement, host, logger's time
+
+
+def read_carmen(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
+    """The records of a CARMEN log; arguments and errors as for :func:`gpusense.logs.read_log`."""
+    names = _REAR if rear else _FRONT
+    scanners: dict[tuple[float, ...], Scanner] = {}
+    old_range_max = range_max
+    for where, fields in _messages(path):
+        name = fields[0].decode()
+        if fields[0] == b"ODOM":
+            values = _message_numbers(where, fields, 6)
+            if odometry:
+                yield Odometry(_time(where, fields), _pose(where, values[:3]))
+            continue
+        if fields[0] not in names:
+            continue
+        geometry: tuple[float, ...]
+        if name.startswith("ROBOT"):
+            config, ranges, poses = _robot_laser(where, fields)
+            start, view, step, stated_max = config[1:5].tolist()
+            geometry = start, _robot_step(view, step, ranges.size), ranges.size, range_max or stated_max
+        else:
+            ranges, poses = _old_laser(where, fields)
+            if old_range_max is None:
+                old_range_max = _range_max_of(path, fields[0])
+            geometry = -math.pi / 2, _old_step(ranges.size), ranges.size, old_range_max
+        scanner = scanners.get(geometry)
+        if scanner is None:
+            scanner = scanners[geometry] = _scanner(where, *geometry)
+        ranges.setflags(write=False)
+        yield Scan(_time(where, fields), ranges, scanner, _pose(where, poses[3:]), _pose(where, poses[:3]))
+
+
+def _messages(path: Path) -> Iterator[tuple[str, list[bytes]]]:
+    """Where each known message stands, ``file:line``, and its fields, the name included."""
+    found = False
+    number = 0
+    try:
+        with path.open("rb") as plain:
+            compressed = plain.read(2) == b"\x1f\x8b"
+            plain.seek(0)
+            with gzip.open(plain) if compressed else plain as stream:
+                while line := stream.readline(_MAX_LINE):
+                    number += 1
+                    if len(line) == _MAX_LINE:
+                        rule = f"must have lines of less than {_MAX_LINE} bytes"
+                        raise ValueError(f"{path}:{number}: {rule}, got a longer one")
+                    if line.startswith(_KNOWN):
+                        fields = line.split()
+                        if fields[0] in _KNOWN:
+                            found = True
+                            yield f"{path}:{number}", fields
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise ValueError(f"{path}:{number + 1}: must be a whole gzip file, got a broken one: {error}") from error
+    if not found:
+        raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, got none in {number} lines")
+
+
+def _old_laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The ranges and the six pose values of FLASER or RLASER."""
+    count = _count(where, fields, 1)
+    values = _message_numbers(where, fields, 1 + count + 6)
+    return values[1 : 1 + count].copy(), values[1 + count :]
+
+
+def _robot_laser(
+    where: str, fields: Sequence[bytes]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The seven values of the configuration, the ranges and the six pose values of ROBOTLASER."""
+    count = _count(where, fields, 8)
+    remissions = _count(where, fields, 9 + count)
+    values = _message_numbers(where, fields, 8 + count + 1 + remissions + 11)
+    poses = 9 + count + remissions
+    return values[:7], values[8 : 8 + count].copy(), values[poses : poses + 6]
+
+
+def _count(where: str, fields: Sequence[bytes], index: int) -> int:
+    """The number of values that follow ``fields[index]``, seen to be there."""
+    name = fields[0].decode()
+    left = len(fields) - index - 1
+    text = fields[index].decode(errors="replace") if left >= 0 else ""
+    if not (text.isascii() and text.isdigit() and len(text) <= 10):
+        raise ValueError(f"{where}: {name}: field {index} must be a count, got {text!r}")
+    if int(text) > left:
+        raise ValueError(f"{where}: {name}: field {index} must count at most {left} values, got {text}")
+    return int(text)
+
+
+def _message_numbers(where: str, fields: Sequence[bytes], count: int) -> NDArray[np.float64]:
+    """The ``count`` numbers between a message's name and its tail, and the times in the tail, checked."""
+    wanted = 1 + count + _TAIL
+    name = fields[0].decode()
+    if len(fields) != wanted:
+        raise ValueError(f"{where}: {name}: must have {wanted} fields, got {len(fields)}")
+    body = fields[1 : 1 + count]
+    for index in (wanted - 3, wanted - 1):
+        _number(where, fields, index)
+    try:
+        values = np.fromiter(map(float, body), np.float64, count)
+    except ValueError:
+        values = None
+    if values is None or b"_" in b"".join(body):  # Python, but no C program, reads 1_000 as a number
+        return np.array([_number(where, fields, index) for index in range(1, 1 + count)])
+    return values
+
+
+def _number(where: str, fields: Sequence[bytes], index: int) -> float:
+    try:
+        if b"_" in fields[index]:
+            raise ValueError
+        return float(fields[index])
+    except ValueError:
+        text = fields[index].decode(errors="replace")
+        name = fields[0].decode()
+        raise ValueError(f"{where}: {name}: field {index} must be a number, got {text[:40]!r}") from None
+
+
+def _time(where: str, fields: Sequence[bytes]) -> float:
+    time = float(fields[-3])
+    if not math.isfinite(time):
+        raise ValueError(f"{where}: {fields[0].decode()}: the time must be finite, got {time}")
+    return time
+
+
+def _pose(where: str, values: NDArray[np.float64]) -> Pose:
+    x, y, theta = values.tolist()
+    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(theta)):
+        raise ValueError(f"{where}: a pose must be finite, got ({x}, {y}, {theta})")
+    return x, y, theta
+
+
+def _old_step(count: int) -> float:
+    """The step between FLASER's bearings [rad]."""
+    degrees = 180.0 / max(count, 1)
+    for nice in (1.0, 0.5, 0.25):
+        if abs(degrees - nice) <= 0.01 * nice:
+            degrees = nice
+    return math.radians(degrees)
+
+
+def _robot_step(view: float, step: float, count: int) -> float:
+    """The step between ROBOTLASER's bearings [rad], of which both arguments are rounded to 1e-6."""
+    finer = view / (count - 1) if count > 1 else step
+    return finer if abs(finer - step) <= 1e-6 else step
+
+
+def _scanner(where: str, start: float, step: float, count: float, range_max: float) -> Scanner:
+    try:
+        return Scanner.uniform(angle_min=start, angle_increment=step, count=int(count), range_max=range_max)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _range_max_of(path: Path, name: bytes) -> float:
+    """The limit of the readings in a log's messages of one name; see ``read_log``."""
+    largest, times = 0.0, 0
+    for where, fields in _messages(path):
+        if fields[0] == name:
+            ranges, _ = _old_laser(where, fields)
+            top = float(np.max(ranges, where=np.isfinite(ranges), initial=0.0))
+            if top > largest:
+                largest, times = top, 0
+            times += int(np.count_nonzero(ranges == largest))
+    if largest == 0.0:
+        raise ValueError(f"{path}: must have a reading > 0 unless range_max is given, got none")
+    return largest if times >= 3 else math.nextafter(largest, math.inf)

@@ -1,0 +1,1 @@
+"""Measurement models: parameters, a map and a scanner, compiled for a device."""

@@ -1,0 +1,193 @@
+"""The beam model, *Probabilistic Robotics* section 6.3: cast, mixture and sum in one launch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from gpusense import _checks
+from gpusense.backends import Backend
+from gpusense.grid import OccupancyGrid
+from gpusense.models.caster import CASTERS, cast_all
+from gpusense.models.reachable import ReachableMap
+from gpusense.models.scan_model import ScanModel, check_poses
+from gpusense.parameters import BeamParameters
+from gpusense.plan import Omission, scene_omissions, share
+from gpusense.prepare import quadrant_squares
+from gpusense.scan import Beams, PreparedScan
+from gpusense.scanner import Scanner
+
+_BYTES_PER_CELL = 4
+# Below this p_rand could underflow beside the other densities, so the mixture is summed as logarithms.
+_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
+
+
+class BeamModel(ScanModel):
+    """log p(z | x, m) of a scan by casting every beam of every particle.
+
+    The mixture is ``z_hit p_hit + z_short p_short + z_max p_max + z_rand p_rand`` with a hit density that is truncated
+    to [0, range_max] and renormalised (book equations 6.4 to 6.12).
+
+    Args:
+        grid: The map.
+        scanner: The scanner's geometry.
+        parameters: Weights and shapes of the mixture.
+        backend: Where it runs; see ``gpusense.devices()``.
+        precision: ``"float32"`` or ``"float64"``.
+        caster: How expected ranges are found: ``"exact"``.
+        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
+        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
+        temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
+            independent. 1 is the book's plain product.
+        beams: Use only so many informative beams, evenly chosen, or the beams of these indices.
+        compat: None.
+        specialize: False leaves nothing out: same numbers, slower.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        scanner: Scanner,
+        parameters: BeamParameters | None = None,
+        *,
+        backend: str | Backend = "auto",
+        precision: str = "float32",
+        caster: str = "exact",
+        unknown: str = "free",
+        outside: str = "free",
+        temperature: float = 1.0,
+        beams: Beams = None,
+        compat: None = None,
+        specialize: bool = True,
+    ) -> None:
+        self.parameters = BeamParameters() if parameters is None else parameters
+        if not isinstance(self.parameters, BeamParameters):
+            raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(parameters)}")
+        _checks.choice("caster", caster, CASTERS)
+        super().__init__(
+            grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
+            temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
+        )  # fmt: skip
+        self._limit = scanner.range_max / grid.resolution
+        self._map = ReachableMap(
+            self._backend, grid, unknown, scanner.mount, self._limit, quadrant_squares, crop=specialize
+        )
+        self._components, self._terms = self._mixture()
+
+    def expected_ranges(self, poses: object) -> np.ndarray:
+        """z* of every beam of the scanner at each pose.
+
+        Args:
+            poses: (N, 3) robot poses in the world [m, m, rad].
+
+        Returns:
+            (N, K) metres in the model's precision; exactly range_max where nothing is nearer.
+
+        Raises:
+            TypeError, ValueError: poses that are not (N, 3) finite numbers.
+        """
+        checked = check_poses(poses)
+        return cast_all(
+            self._backend, self._workspace, self._map, self.grid, self.scanner.mount, self._vectors, checked,
+            self._real, self.scanner.range_max, self.outside == "occupied",
+        )  # fmt: skip
+
+    def explain(self) -> str:
+        """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
+        p = self.parameters
+        components = [
+            ("z_hit", p.z_hit, "1 exp, 2 erf and 1 division per particle-beam"),
+            ("z_short", p.z_short, "1 exp, 1 tanh and 2 divisions per particle-beam"),
+            ("z_rand", p.z_rand, "1 addition per particle-beam"),
+            ("z_max", p.z_max, "max readings altogether"),
+        ]
+        omissions = scene_omissions(
+            components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
+            precision=self.precision,
+        )  # fmt: skip
+        scan = self._last_scan
+        if scan is not None and scan.shared:
+            spared = len(scan.readings) - len(scan.rays)
+            omissions.append(
+                Omission(
+                    "repeated bearings",
+                    f"{len(scan.readings)} readings lie on {len(scan.rays)} rays",
+                    f"{share(spared, len(scan.readings))} of the ray casts",
+                )
+            )
+        if self._last_code and "ORIGINS_OUTSIDE" not in self._last_code:
+            omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray"))
+        if self._last_code and "LINEAR" in self._last_code:
+            omissions.append(
+                Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
+            )
+        if (far := self._map.omission(_BYTES_PER_CELL)) is not None:
+            omissions.append(far)
+        title = f"beam model, {self.precision}, {self.device.selection} ({self.device.name})"
+        return str(self._plan(title, omissions))
+
+    def _mixture(self) -> tuple[frozenset[str], np.ndarray]:
+        """Flags of the components, and the numbers of the kernel file ``mixture``."""
+        p, range_max = self.parameters, self.scanner.range_max
+        weights = {"HIT": p.z_hit, "SHORT": p.z_short, "RAND": p.z_rand}
+        flags = {name for name, weight in weights.items() if weight > 0 or not self._specialize}
+        rand = p.z_rand / range_max
+        if self._specialize and len(flags) == 1:
+            flags.add("SINGLE")
+        scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        if rand >= _SMALLEST_DENSITY[self._real]:
+            flags.add("LINEAR")
+            head = (scale, p.z_short, rand)
+        else:
+            log_scale = _log(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+            head = (log_scale, _log(p.z_short), _log(p.z_rand) - math.log(range_max))
+        inverse = 1 / p.sigma_hit
+        terms = [
+            head[0], inverse, inverse * math.sqrt(0.5), head[1], p.lambda_short, head[2], range_max, _log(p.z_max),
+        ]  # fmt: skip
+        return frozenset(flags), np.array(terms).astype(self._real)
+
+    def _impossible(self) -> bool:
+        p = self.parameters
+        return p.z_hit == 0 and p.z_short == 0 and p.z_rand == 0
+
+    def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
+        space, real = self._workspace, self._real
+        ray = space.upload("ray", scan.rays.astype(real))
+        first = space.upload("first", scan.first)
+        reading = space.upload("reading", scan.readings.astype(real))
+        terms = space.upload("terms", self._terms)
+        rays, readings = len(scan.rays), len(scan.readings)
+
+        def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
+            squares, region = self._map.ensure(poses)
+            placed, beyond = self._place(poses, region)
+            flags = self._components | self._scene_flags()
+            flags |= {"SHARED_RAYS"} if scan.shared or not self._specialize else set()
+            flags |= {"ORIGINS_OUTSIDE"} if beyond or not self._specialize else set()
+            flags |= {"OUTSIDE_OCCUPIED"} if self.outside == "occupied" else set()
+            flags |= {"PER_BEAM"} if per_beam else set()
+            self._last_code = flags
+            count = len(poses)
+            result = space.empty("log_p", count, real)
+            parts = space.empty("parts", count * readings if per_beam else 1, real)
+            self._backend.compile("score_beams", flags)(
+                (count,), squares, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, first,
+                reading, terms, result, parts, region.rows, region.cols, count, rays, readings, self._limit,
+                self.grid.resolution, self.scanner.range_max, scan.constant, self.temperature,
+            )  # fmt: skip
+            self._backend.download(result, log_p)
+            each = np.empty((count, readings if per_beam else 0), real)
+            return self._backend.download(parts, each) if per_beam else each
+
+        return launch
+
+
+def _log(weight: float) -> float:
+    return math.log(weight) if weight > 0 else -math.inf

@@ -1,0 +1,213 @@
+"""The likelihood field, *Probabilistic Robotics* section 6.4: one look-up at each beam's end point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from gpusense import _checks
+from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.frames import split
+from gpusense.grid import OccupancyGrid
+from gpusense.models.reachable import ReachableMap
+from gpusense.models.scan_model import ScanModel
+from gpusense.parameters import LikelihoodFieldParameters
+from gpusense.plan import Omission, scene_omissions
+from gpusense.prepare import check_size, squared_distances
+from gpusense.scan import Beams, PreparedScan
+from gpusense.scanner import Scanner
+
+_RING = 2
+# Longest table from squared distances to densities; a larger cap is looked up on the host while preparing.
+_LONGEST_TABLE = 1 << 22
+_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
+
+
+class LikelihoodFieldModel(ScanModel):
+    """log p(z | x, m) of a scan by the distance of its end points to the nearest obstacle.
+
+    Per hit ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, which is also its value
+    outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book table 6.3).
+
+    Args:
+        grid: The map.
+        scanner: The scanner's geometry.
+        parameters: Weights, deviation, cap and interpolation.
+        backend: Where it runs; see ``gpusense.devices()``.
+        precision: ``"float32"`` or ``"float64"``.
+        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
+        outside: ``"free"``, or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
+        temperature: In (0, 1]: multiplies the sum over beams. 1 is the book's plain product.
+        beams: Use only so many informative beams, evenly chosen, or the beams of these indices.
+        compat: None.
+        specialize: False leaves nothing out: same numbers, slower.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        scanner: Scanner,
+        parameters: LikelihoodFieldParameters | None = None,
+        *,
+        backend: str | Backend = "auto",
+        precision: str = "float32",
+        unknown: str = "free",
+        outside: str = "free",
+        temperature: float = 1.0,
+        beams: Beams = None,
+        compat: None = None,
+        specialize: bool = True,
+    ) -> None:
+        self.parameters = LikelihoodFieldParameters() if parameters is None else parameters
+        if not isinstance(self.parameters, LikelihoodFieldParameters):
+            raise TypeError(f"parameters: must be LikelihoodFieldParameters, got {_checks.show(parameters)}")
+        super().__init__(
+            grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
+            temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
+        )  # fmt: skip
+        p = self.parameters
+        self._bilinear = p.interpolation == "bilinear"
+        self._log_table = specialize and not self._bilinear
+        self._flags, self._terms = self._mixture()
+        reach = (scanner.range_max + p.max_distance) / grid.resolution
+        self._map = ReachableMap(
+            self._backend, grid, unknown, scanner.mount, reach, self._prepare_table, crop=specialize
+        )
+
+    def explain(self) -> str:
+        """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
+        p = self.parameters
+        components = [
+            ("z_hit", p.z_hit, "1 exp per particle-beam"),
+            ("z_rand", p.z_rand, "1 addition per particle-beam"),
+            ("z_max", p.z_max, "max readings altogether"),
+        ]
+        omissions = scene_omissions(
+            components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
+            precision=self.precision,
+        )  # fmt: skip
+        if self._log_table:
+            omissions.append(
+                Omission("density per beam", "cells hold log densities (nearest)", "1 exp and 1 log per particle-beam")
+            )
+        if not self._bilinear:
+            omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))
+        if (far := self._map.omission(self._real.itemsize)) is not None:
+            omissions.append(far)
+        title = f"likelihood field, {self.precision}, {self.device.selection} ({self.device.name})"
+        return str(self._plan(title, omissions))
+
+    def _mixture(self) -> tuple[frozenset[str], np.ndarray]:
+        """Flags of the code, and the numbers of the kernel file ``field``."""
+        p, range_max = self.parameters, self.scanner.range_max
+        flags = self._scene_flags()
+        flags |= {"BILINEAR"} if self._bilinear else set()
+        flags |= {"LOG_TABLE"} if self._log_table else set()
+        flags |= {"CAREFUL"} if self._real == np.float32 else set()
+        flags |= {"HIT"} if p.z_hit > 0 or not self._specialize else set()
+        rand = p.z_rand / range_max
+        if rand >= _SMALLEST_DENSITY[self._real]:
+            flags.add("LINEAR")
+            head = (p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi)), rand)
+        else:
+            log_scale = _log(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+            head = (log_scale, _log(p.z_rand) - math.log(range_max))
+        terms = np.array([head[0], 1 / p.sigma_hit, head[1], _log(p.z_max)])
+        return frozenset(flags), terms.astype(self._real)
+
+    def _values(self, squared: np.ndarray) -> np.ndarray:
+        """What the table holds for squared cell distances: log densities, or distances in metres. float64."""
+        p = self.parameters
+        distance = np.minimum(np.sqrt(squared) * self.grid.resolution, p.max_distance)
+        return self._log_density(distance) if self._log_table else distance
+
+    def _log_density(self, distance: np.ndarray) -> np.ndarray:
+        p = self.parameters
+        u = distance / p.sigma_hit
+        log_hit = _log(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - 0.5 * u * u
+        return np.logaddexp(log_hit, _log(p.z_rand) - math.log(self.scanner.range_max))
+
+    def _prepare_table(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
+        """Padded table of a window; its ring holds what lies outside the grid."""
+        rows, cols = obstacles.shape
+        check_size(rows, cols)
+        p = self.parameters
+        beyond = self._values(np.array([0.0 if self.outside == "occupied" else np.inf])).astype(self._real)
+        size = (rows + 2 * _RING, cols + 2 * _RING)
+        farthest = min(math.floor((p.max_distance / self.grid.resolution) ** 2) + 1, rows * rows + cols * cols)
+        if self.outside == "occupied":
+            return backend.upload(self._table_with_walls(obstacles, size))
+        squared = squared_distances(backend, obstacles)
+        if farthest > _LONGEST_TABLE:
+            distances = backend.download(squared, np.empty((rows, cols), np.int32))
+            table = np.full(size, beyond[0])
+            table[_RING:-_RING, _RING:-_RING] = self._values(_with_infinity(distances))
+            return backend.upload(table)
+        density = self._values(np.append(np.arange(farthest + 1, dtype=np.float64), np.inf)).astype(self._real)
+        table = backend.upload(np.full(size, beyond[0]))
+        backend.compile("fill_field", self._flags)(
+            (cols, rows), squared, backend.upload(density), table, rows, cols, farthest + 1
+        )
+        backend.synchronize()
+        return table
+
+    def _table_with_walls(self, obstacles: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Table of a window whose surroundings are occupied: distances see the ring as obstacles."""
+        walled = np.pad(obstacles, _RING, constant_values=True)
+        squared = self._backend.download(squared_distances(self._backend, walled), np.empty(size, np.int32))
+        return self._values(_with_infinity(squared)).astype(self._real)
+
+    def _impossible(self) -> bool:
+        return self.parameters.z_hit == 0 and self.parameters.z_rand == 0
+
+    def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
+        space, real = self._workspace, self._real
+        cells = scan.readings / self.grid.resolution
+        if self._specialize:
+            points = scan.vectors * cells[:, None]
+        else:
+            points = np.where(np.isfinite(cells)[:, None], scan.vectors * np.nan_to_num(cells, posinf=0)[:, None],
+                              cells[:, None])  # fmt: skip
+        high, low = split(points, real)
+        low = np.where(np.isfinite(points), low, 0).astype(real)
+        point, point_low = space.upload("point", high), space.upload("point_low", low)
+        terms = space.upload("terms", self._terms)
+        longest = np.max(cells, initial=0.0, where=np.isfinite(cells))
+        guard = 8 * np.finfo(real).eps * (longest + 2)
+        readings = len(scan.readings)
+
+        def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
+            table, region = self._map.ensure(poses)
+            placed, _ = self._place(poses, region)
+            flags = self._flags | ({"PER_BEAM"} if per_beam else set())
+            self._last_code = flags
+            count = len(poses)
+            result = space.empty("log_p", count, real)
+            parts = space.empty("parts", count * readings if per_beam else 1, real)
+            careful = "CAREFUL" in flags
+            self._backend.compile("score_field", flags)(
+                (count,), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose),
+                space.upload("pose_low", placed.low if careful else placed.low[:1]), point, point_low, terms, result,
+                parts, region.rows, region.cols, count, readings, guard, scan.constant, self.temperature,
+            )  # fmt: skip
+            self._backend.download(result, log_p)
+            each = np.empty((count, readings if per_beam else 0), real)
+            return self._backend.download(parts, each) if per_beam else each
+
+        return launch
+
+
+def _with_infinity(squared: np.ndarray) -> np.ndarray:
+    """Squared distances as float64, infinite where there is no obstacle."""
+    return np.where(squared == np.iinfo(np.int32).max, np.inf, squared.astype(np.float64))
+
+
+def _log(weight: float) -> float:
+    return math.log(weight) if weight > 0 else -math.inf

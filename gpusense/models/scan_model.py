@@ -1,0 +1,246 @@
+"""What the range models share: arguments, readings, poses, batching and the report of what is left out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import numpy as np
+
+from gpusense import _checks
+from gpusense.backends import Backend, BackendInfo, get_backend
+from gpusense.frames import PlacedPoses, place_poses, ray_vectors
+from gpusense.grid import OccupancyGrid
+from gpusense.plan import Omission, Plan, share
+from gpusense.region import Region
+from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
+from gpusense.scanner import Scanner
+from gpusense.workspace import Workspace
+
+# Particles of one launch: enough to fill a device, few enough for its memory (44 bytes each).
+CHUNK = 1 << 20
+# Most bytes of a result with a number per particle and beam.
+CHUNK_BYTES = 256 << 20
+# A launch that does not fit is tried with half the particles down to this.
+SMALLEST_CHUNK = 256
+# Above this many cells neighbouring crossing counts could be confused in float32.
+_MOST_CELLS_PER_RANGE = 1 << 22
+
+
+def check_poses(poses: object, name: str = "poses") -> np.ndarray:
+    """(N, 3) finite float64 poses.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: another shape, or a value that is not finite.
+    """
+    return _checks.array(name, poses, ("N", 3))
+
+
+def check_scene(grid: object, range_max: float) -> OccupancyGrid:
+    """The map, whose cells must not be absurdly small against the range.
+
+    Raises:
+        TypeError: not an OccupancyGrid.
+        ValueError: more than 4 194 304 cells per range_max.
+    """
+    if not isinstance(grid, OccupancyGrid):
+        raise TypeError(f"grid: must be an OccupancyGrid, got {_checks.show(grid)}")
+    cells = range_max / grid.resolution
+    if cells > _MOST_CELLS_PER_RANGE:
+        raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.0f}")
+    return grid
+
+
+def real_dtype(precision: str, backend: Backend) -> np.dtype:
+    """NumPy dtype of a precision on a device.
+
+    Raises:
+        TypeError, ValueError: an unknown precision, or float64 on a device without it.
+    """
+    dtype = np.dtype(_checks.choice("precision", precision, ("float32", "float64")))
+    if dtype == np.float64 and not backend.info.float64:
+        raise ValueError(f"precision: must be 'float32' on {backend.info.name}, which has no float64, got 'float64'")
+    return dtype
+
+
+def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, int], None]) -> None:
+    """Call ``run(begin, end)`` over [0, count) in pieces; pieces that do not fit into memory are halved.
+
+    Raises:
+        MemoryError: not even the smallest piece fits. The model still works for smaller calls.
+    """
+    begin = 0
+    while begin < count:
+        try:
+            run(begin, min(begin + chunk, count))
+            begin += chunk
+        except MemoryError:
+            workspace.release()
+            if chunk <= SMALLEST_CHUNK:
+                raise
+            chunk = max(chunk // 2, SMALLEST_CHUNK)
+
+
+class ScanModel(ABC):
+    """A measurement model of whole scans; the base of the beam model and the likelihood field."""
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        scanner: Scanner,
+        *,
+        backend: str | Backend,
+        precision: str,
+        unknown: str,
+        outside: str,
+        temperature: float,
+        beams: Beams,
+        compat: None,
+        specialize: bool,
+        z_max: float,
+    ) -> None:
+        if not isinstance(scanner, Scanner):
+            raise TypeError(f"scanner: must be a Scanner, got {_checks.show(scanner)}")
+        self.grid = check_scene(grid, scanner.range_max)
+        self.scanner = scanner
+        self.unknown = _checks.choice("unknown", unknown, ("free", "occupied"))
+        self.outside = _checks.choice("outside", outside, ("free", "occupied"))
+        self.temperature = _checks.real("temperature", temperature, above=0, high=1)
+        self.beams = check_beams(beams, scanner.count)
+        if compat is not None:
+            raise ValueError(f"compat: must be None in this version, got {_checks.show(compat)}")
+        if not isinstance(specialize, bool):
+            raise TypeError(f"specialize: must be True or False, got {_checks.show(specialize)}")
+        self._specialize = specialize
+        self._backend = get_backend(backend)
+        self._real = real_dtype(precision, self._backend)
+        self._workspace = Workspace(self._backend)
+        self._vectors = ray_vectors(scanner.bearings, scanner.mount)
+        self._z_max = z_max
+        self._last_scan: PreparedScan | None = None
+        self._last_code: frozenset[str] = frozenset()
+
+    @property
+    def device(self) -> BackendInfo:
+        """The device the model is compiled for."""
+        return self._backend.info
+
+    @property
+    def precision(self) -> str:
+        """``"float32"`` or ``"float64"``."""
+        return self._real.name
+
+    def log_likelihood(
+        self, poses: object, ranges: object, *, per_beam: bool = False
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """log p(z | x, m) of a scan for each particle, natural logarithm.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans.
+            ranges: (K,) readings [m], or (S, K). NaN, -inf and readings below range_min are missing, +inf and readings
+                of range_max or more are max readings.
+            per_beam: Also return what each reading contributes, before the temperature.
+
+        Returns:
+            (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
+            each max reading. With ``per_beam`` also (N, K) or (S, N, K) parts; left-out readings have 0.
+
+        Raises:
+            TypeError: an argument does not hold real numbers.
+            ValueError: a wrong shape, or a pose that is not finite; the message names it.
+            MemoryError: the device cannot hold even a few particles.
+        """
+        scans = check_ranges(ranges, self.scanner)
+        if scans.ndim == 1:
+            log_p, parts = self._score_scan(check_poses(poses), scans, per_beam)
+            return (log_p, parts) if per_beam else log_p
+        clouds = _checks.array("poses", poses, (len(scans), "N", 3))
+        scored = [self._score_scan(cloud, scan, per_beam) for cloud, scan in zip(clouds, scans, strict=True)]
+        log_p = np.stack([one for one, _ in scored]) if scored else np.empty(clouds.shape[:2], self._real)
+        if not per_beam:
+            return log_p
+        return log_p, np.stack([parts for _, parts in scored])
+
+    def _score_scan(self, poses: np.ndarray, ranges: np.ndarray, per_beam: bool) -> tuple[np.ndarray, np.ndarray]:
+        scan = prepare_scan(ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize)
+        self._last_scan = scan
+        count, used = len(poses), len(scan.readings)
+        log_p = np.empty(count, self._real)
+        parts = np.zeros((count, self.scanner.count if per_beam else 0), self._real)
+        if per_beam and len(scan.max_columns):
+            parts[:, scan.max_columns] = np.log(self._z_max)
+        if used == 0:
+            log_p[:] = self.temperature * scan.constant
+            return log_p, parts
+        if self._impossible():
+            log_p[:] = -np.inf
+            if per_beam:
+                parts[:, scan.columns] = -np.inf
+            return log_p, parts
+        launch = self._prepare_launch(scan)
+        chunk = CHUNK
+        if per_beam:
+            chunk = max(min(chunk, CHUNK_BYTES // (used * self._real.itemsize)), 1)
+
+        def run(begin: int, end: int) -> None:
+            each = launch(poses[begin:end], log_p[begin:end], per_beam)
+            if per_beam:
+                parts[begin:end, scan.columns] = each
+
+        in_chunks(count, chunk, self._workspace, run)
+        return log_p, parts
+
+    @abstractmethod
+    def _impossible(self) -> bool:
+        """Whether no range reading is possible at all."""
+
+    @abstractmethod
+    def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
+        """What scores (n, 3) poses into a log-likelihood array and returns (n, M) parts where they are wanted."""
+
+    def _place(self, poses: np.ndarray, region: Region) -> tuple[PlacedPoses, bool]:
+        """Poses in the window's frame, and whether any starts outside the window."""
+        placed = place_poses(poses, self.grid, self.scanner.mount, self._real)
+        placed.cell[:] -= (region.col, region.row)
+        outside = not ((placed.cell >= 0) & (placed.cell < (region.cols, region.rows))).all()
+        return placed, outside
+
+    def _scene_flags(self) -> set[str]:
+        flags = {"FLOAT64"} if self._real == np.float64 else set()
+        if not self._specialize:
+            flags |= {"ALL_READINGS"}
+        return flags
+
+    def _plan(self, title: str, omissions: list[Omission]) -> Plan:
+        """The plan as of the last call."""
+        if not self._specialize:
+            return Plan(f"{title}, specialize=False", self._last_code, ())
+        scan = self._last_scan
+        if scan is not None:
+            count = self.scanner.count
+            if scan.missing:
+                omissions.append(
+                    Omission(
+                        "missing readings",
+                        f"{scan.missing} of {count} readings say nothing",
+                        f"{share(scan.missing, count)} of the beams",
+                    )
+                )
+            if len(scan.max_columns):
+                omissions.append(
+                    Omission(
+                        "max readings",
+                        f"{len(scan.max_columns)} of {count} readings have probability z_max at every pose",
+                        f"{share(len(scan.max_columns), count)} of the beams",
+                    )
+                )
+            if scan.thinned:
+                omissions.append(
+                    Omission(
+                        "thinned beams",
+                        f"beams= leaves out {scan.thinned}",
+                        f"{share(scan.thinned, count)} of the beams",
+                    )
+                )
+        return Plan(title, self._last_code, tuple(omissions))

@@ -1,0 +1,115 @@
+"""The intrinsic parameters of the measurement models: frozen, validated dataclasses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, Self
+
+from gpusense import _checks
+
+_WEIGHT_SUM_TOLERANCE = 1e-6
+
+
+class _Parameters:
+    """What the parameter classes share."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields by name, as plain numbers and strings."""
+        return asdict(self)  # type: ignore[call-overload]
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The parameters that :meth:`to_dict` wrote; a field that is left out takes its default.
+
+        Raises:
+            TypeError: ``values`` is not a mapping, or a value is not of its field's kind.
+            ValueError: a key names no field, or a value breaks its field's rule.
+        """
+        if not isinstance(values, Mapping):
+            raise TypeError(f"values: must be a mapping, got {_checks.show(values)}")
+        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        for key in values:
+            if key not in names:
+                rule = f"every field must be one of {', '.join(names)}"
+                raise ValueError(f"{cls.__name__}: {rule}, got {_checks.show(key)}")
+        return cls(**values)
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed.
+
+        Raises:
+            TypeError: a value is not of its field's kind.
+            ValueError: a name is no field's, or the result breaks a rule.
+        """
+        return self.from_dict({**self.to_dict(), **changes})
+
+    def _check(self, name: str, **limits: float) -> None:
+        """Hold one field to its limits and store it as a float."""
+        object.__setattr__(self, name, _checks.real(name, getattr(self, name), **limits))
+
+    def _check_weights(self, *names: str) -> None:
+        for name in names:
+            self._check(name, low=0)
+        total = math.fsum(getattr(self, name) for name in names)
+        if abs(total - 1.0) > _WEIGHT_SUM_TOLERANCE:
+            rule = f"must be 1 within {_WEIGHT_SUM_TOLERANCE:.0e}"
+            raise ValueError(f"{' + '.join(names)}: {rule}, got {total}")
+
+
+@dataclass(frozen=True)
+class BeamParameters(_Parameters):
+    """The beam model's parameters, *Probabilistic Robotics* section 6.3.
+
+    Raises:
+        TypeError: a value is not a real number.
+        ValueError: a value breaks its field's rule, or the four weights do not sum to 1 within 1e-6.
+    """
+
+    z_hit: float = 0.7
+    """The weight of a correct range with local noise, >= 0 [1] (6.3.1, item 1)."""
+    z_short: float = 0.1
+    """The weight of an unexpected, nearer object, >= 0 [1] (6.3.1, item 2)."""
+    z_max: float = 0.1
+    """The weight of no return, >= 0 [1] (6.3.1, item 3)."""
+    z_rand: float = 0.1
+    """The weight of a random reading, >= 0 [1] (6.3.1, item 4)."""
+    sigma_hit: float = 0.05
+    """The standard deviation of a correct range, > 0 [m] (equation 6.4)."""
+    lambda_short: float = 0.2
+    """The rate of unexpected objects along the beam, >= 0 [1/m] (equation 6.6)."""
+
+    def __post_init__(self) -> None:
+        self._check_weights("z_hit", "z_short", "z_max", "z_rand")
+        self._check("sigma_hit", above=0)
+        self._check("lambda_short", low=0)
+
+
+@dataclass(frozen=True)
+class LikelihoodFieldParameters(_Parameters):
+    """The likelihood field's parameters, *Probabilistic Robotics* section 6.4.
+
+    Raises:
+        TypeError: a value is not of its field's kind.
+        ValueError: a value breaks its field's rule, or the three weights do not sum to 1 within 1e-6.
+    """
+
+    z_hit: float = 0.9
+    """The weight of a correct range with local noise, >= 0 [1] (6.4.1)."""
+    z_max: float = 0.0
+    """The weight of no return, >= 0 [1]; 0 leaves such readings out, as the book does (6.4.1)."""
+    z_rand: float = 0.1
+    """The weight of a random reading, >= 0 [1] (6.4.1)."""
+    sigma_hit: float = 0.2
+    """The standard deviation of an end point's distance to the nearest obstacle, > 0 [m] (table 6.3)."""
+    max_distance: float = 2.0
+    """The distance to the nearest obstacle is capped at this, > 0 [m]."""
+    interpolation: Literal["nearest", "bilinear"] = "nearest"
+    """How the distance is read between cell centres: that of the end point's cell, or bilinear."""
+
+    def __post_init__(self) -> None:
+        self._check_weights("z_hit", "z_max", "z_rand")
+        self._check("sigma_hit", above=0)
+        self._check("max_distance", above=0)
+        _checks.choice("interpolation", self.interpolation, ("nearest", "bilinear"))

@@ -1,0 +1,67 @@
+"""Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum (book table 6.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.error_free import BLOCK_TERMS, add_term
+from gpusense.reference.mixture import log_density
+from gpusense.reference.raycast import cast_ranges
+
+
+def score_beams(
+    flags: frozenset[str],
+    squares: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    first: np.ndarray,
+    reading: np.ndarray,
+    terms: np.ndarray,
+    log_p: np.ndarray,
+    parts: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    rays: int,
+    readings: int,
+    limit: np.floating,
+    resolution: np.floating,
+    range_max: np.floating,
+    fixed: np.floating,
+    temperature: np.floating,
+) -> None:
+    """Readings of ray r are first[r] to first[r + 1] - 1; what does not depend on the pose is fixed."""
+    real = pose.dtype
+    block = max((1 << 20) // max(readings, 1), 1)
+    ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
+    for begin in range(0, particles, block):
+        end = min(begin + block, particles)
+        ranges = np.empty((end - begin) * rays, real)
+        cast_ranges(
+            flags, squares, pose_cell[begin:end], pose[begin:end], ray, ranges, rows, cols, end - begin, rays,
+            limit, resolution, range_max,
+        )  # fmt: skip
+        expected = ranges.reshape(end - begin, rays)[:, ray_of]
+        z = np.broadcast_to(reading[:readings], expected.shape)
+        term = log_density(flags, z, expected, terms)
+        if "ALL_READINGS" in flags:
+            term = np.where(np.isnan(z), 0, np.where(np.isinf(z), terms[7], term)).astype(real)
+        if "PER_BEAM" in flags:
+            parts[begin * readings : end * readings] = term.ravel()
+        log_p[begin:end] = sum_terms(term, fixed, temperature)
+
+
+def sum_terms(term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:
+    """Sum of (M, K) terms and a fixed one, in the order of the beams; -inf where one term is.
+
+    BLOCK_TERMS terms are added plainly, then the block's sum to a compensated total.
+    """
+    finite = np.where(np.isneginf(term), 0, term).astype(term.dtype)
+    total = (np.full(len(term), fixed, term.dtype), np.zeros(len(term), term.dtype))
+    for first in range(0, term.shape[1] + 1, BLOCK_TERMS):
+        block = np.zeros(len(term), term.dtype)
+        for k in range(first, min(first + BLOCK_TERMS, term.shape[1])):
+            block += finite[:, k]
+        total = add_term(total, block)
+    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * (total[0] + total[1]))

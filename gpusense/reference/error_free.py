@@ -1,0 +1,38 @@
+"""Error-free transformations: what a rounded operation leaves behind is kept in a second number.
+
+Source: Knuth (``two_sum``), Dekker and Veltkamp (``two_product``).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+BLOCK_TERMS = 16
+
+
+def two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``a + b = sum + error`` exactly."""
+    total = a + b
+    shift = total - a
+    return total, (a - (total - shift)) + (b - shift)
+
+
+def high_half(a: np.ndarray) -> np.ndarray:
+    """Leading bits of a float, few enough that a product of two such halves is exact."""
+    splitter = a.dtype.type(134217729 if a.dtype == np.float64 else 4097)
+    scaled = splitter * a
+    return scaled - (scaled - a)
+
+
+def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``a * b = product + error`` exactly, short of overflow and underflow."""
+    product = a * b
+    a_high, b_high = high_half(a), high_half(b)
+    a_low, b_low = a - a_high, b - b_high
+    return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+
+
+def add_term(total: tuple[np.ndarray, np.ndarray], term: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One more term in a compensated sum: the running sum, and what its roundings lost."""
+    head, lost = two_sum(total[0], term)
+    return head, total[1] + lost

@@ -1,0 +1,135 @@
+"""Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
+
+The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.beam import sum_terms
+from gpusense.reference.error_free import two_product, two_sum
+
+FIELD_RING = 2
+BLOCK = 1 << 18
+
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def fill_field(
+    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, table: np.ndarray, rows: int, cols: int, cap: int
+) -> None:
+    """Log density of each cell from its squared distance by a table of all squared distances up to the cap."""
+    ring = FIELD_RING
+    padded = table[: (rows + 2 * ring) * (cols + 2 * ring)].reshape(rows + 2 * ring, cols + 2 * ring)
+    padded[ring:-ring, ring:-ring] = density[np.minimum(squared[: rows * cols].reshape(rows, cols), cap)]
+
+
+def field_cell(col: np.ndarray, row: np.ndarray, rows: int, cols: int) -> np.ndarray:
+    """Index of a cell of the padded table; far cells become ring cells."""
+    c = np.clip(col, -FIELD_RING, cols + FIELD_RING - 1)
+    r = np.clip(row, -FIELD_RING, rows + FIELD_RING - 1)
+    return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
+
+
+def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) -> Pair:
+    """``frac + a b + sign c d`` where every factor is a sum of two reals; to about twice the working precision."""
+    ab, cd = two_product(a[0], b[0]), two_product(c[0], d[0])
+    products = two_sum(ab[0], sign * cd[0])
+    total = two_sum(products[0], frac[0])
+    low = (a[0] * b[1] + a[1] * b[0]) + sign * (c[0] * d[1] + c[1] * d[0])
+    return total[0], ((ab[1] + sign * cd[1]) + (products[1] + frac[1])) + (low + total[1])
+
+
+def whole_cells(offset: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """Whole cells below an offset of two parts, and what is left of it in [0, 1)."""
+    whole = np.floor(np.where(np.isfinite(offset[0]), offset[0], 0))
+    left = (offset[0] - whole) + offset[1]
+    carry = np.where(left < 0, -1, np.where(left >= 1, 1, 0)).astype(left.dtype)
+    return (whole + carry).astype(np.int64), left - carry
+
+
+def end_point(
+    flags: frozenset[str], pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray
+) -> tuple[Pair, Pair]:
+    """Cell offsets (x, y) of end points from the pose's cell, and the position within those cells.
+
+    Poses are (M, 1, 4), points (1, K, 2): the reading times the beam's (cos, sin), in cells.
+    """
+    real = pose.dtype.type
+    shift = real(0.5) if "BILINEAR" in flags else real(0)
+    cos, sin = pose[..., 2], pose[..., 3]
+    p, q = point[..., 0], point[..., 1]
+    if "CAREFUL" in flags:
+        c, s = (cos, pose_low[..., 2]), (sin, pose_low[..., 3])
+        u, v = (p, point_low[..., 0]), (q, point_low[..., 1])
+        x = careful_offset((pose[..., 0] - shift, pose_low[..., 0]), c, u, s, v, -1)
+        y = careful_offset((pose[..., 1] - shift, pose_low[..., 1]), s, u, c, v, 1)
+    else:
+        x_plain = (pose[..., 0] - shift) + (cos * p - sin * q)
+        y_plain = (pose[..., 1] - shift) + (sin * p + cos * q)
+        x, y = (x_plain, np.zeros_like(x_plain)), (y_plain, np.zeros_like(y_plain))
+    (col, left_x), (row, left_y) = whole_cells(x), whole_cells(y)
+    return (col, row), (left_x, left_y)
+
+
+def bilinear(table: np.ndarray, col: np.ndarray, row: np.ndarray, rest: Pair, rows: int, cols: int) -> np.ndarray:
+    """Smooth distance between the four cell centres around an end point."""
+    a = table[field_cell(col, row, rows, cols)]
+    b = table[field_cell(col + 1, row, rows, cols)]
+    c = table[field_cell(col, row + 1, rows, cols)]
+    d = table[field_cell(col + 1, row + 1, rows, cols)]
+    low, high = a + rest[0] * (b - a), c + rest[0] * (d - c)
+    return low + rest[1] * (high - low)
+
+
+def log_field(flags: frozenset[str], distance: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """terms = (hit, 1 / sigma, rand, log z_max): z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, or logarithms."""
+    u = distance * terms[1]
+    half = terms.dtype.type(0.5)
+    if "LINEAR" not in flags:
+        return np.logaddexp(terms[0] - half * u * u, terms[2])
+    p = np.full(distance.shape, terms[2])
+    if "HIT" in flags:
+        p += terms[0] * np.exp(-half * u * u)
+    return np.log(p)
+
+
+def score_field(
+    flags: frozenset[str],
+    table: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    point: np.ndarray,
+    point_low: np.ndarray,
+    terms: np.ndarray,
+    log_p: np.ndarray,
+    parts: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    readings: int,
+    guard: np.floating,
+    fixed: np.floating,
+    temperature: np.floating,
+) -> None:
+    """The table holds log densities, or capped distances in metres where it is interpolated."""
+    block = max(BLOCK // max(readings, 1), 1)
+    points = point[None, :readings]
+    for begin in range(0, particles, block):
+        some = slice(begin, min(begin + block, particles))
+        low = pose_low[some, None] if "CAREFUL" in flags else pose_low[None, :1]
+        (col, row), rest = end_point(flags, pose[some, None], low, points, point_low[None, :readings])
+        col, row = col + pose_cell[some, None, 0], row + pose_cell[some, None, 1]
+        if "BILINEAR" in flags:
+            term = log_field(flags, bilinear(table, col, row, rest, rows, cols), terms)
+        else:
+            term = table[field_cell(col, row, rows, cols)]
+            term = term if "LOG_TABLE" in flags else log_field(flags, term, terms)
+        if "ALL_READINGS" in flags:
+            x = points[..., 0]
+            term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
+        if "PER_BEAM" in flags:
+            parts[begin * readings : some.stop * readings] = term.ravel()
+        log_p[some] = sum_terms(term, fixed, temperature)

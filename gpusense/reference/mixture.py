@@ -1,0 +1,60 @@
+"""Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
+
+``terms`` = (hit, 1 / sigma, 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max). In the linear domain hit is
+z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain their logarithms.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import erf
+
+TINY = 1e-30
+SMALLEST_RANGE = 1e-37
+
+
+def hit_mass(expected: np.ndarray, erf_scale: np.floating, range_max: np.floating) -> np.ndarray:
+    """Mass of the normal around z* on [0, range_max]: a sum of positive terms, so nothing cancels."""
+    half = expected.dtype.type(0.5)
+    return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
+
+
+def short_factor(x: np.ndarray) -> np.ndarray:
+    """``x / (1 - exp(-x))`` for x >= 0 as h / tanh(h) + h with h = x / 2."""
+    h = x.dtype.type(0.5) * x
+    safe = np.where(h > TINY, h, 1)
+    return np.where(h > TINY, safe / np.tanh(safe) + h, x.dtype.type(1))
+
+
+def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
+    if "LINEAR" in flags:
+        return _linear(flags, z, expected, terms)
+    half = terms.dtype.type(0.5)
+    parts = []
+    if "HIT" in flags:
+        u = (z - expected) * terms[1]
+        parts.append(terms[0] - half * u * u - np.log(hit_mass(expected, terms[2], terms[6])))
+    if "SHORT" in flags:
+        inside = (z <= expected) & (expected > 0)
+        x = terms[4] * expected
+        log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
+        parts.append(np.where(inside, log_p, -np.inf))
+    if "RAND" in flags:
+        parts.append(np.broadcast_to(terms[5], z.shape))
+    if len(parts) == 1:
+        return parts[0].astype(terms.dtype)
+    return np.logaddexp.reduce(parts, axis=0).astype(terms.dtype)
+
+
+def _linear(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    half = terms.dtype.type(0.5)
+    p = np.zeros(z.shape, terms.dtype)
+    if "HIT" in flags:
+        u = (z - expected) * terms[1]
+        p += terms[0] * np.exp(-half * u * u) / hit_mass(expected, terms[2], terms[6])
+    if "SHORT" in flags:
+        decay = np.exp(-terms[4] * z) / np.maximum(expected, SMALLEST_RANGE)
+        density = terms[3] * short_factor(terms[4] * expected) * decay
+        p += np.where((z <= expected) & (expected > 0), density, 0)
+    return np.log(p + terms[5])

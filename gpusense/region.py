@@ -1,0 +1,91 @@
+"""The part of a map that a cloud of particles can reach: everything else is left out until the cloud moves there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.frames import Mount, to_grid
+from gpusense.grid import OccupancyGrid
+
+# Maps smaller than this are prepared faster than it takes to think about it.
+SMALLEST_CELLS = 1 << 20
+# A region that covers more than this share of the map is not worth refreshing.
+LARGEST_SHARE = 0.6
+# Room to move, as a share of the reach, before a region is made anew.
+SLACK = 0.5
+
+
+@dataclass(frozen=True)
+class Region:
+    """Half-open window of a grid's rows and columns."""
+
+    row: int
+    col: int
+    rows: int
+    cols: int
+
+    @property
+    def cells(self) -> int:
+        """Number of cells."""
+        return self.rows * self.cols
+
+    def contains(self, other: Region) -> bool:
+        """Whether the other window lies inside."""
+        return (
+            self.row <= other.row
+            and self.col <= other.col
+            and other.row + other.rows <= self.row + self.rows
+            and other.col + other.cols <= self.col + self.cols
+        )
+
+    def cut(self, array: np.ndarray) -> np.ndarray:
+        """The window of a (H, W) array."""
+        return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
+
+
+def whole(grid: OccupancyGrid) -> Region:
+    """The window of all cells."""
+    return Region(0, 0, *grid.shape)
+
+
+def needed(grid: OccupancyGrid, poses: np.ndarray, mount: Mount, reach: float, slack: float = 0.0) -> Region:
+    """Smallest window that holds all cells within ``reach`` cells of any sensor, at least one cell.
+
+    Args:
+        grid: The map.
+        poses: (N, 3) float64 robot poses, N > 0.
+        mount: The sensor's pose on the robot.
+        reach: Longest distance in cells that matters, ring and rounding included.
+        slack: Cells added on every side.
+    """
+    x, y = to_grid(grid, poses[:, 0] - grid.origin[0], poses[:, 1] - grid.origin[1])
+    margin = reach + slack + np.hypot(mount[0], mount[1]) / grid.resolution + 3
+    rows, cols = grid.shape
+    low_col, high_col = (int(np.clip(v, 0, cols)) for v in (x.min() - margin, x.max() + margin))
+    low_row, high_row = (int(np.clip(v, 0, rows)) for v in (y.min() - margin, y.max() + margin))
+    low_col, low_row = min(low_col, cols - 1), min(low_row, rows - 1)
+    return Region(low_row, low_col, max(high_row - low_row, 1), max(high_col - low_col, 1))
+
+
+def choose(grid: OccupancyGrid, current: Region | None, poses: np.ndarray, mount: Mount, reach: float) -> Region:
+    """The window to prepare for a cloud of N > 0 poses: the current one where it suffices, else one with room."""
+    everything = whole(grid)
+    if current == everything or everything.cells < SMALLEST_CELLS:
+        return everything
+    least = needed(grid, poses, mount, reach)
+    if current is not None and current.contains(least):
+        return current
+    roomy = needed(grid, poses, mount, reach, SLACK * reach)
+    if current is not None:
+        row, col = min(roomy.row, current.row), min(roomy.col, current.col)
+        joined = Region(
+            row,
+            col,
+            max(roomy.row + roomy.rows, current.row + current.rows) - row,
+            max(roomy.col + roomy.cols, current.col + current.cols) - col,
+        )
+        # A cloud that jumped far away does not drag its old window along.
+        roomy = joined if joined.cells <= 2 * (roomy.cells + current.cells) else roomy
+    return everything if roomy.cells > LARGEST_SHARE * everything.cells else roomy

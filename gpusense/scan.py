@@ -1,0 +1,150 @@
+"""A scan on its way to a device: which readings depend on the pose, which rays they share, what is constant.
+
+Readings are classed first and thinned afterwards, so that ``beams=60`` means 60 informative beams.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._checks import array, integer
+from gpusense.scanner import Reading, Scanner, classify
+
+Beams = int | Sequence[int] | np.ndarray | None
+
+
+@dataclass(frozen=True)
+class PreparedScan:
+    """What a launch needs of a scan.
+
+    Attributes:
+        columns: (M,) positions in the scan of the readings that are evaluated, in the order of their rays.
+        readings: (M,) their ranges in metres; NaN (missing) and inf (max) only where nothing is left out.
+        vectors: (M, 2) float64 cosine and sine of their bearings.
+        rays: (R, 2) the bearings that are cast.
+        first: (R + 1,) int32; readings of ray r are first[r] to first[r + 1] - 1.
+        constant: Log-likelihood of the readings that do not depend on the pose.
+        max_columns: Positions of max readings that are in the constant.
+        missing: Readings without information, left out.
+        thinned: Informative readings left out by ``beams=``.
+    """
+
+    columns: np.ndarray
+    readings: np.ndarray
+    vectors: np.ndarray
+    rays: np.ndarray
+    first: np.ndarray
+    constant: float
+    max_columns: np.ndarray
+    missing: int
+    thinned: int
+
+    @property
+    def shared(self) -> bool:
+        """Whether several readings share a ray."""
+        return len(self.rays) < len(self.readings)
+
+
+def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:
+    """Whether each reading is used: all, an even choice of ``beams`` informative ones, or those of given indices."""
+    informative = (kinds == Reading.HIT) | ((kinds == Reading.MAX) & informative_max)
+    if beams is None:
+        return informative
+    if isinstance(beams, (int, np.integer)):
+        places = np.flatnonzero(informative)
+        if len(places) <= beams:
+            return informative
+        chosen = np.zeros(len(kinds), bool)
+        chosen[places[(np.arange(beams) * len(places)) // max(int(beams), 1)]] = True
+        return chosen
+    chosen = np.zeros(len(kinds), bool)
+    chosen[np.asarray(beams, dtype=np.intp)] = True
+    return chosen & informative
+
+
+def check_beams(beams: Beams, count: int) -> Beams:
+    """Validate ``beams=`` for a scanner of ``count`` beams.
+
+    Raises:
+        ValueError: a number below 0, or an index outside the scan.
+        TypeError: not an integer or a list of them.
+    """
+    if beams is None:
+        return None
+    if isinstance(beams, (int, np.integer)):
+        return integer("beams", beams, low=0)
+    indices = np.asarray(beams)
+    if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
+        raise TypeError(f"beams: must be a number of beams or a list of beam indices, got {beams!r}")
+    outside = (indices < 0) | (indices >= count)
+    if outside.any():
+        raise ValueError(f"beams: indices must be in [0, {count}), got {indices[outside][0]}")
+    return np.unique(indices)
+
+
+def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
+    """Readings of one scan (K,) or of several (S, K), in their own float dtype."""
+    checked = np.asarray(ranges)
+    shape = ("S", scanner.count) if checked.ndim == 2 else (scanner.count,)
+    return array("ranges", ranges, shape=shape, finite=False, dtype=None)
+
+
+def prepare_scan(
+    ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float, beams: Beams, specialize: bool
+) -> PreparedScan:
+    """Class, choose and group the readings of one scan.
+
+    Args:
+        ranges: (K,) metres.
+        scanner: Its geometry.
+        vectors: (K, 2) float64 cosine and sine of the bearings, mount included.
+        z_max: Probability of a max reading; 0 makes it missing.
+        beams: Which beams are used.
+        specialize: False keeps readings without information, and casts equal bearings one by one.
+    """
+    kinds = classify(ranges, scanner)
+    used = choose_beams(kinds, beams, z_max > 0)
+    is_max = used & (kinds == Reading.MAX)
+    hit = used & (kinds == Reading.HIT)
+    informative = int(np.count_nonzero((kinds == Reading.HIT) | ((kinds == Reading.MAX) & (z_max > 0))))
+    values = np.where(hit, ranges, 0).astype(np.float64)
+    if specialize:
+        columns = np.flatnonzero(hit)
+        constant = float(np.count_nonzero(is_max) * np.log(z_max)) if is_max.any() else 0.0
+    else:
+        columns = np.arange(len(kinds))
+        values[~hit] = np.nan
+        values[is_max] = np.inf
+        constant = 0.0
+        is_max = np.zeros_like(is_max)
+    rays, first, order = _group(vectors[columns], specialize)
+    return PreparedScan(
+        columns=columns[order],
+        readings=values[columns][order],
+        vectors=vectors[columns][order],
+        rays=rays,
+        first=first,
+        constant=constant,
+        max_columns=np.flatnonzero(is_max),
+        missing=len(kinds) - informative,
+        thinned=informative - int(np.count_nonzero(used)),
+    )
+
+
+def _group(vectors: np.ndarray, share: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays without repetition, the readings of each, and the order of readings that makes them neighbours."""
+    count = len(vectors)
+    plain = (vectors, np.arange(count + 1, dtype=np.int32), np.arange(count))
+    if not share or count < 2:
+        return plain
+    rays, index, inverse = np.unique(vectors, axis=0, return_index=True, return_inverse=True)
+    if len(rays) == count:
+        return plain
+    rank = np.argsort(np.argsort(index))
+    ray_of = rank[inverse.ravel()]
+    order = np.argsort(ray_of, kind="stable")
+    first = np.concatenate([[0], np.cumsum(np.bincount(ray_of, minlength=len(rays)))]).astype(np.int32)
+    return vectors[np.sort(index)], first, order

@@ -1,0 +1,120 @@
+"""One row per kernel: its file, launch shape and arguments in order. Every backend binds its arguments from here.
+
+A kernel has three bodies (NumPy reference, OpenCL, Warp) with the same name and the same arguments; a test holds the
+three to this table. ``real`` stands for the precision of a model, float32 or float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+FLAGS = {
+    "FLOAT64": "real numbers are float64",
+    "ORIGINS_OUTSIDE": "some beam starts outside the grid",
+    "OUTSIDE_OCCUPIED": "what lies outside the grid is a wall",
+    "HIT": "z_hit > 0",
+    "SHORT": "z_short > 0",
+    "RAND": "z_rand > 0",
+    "SINGLE": "the mixture has one continuous component",
+    "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
+    "SHARED_RAYS": "several readings have the same bearing",
+    "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
+    "PER_BEAM": "the log-likelihood of each reading is wanted",
+    "BILINEAR": "the field is interpolated",
+    "LOG_TABLE": "the field's table holds log densities, not distances",
+    "CAREFUL": "end points need more than the working precision to fall into the right cell",
+}
+
+_SCALARS: dict[str, np.dtype] = {"int": np.dtype(np.int32), "uchar": np.dtype(np.uint8)}
+_WIDTHS = {"": 1, "2": 2, "4": 4}
+
+
+@dataclass(frozen=True)
+class Argument:
+    """One argument of a kernel: an array (with its shape in words) or a scalar (shape None)."""
+
+    name: str
+    type: str
+    shape: str | None = None
+    output: bool = False
+
+    @property
+    def width(self) -> int:
+        """Numbers per element: 4 for real4."""
+        return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
+
+    def dtype(self, real: np.dtype) -> np.dtype:
+        """NumPy dtype of one number of the argument."""
+        base = self.type.rstrip("24")
+        return real if base == "real" else _SCALARS[base]
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel: the concept (file) it belongs to, what one work-item is, its arguments, and its work-group size.
+
+    A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group.
+    """
+
+    file: str
+    launch: tuple[str, ...]
+    arguments: tuple[Argument, ...]
+    group: int
+
+
+def _kernel(file: str, launch: str, *rows: str, group: int = 64) -> Kernel:
+    arguments = []
+    for row in rows:
+        head, _, shape = row.partition("[")
+        *output, kind, name = head.split()
+        arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group)
+
+
+_MAP = ("int rows", "int cols")
+_POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
+_RANGE = ("real limit", "real resolution", "real range_max")
+_RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
+
+KERNELS: dict[str, Kernel] = {
+    "distance_lines": _kernel(
+        "distance", "line", "uchar occupied [rows * cols]", "out int along [rows * cols]",
+        "int lines", "int length", "int line_stride", "int step", group=16,
+    ),
+    "distance_envelope": _kernel(
+        "distance", "line", "int along [rows * cols]", "out int starts [rows * cols]", "out int squared [rows * cols]",
+        "int lines", "int length", "int line_stride", "int step", group=16,
+    ),
+    "square_runs": _kernel(
+        "squares", "row direction", "uchar occupied [rows * cols]", "out uchar runs [2 * rows * cols]", *_MAP,
+        group=16,
+    ),
+    "squares_rows": _kernel(
+        "squares", "plane", "uchar runs [2 * rows * cols]", "out uchar squares [4 * (rows + 2) * (cols + 2)]", *_MAP,
+        group=1,
+    ),
+    "squares_scan": _kernel(
+        "squares", "cell plane", "uchar runs [2 * rows * cols]", "out uchar squares [4 * (rows + 2) * (cols + 2)]",
+        *_MAP,
+    ),
+    "cast_ranges": _kernel(
+        "raycast", "ray particle", "uchar squares [4 * (rows + 2) * (cols + 2)]", *_POSES, "real2 ray [rays]",
+        "out real ranges [particles * rays]", *_MAP, "int particles", "int rays", *_RANGE,
+    ),
+    "score_beams": _kernel(
+        "beam", "particle", "uchar squares [4 * (rows + 2) * (cols + 2)]", *_POSES, "real2 ray [rays]",
+        "int first [rays + 1]", "real reading [readings]", "real terms [8]", *_RESULT, *_MAP, "int particles",
+        "int rays", "int readings", *_RANGE, "real fixed", "real temperature",
+    ),
+    "fill_field": _kernel(
+        "field", "col row", "int squared [rows * cols]", "real density [cap + 1]",
+        "out real table [(rows + 4) * (cols + 4)]", *_MAP, "int cap",
+    ),
+    "score_field": _kernel(
+        "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [4]", *_RESULT, *_MAP, "int particles",
+        "int readings", "real guard", "real fixed", "real temperature",
+    ),
+}  # fmt: skip

@@ -1,0 +1,86 @@
+"""OpenCL source of one program: prelude, the files a kernel requires in order, and only the branches its spec needs."""
+
+from __future__ import annotations
+
+import re
+
+from gpusense._kernel_files import opencl_source
+from gpusense.signatures import FLAGS
+
+_PRELUDE = """\
+#pragma OPENCL FP_CONTRACT OFF
+{extension}typedef {real} real;
+typedef {real}2 real2;
+typedef {real}4 real4;
+#define FLOAT64 {float64}
+#define SPLITTER ((real){splitter})
+"""
+_REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
+_CONDITION = re.compile(r"#if (!?)([A-Z0-9_]+)$")
+
+
+def prelude(*, float64: bool) -> str:
+    """What every program begins with: no contraction, and the meaning of ``real``."""
+    return _PRELUDE.format(
+        extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 else "",
+        real="double" if float64 else "float",
+        float64=int(float64),
+        splitter="134217729" if float64 else "4097",
+    )
+
+
+def required_files(name: str) -> list[str]:
+    """Kernel files that a file needs, itself last."""
+    files: list[str] = []
+    match = _REQUIRES.search(opencl_source(name))
+    for needed in match.group(1).split() if match else ():
+        files += [file for file in required_files(needed) if file not in files]
+    return [*files, name]
+
+
+def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
+    """Keep the taken branches of ``#if FLAG``, ``#if !FLAG``, ``#else``, ``#endif`` and drop the rest.
+
+    Raises:
+        ValueError: a condition that is not a single known flag, or unbalanced directives.
+    """
+    kept: list[str] = []
+    taken: list[bool] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        directive = line.strip()
+        if directive.startswith("#if"):
+            match = _CONDITION.match(directive)
+            if match is None or match.group(2) not in FLAGS:
+                raise ValueError(f"{name}:{number}: condition must be one known flag, got {directive!r}")
+            taken.append((match.group(2) in flags) != (match.group(1) == "!"))
+        elif directive in ("#else", "#endif"):
+            if not taken:
+                raise ValueError(f"{name}:{number}: {directive} without #if")
+            last = taken.pop()
+            if directive == "#else":
+                taken.append(not last)
+        elif all(taken):
+            kept.append(line)
+    if taken:
+        raise ValueError(f"{name}: #if without #endif")
+    return "\n".join(kept) + "\n"
+
+
+def assemble(file: str, flags: frozenset[str]) -> str:
+    """Complete OpenCL C source of a kernel file for a set of flags."""
+    parts = [prelude(float64="FLOAT64" in flags)]
+    for needed in required_files(file):
+        parts += [f"// ---- {needed}.cl\n", resolve(opencl_source(needed), flags, f"{needed}.cl")]
+    return "".join(parts)
+
+
+def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
+    """The flags that change a kernel file's code, so that one program serves all specs that agree on them."""
+    text = "".join(opencl_source(needed) for needed in required_files(file))
+    words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
+    unknown = flags - FLAGS.keys()
+    if unknown:
+        raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")
+    if re.search(r"\breal\b", text):
+        words.add("FLOAT64")
+    return flags & words

@@ -1,0 +1,34 @@
+// Error-free transformations: what a rounded operation leaves behind is kept in a second number.
+// Source: Knuth (two_sum), Dekker and Veltkamp (two_product). They need FP_CONTRACT OFF and no fast-math.
+
+// a + b = sum.x + sum.y exactly.
+real2 two_sum(const real a, const real b) {
+    const real sum = a + b;
+    const real shift = sum - a;
+    return (real2)(sum, (a - (sum - shift)) + (b - shift));
+}
+
+// High half of a float: its leading bits, few enough that a product of two such halves is exact.
+real high_half(const real a) {
+    const real scaled = SPLITTER * a;
+    return scaled - (scaled - a);
+}
+
+// a * b = product.x + product.y exactly, short of overflow and underflow.
+real2 two_product(const real a, const real b) {
+    const real product = a * b;
+    const real a_high = high_half(a), b_high = high_half(b);
+    const real a_low = a - a_high, b_low = b - b_high;
+    const real error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;
+    return (real2)(product, error);
+}
+
+// Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of
+// compensating every term, at nearly the cost of none.
+#define BLOCK_TERMS 16
+
+// One more term in a compensated sum: total.x is the running sum, total.y what its roundings lost.
+real2 add_term(const real2 total, const real term) {
+    const real2 sum = two_sum(total.x, term);
+    return (real2)(sum.x, total.y + sum.y);
+}

@@ -1,0 +1,163 @@
+// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
+// The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
+// requires: error_free
+
+#define FIELD_RING 2
+
+// Log density of each cell from its squared distance by a table of all squared distances up to the cap.
+kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
+                       const int cols, const int cap) {
+    const int col = get_global_id(0), row = get_global_id(1);
+    if (row >= rows || col >= cols) return;
+    const long cell = (long)(row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING;
+    table[cell] = density[min(squared[(long)row * cols + col], cap)];
+}
+
+// i held to [0, last]; some drivers call clamp as a function.
+int within(const int i, const int last) { return i < 0 ? 0 : i > last ? last : i; }
+
+// Index of a cell of the padded table; far cells become ring cells.
+int field_cell(const int col, const int row, const int rows, const int cols) {
+    const int c = within(col + FIELD_RING, cols + 2 * FIELD_RING - 1);
+    const int r = within(row + FIELD_RING, rows + 2 * FIELD_RING - 1);
+    return r * (cols + 2 * FIELD_RING) + c;
+}
+
+#if CAREFUL
+// frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
+// the working precision.
+real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2 c, const real2 d, const real sign) {
+    const real2 ab = two_product(a.x, b.x), cd = two_product(c.x, d.x);
+    const real2 products = two_sum(ab.x, sign * cd.x);
+    const real2 sum = two_sum(products.x, frac.x);
+    const real low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x);
+    return (real2)(sum.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + sum.y));
+}
+#endif
+
+// Largest integer not above a.
+int floor_int(const real a) {
+    const int whole = (int)a;
+    return whole - ((real)whole > a);
+}
+
+#if CAREFUL
+// Whole cells below an offset of two parts, and what is left of it in [0, 1).
+int whole_cells(const real2 offset, real *rest) {
+    const int whole = floor_int(offset.x);
+    const real left = (offset.x - (real)whole) + offset.y;
+    const int carry = (left >= 1) - (left < 0);
+    *rest = left - (real)carry;
+    return whole + carry;
+}
+#endif
+
+// Cell offsets of an end point from the pose's cell, and the position within that cell.
+// point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
+// nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
+int2 end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
+               const real guard, real2 *rest) {
+    const real x = (pose.x - shift) + (pose.z * point.x - pose.w * point.y);
+    const real y = (pose.y - shift) + (pose.w * point.x + pose.z * point.y);
+    int whole_x = floor_int(x), whole_y = floor_int(y);
+    real left_x = x - (real)whole_x, left_y = y - (real)whole_y;
+#if CAREFUL
+#if !BILINEAR
+    if (left_x < guard || left_y < guard || left_x > 1 - guard || left_y > 1 - guard)
+#endif
+    {
+        const real2 c = (real2)(pose.z, pose_low.z), s = (real2)(pose.w, pose_low.w);
+        const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
+        whole_x = whole_cells(careful_offset((real2)(pose.x - shift, pose_low.x), c, p, s, q, (real)-1), &left_x);
+        whole_y = whole_cells(careful_offset((real2)(pose.y - shift, pose_low.y), s, p, c, q, (real)1), &left_y);
+    }
+#endif
+    *rest = (real2)(left_x, left_y);
+    return (int2)(whole_x, whole_y);
+}
+
+#if BILINEAR
+// Smooth distance between the four cell centres around an end point.
+real bilinear(global const real *table, const int2 cell, const real2 rest, const int rows, const int cols) {
+    const real a = table[field_cell(cell.x, cell.y, rows, cols)];
+    const real b = table[field_cell(cell.x + 1, cell.y, rows, cols)];
+    const real c = table[field_cell(cell.x, cell.y + 1, rows, cols)];
+    const real d = table[field_cell(cell.x + 1, cell.y + 1, rows, cols)];
+    const real low = a + rest.x * (b - a), high = c + rest.x * (d - c);
+    return low + rest.y * (high - low);
+}
+#endif
+
+#if !LOG_TABLE
+// terms[4] = {hit, 1 / sigma, rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms in the
+// log domain.
+real log_field(const real distance, global const real *terms) {
+    const real u = distance * terms[1];
+#if LINEAR
+    real p = terms[2];
+#if HIT
+    p += terms[0] * exp((real)-0.5 * u * u);
+#endif
+    return log(p);
+#else
+    const real hit = terms[0] - (real)0.5 * u * u;
+    const real largest = fmax(hit, terms[2]);
+    return largest + log(exp(hit - largest) + exp(terms[2] - largest));
+#endif
+}
+#endif
+
+// One work-item a particle. The table holds log densities, or capped distances in metres where it is interpolated.
+kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
+                        global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
+                        global const real *terms, global real *log_p, global real *parts, const int rows,
+                        const int cols, const int particles, const int readings, const real guard,
+                        const real fixed, const real temperature) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    const int2 origin = pose_cell[n];
+#if CAREFUL
+    const real4 low = pose_low[n];
+#else
+    const real4 low = (real4)(0);
+#endif
+    real2 total = (real2)(fixed, 0);
+#if BILINEAR
+    const real shift = (real)0.5;
+#else
+    const real shift = 0;
+#endif
+    real block = 0;
+    for (int k = 0; k < readings; ++k) {
+        real term;
+#if ALL_READINGS
+        if (isnan(point[k].x))
+            term = 0;
+        else if (isinf(point[k].x))
+            term = terms[3];
+        else
+#endif
+        {
+            real2 rest;
+            const int2 offset = end_point(pose[n], low, point[k], point_low[k], shift, guard, &rest);
+#if BILINEAR
+            term = log_field(bilinear(table, origin + offset, rest, rows, cols), terms);
+#else
+            term = table[field_cell(origin.x + offset.x, origin.y + offset.y, rows, cols)];
+#if !LOG_TABLE
+            term = log_field(term, terms);
+#endif
+#endif
+        }
+#if PER_BEAM
+        parts[(long)n * readings + k] = term;
+#endif
+        block += term;
+        if ((k + 1) % BLOCK_TERMS == 0) {
+            total = add_term(total, block);
+            block = 0;
+        }
+    }
+    total = add_term(total, block);
+    log_p[n] = temperature * (total.x + total.y);
+}

@@ -1,0 +1,78 @@
+// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
+// terms[8] = {hit, 1 / sigma, 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max}. In the linear domain hit
+// is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain their logarithms.
+
+// Above this the error function is 1 to the last bit.
+#define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
+// Keeps 1 / z* finite.
+#define SMALLEST_RANGE ((real)1e-37)
+
+#if HIT
+// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
+real hit_mass(const real expected, const real erf_scale, const real range_max) {
+    const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
+    if (fmin(below, above) > ERF_ONE) return (real)1;
+    return (real)0.5 * (erf(below) + erf(above));
+}
+#endif
+
+#if SHORT
+// x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
+real short_factor(const real x) {
+    const real h = (real)0.5 * x;
+    return h > TINY ? h / tanh(h) + h : (real)1;
+}
+#endif
+
+#if LINEAR
+// p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+real log_density(const real z, const real expected, global const real *terms) {
+    real p = 0;
+#if HIT
+    const real u = (z - expected) * terms[1];
+    p += terms[0] * exp((real)-0.5 * u * u) / hit_mass(expected, terms[2], terms[6]);
+#endif
+#if SHORT
+    if (z <= expected && expected > 0) {
+        const real x = terms[4] * expected;
+        p += terms[3] * short_factor(x) * exp(-terms[4] * z) / fmax(expected, SMALLEST_RANGE);
+    }
+#endif
+    return log(p + terms[5]);
+}
+#else
+// Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
+real log_density(const real z, const real expected, global const real *terms) {
+    real largest = -INFINITY;
+#if HIT
+    const real u = (z - expected) * terms[1];
+    const real hit = terms[0] - (real)0.5 * u * u - log(hit_mass(expected, terms[2], terms[6]));
+    largest = hit;
+#endif
+#if SHORT
+    real shorter = -INFINITY;
+    if (z <= expected && expected > 0)
+        shorter = terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
+    largest = fmax(largest, shorter);
+#endif
+#if RAND
+    largest = fmax(largest, terms[5]);
+#endif
+#if SINGLE
+    return largest;
+#else
+    if (isinf(largest)) return largest;
+    real p = 0;
+#if HIT
+    p += exp(hit - largest);
+#endif
+#if SHORT
+    p += exp(shorter - largest);
+#endif
+#if RAND
+    p += exp(terms[5] - largest);
+#endif
+    return largest + log(p);
+#endif
+}
+#endif

@@ -1,0 +1,21 @@
+"""Bad input is refused with the exact message, and leaves no file behind."""
+
+from __future__ import annotations
+
+import pytest
+from bad_input_world import CASES
+
+
+@pytest.mark.parametrize(("action", "kind", "message"), [case[1:] for case in CASES], ids=[c[0] for c in CASES])
+def test_bad_input(tmp_path, action, kind, message):
+    with pytest.raises(kind) as caught:
+        action(tmp_path)
+    assert type(caught.value) is kind
+    assert str(caught.value) == message.replace("{tmp}", str(tmp_path))
+    assert {file.name for file in tmp_path.iterdir()} <= {"input"}
+    assert not [file for file in tmp_path.rglob("*") if file.name.startswith(".")]
+
+
+def test_ids_are_unique():
+    names = [name for name, *_ in CASES]
+    assert len(names) == len(set(names)) >= 45

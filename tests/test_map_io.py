@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from gpusense import map_io
+from gpusense import _images, map_io
 from gpusense.grid import OccupancyGrid
 from gpusense.map_io import read_map, write_map
 
@@ -238,7 +238,7 @@ def test_image_data_in_many_chunks(place):
 
 @pytest.mark.parametrize("kind", ["P2", "P5", "P6", "png", "bmp"])
 def test_every_strip_has_its_place(place, monkeypatch, kind):
-    monkeypatch.setattr(map_io, "_STRIP_CELLS", 16)
+    monkeypatch.setattr(_images, "_STRIP_CELLS", 16)
     greys = np.random.default_rng(1).choice(np.array([0, 205, 254], np.uint8), (13, 7))
     expected = np.where(greys == 0, 100, np.where(greys == 254, 0, -1))[::-1]
     if kind == "P2":

@@ -1,0 +1,191 @@
+"""Speed and error of ray casting, beam model and likelihood field on the devices of this machine.
+
+    python bench/speed.py                            # built-in building, every device present
+    python bench/speed.py --backend opencl --particles 100000 --beams 360 --output bench/results/name
+
+Writes a Markdown table and a JSON file with machine, sizes, times, errors and the command. Times are of one call with
+NumPy arrays in and out, of the launch alone with its arrays on the device, and of the first call with compilation and
+map preparation. Errors are against float64 NumPy on the first particles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+
+CHECKED = 200
+
+
+class Recorder:
+    """Remembers the last launch of a backend, so that it can be timed again with everything on the device."""
+
+    def __init__(self, backend: Any) -> None:
+        self._backend = backend
+        self.last: Callable[[], None] | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Any:
+        """The backend's launcher, remembered with its arguments."""
+        launcher = self._backend.compile(kernel, flags)
+
+        def launch(size: tuple[int, ...], *arguments: Any) -> None:
+            self.last = lambda: launcher(size, *arguments)
+            launcher(size, *arguments)
+
+        return launch
+
+
+def best(run: Callable[[], Any], repeats: int, longest: float) -> tuple[float, float]:
+    """Minimum and median seconds of some calls, fewer where they take longer than ``longest`` altogether."""
+    times: list[float] = []
+    while len(times) < repeats and (not times or sum(times) + times[-1] < longest):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return min(times), float(np.median(times))
+
+
+def measure(name: str, make: Callable[[Any, str], Any], backend: str, poses: np.ndarray, work: int,
+            arguments: argparse.Namespace, call: Callable[[Any, np.ndarray], np.ndarray]) -> dict[str, Any]:  # fmt: skip
+    """One row: times of a model's call on a device, and its largest and median error."""
+    device = Recorder(get_backend(backend))
+    start = time.perf_counter()
+    model = make(device, "float32")
+    result = call(model, poses)
+    first = time.perf_counter() - start
+    least, median = best(lambda: call(model, poses), arguments.repeats, arguments.seconds)
+    assert device.last is not None
+
+    def launch() -> None:
+        assert device.last is not None
+        device.last()
+        device.synchronize()
+
+    kernel, _ = best(launch, arguments.repeats, arguments.seconds)
+    truth = call(make("numpy", "float64"), poses[:CHECKED])
+    same = call(make("numpy", "float32"), poses[:CHECKED])
+    error = np.abs(result[:CHECKED].astype(np.float64) - truth)
+    info = device.info
+    return {
+        "backend": info.selection, "device": info.name, "driver": info.driver, "what": name,
+        "first_s": first, "steady_s": least, "median_s": median, "launch_s": kernel,
+        "rate": work / least, "launch_rate": work / kernel,
+        "median_error": float(np.median(error)), "max_error": float(error.max()),
+        "bits_from_numpy": int(np.count_nonzero(result[:CHECKED] != same)), "checked": int(error.size),
+    }  # fmt: skip
+
+
+def rows_of(backend: str, clouds: dict[str, np.ndarray], scene: Any, arguments: argparse.Namespace) -> list[dict]:
+    """All rows of one device."""
+    grid, scanner, ranges = scene
+    hits = int(np.count_nonzero(gs.classify(ranges, scanner) == gs.Reading.HIT))
+    bilinear = gs.LikelihoodFieldParameters(interpolation="bilinear")
+    rows = []
+    for cloud, poses in clouds.items():
+        cast_poses = poses[: max(arguments.particles // 4, 1)]
+        jobs = (
+            ("ray casting", lambda b, p: gs.RayCaster(grid, scanner.range_max, backend=b, precision=p),
+             lambda m, x: m.cast(x, scanner.bearings), cast_poses, scanner.count),
+            ("beam model", lambda b, p: gs.BeamModel(grid, scanner, backend=b, precision=p),
+             lambda m, x: m.log_likelihood(x, ranges), poses, hits),
+            ("field, nearest", lambda b, p: gs.LikelihoodFieldModel(grid, scanner, backend=b, precision=p),
+             lambda m, x: m.log_likelihood(x, ranges), poses, hits),
+            ("field, bilinear", lambda b, p: gs.LikelihoodFieldModel(grid, scanner, bilinear, backend=b, precision=p),
+             lambda m, x: m.log_likelihood(x, ranges), poses, hits),
+        )  # fmt: skip
+        for name, make, call, some, beams in jobs:
+            row = measure(name, make, backend, some, len(some) * beams, arguments, call)
+            rows.append({"cloud": cloud, "particles": len(some), "beams": beams, **row})
+            print(to_markdown(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
+    return rows
+
+
+def to_markdown(rows: list[dict]) -> str:
+    """The rows as a table."""
+    head = (
+        "| backend | device | what | cloud | particles x beams | M/s, arrays in and out | M/s, launch alone "
+        "| first call s | median / max error | differing bits of checked |\n|" + " --- |" * 10
+    )
+    lines = [
+        f"| {r['backend']} | {r['device']} | {r['what']} | {r['cloud']} | {r['particles']} x {r['beams']} "
+        f"| {r['rate'] / 1e6:.4g} | {r['launch_rate'] / 1e6:.4g} | {r['first_s']:.2f} "
+        f"| {r['median_error']:.1e} / {r['max_error']:.1e} | {r['bits_from_numpy']} of {r['checked']} |"
+        for r in rows
+    ]
+    return "\n".join([head, *lines])
+
+
+def machine() -> dict[str, str]:
+    """What the figures depend on beside the device."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False,
+        cwd=Path(__file__).parent,
+    ).stdout.strip()  # fmt: skip
+    return {
+        "date": time.strftime("%Y-%m-%d"), "python": platform.python_version(), "numpy": np.__version__,
+        "gpusense": gs.__version__, "commit": commit, "platform": platform.platform(terse=True),
+        "threads": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+    }  # fmt: skip
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backend", action="append", help="selection string; default: every device present")
+    parser.add_argument("--particles", type=int, default=20_000)
+    parser.add_argument("--beams", type=int, default=180)
+    parser.add_argument("--size", type=float, default=50.0, help="side of the built-in building in metres")
+    parser.add_argument("--map", type=Path, help="a map_server YAML instead of the built-in building")
+    parser.add_argument("--range-max", type=float, default=30.0)
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=5.0, help="longest time of the repeats of one row")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
+    arguments = parser.parse_args()
+    rng = np.random.default_rng(arguments.seed)
+    grid = gs.read_map(arguments.map) if arguments.map else building(arguments.seed, (arguments.size,) * 2)
+    step = 2 * np.pi / max(arguments.beams, 1)
+    scanner = gs.Scanner.uniform(
+        angle_min=-np.pi, angle_increment=step, count=arguments.beams, range_max=arguments.range_max
+    )
+    pose = free_pose(grid, rng)
+    ranges = simulate_scan(grid, scanner, pose, gs.BeamParameters(), rng)
+    clouds = {
+        "global": cloud_uniform(grid, arguments.particles, rng),
+        "tracking": cloud_around(pose, arguments.particles, 0.3, 0.1, rng),
+    }
+    present = [d.selection for d in gs.devices() if d.available and d.kind != "simulator"]
+    rows = []
+    for backend in arguments.backend or present:
+        rows += rows_of(backend, clouds, (grid, scanner, ranges), arguments)
+    scene = f"{arguments.map.name if arguments.map else 'built-in building'}, {grid.shape[0]} x {grid.shape[1]} cells"
+    command = shlex.join(["python", *sys.argv])
+    report = {"command": command, "scene": scene, "machine": machine(), "rows": rows}
+    table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {machine()}. Command: `{command}`.\n"
+    print(table)
+    if arguments.output:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+        arguments.output.with_suffix(".md").write_text(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,184 @@
+"""How far results may lie apart, and why: the one table that the tests, ``gpusense selftest`` and the documents use.
+
+A float32 result is never held against the float64 result of the same call: they round their inputs differently, and a
+ray that grazes a corner may then end at another wall. Ray casting is judged by bits across devices; a likelihood is
+judged against the float64 reference kernel *on the float32 launch's own rounded inputs and expected ranges* (see
+``gpusense.selftest.replay``). Two devices that each keep a bound against that truth lie at most twice the bound apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from gpusense.reference.error_free import BLOCK_TERMS
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The largest difference allowed.
+
+    Attributes:
+        name: What is compared.
+        value: The largest difference, itself allowed.
+        unit: What the difference is measured in.
+        reason: Where the number comes from.
+    """
+
+    name: str
+    value: float
+    unit: str
+    reason: str
+
+    def allows(self, difference: float) -> bool:
+        """Whether a difference is small enough; NaN never is."""
+        return difference <= self.value
+
+    def twice(self) -> Tolerance:
+        """The tolerance between two results that each keep this one against the truth."""
+        return Tolerance(self.name, 2 * self.value, self.unit, f"both keep half of it; {self.reason}")
+
+
+_ALL = (
+    Tolerance("distance transform", 0, "cells that differ", "squared distances are integers, found exactly"),
+    Tolerance("quadrant squares", 0, "cells that differ", "sides are integers from 0 to 255, found exactly"),
+    Tolerance(
+        "float32 ranges", 0, "values with other bits",
+        "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines come "
+        "from the host",
+    ),
+    Tolerance(
+        "float64 ranges", 1e-12, "relative",
+        "a crossing distance is (k + a) / |d|: four roundings of 1.1e-16 and the conditioning of the direction",
+    ),
+    Tolerance("float32 ranges to float64", 1e-3, "cells", "rounded inputs, for a ray that grazes nothing"),
+    Tolerance("moved origin of a grazing ray", 1e-4, "cells", "backward error: an inverse of float32's 24 bits at 1e3"),
+    Tolerance("moved bearing of a grazing ray", 1e-6, "rad", "backward error: float32 sines and cosines and their sum"),
+    Tolerance(
+        "float32 beam", 16, "eps (1 + |log p_k|)",
+        "exp, log, tanh and division within a few eps, erf within 16 eps (OpenCL), u^2 / 2 within 3 eps of itself",
+    ),
+    Tolerance("float64 beam", 1e-11, "1 + |log p_k|", "a few eps, with room for drivers whose erf or tanh is poor"),
+    Tolerance("float32 scan, K = 1000", 2e-3, "nats", "below what changes a particle's weight by 0.2 %"),
+    Tolerance("float32 scan, K = 10 000", 1e-2, "nats", "below what changes a particle's weight by 1 %"),
+    Tolerance("float64 scan", 1e-11, "1 + |log p|", "a few eps a beam, and a compensated sum"),
+    Tolerance(
+        "field look-ups", 0, "beams in another cell",
+        "end points near a cell's edge are found again with twice the digits, so float32 hits the cells of float64",
+    ),
+    Tolerance("specialize=False, float32", 32, "eps (1 + |log p_k|)", "both keep the bound of one beam"),
+    Tolerance("specialize=False, float64", 2e-11, "1 + |log p_k|", "both keep the bound of one beam"),
+    Tolerance("batching, order, repetition", 0, "values with other bits", "one work-item scores a particle by itself"),
+)  # fmt: skip
+
+TOLERANCES: dict[str, Tolerance] = {tolerance.name: tolerance for tolerance in _ALL}
+"""Every tolerance by its name."""
+
+Floats = NDArray[np.floating]
+
+
+def beam_tolerance(dtype: DTypeLike) -> Tolerance:
+    """The tolerance of one beam's log-likelihood in a precision."""
+    return TOLERANCES[f"{np.dtype(dtype).name} beam"]
+
+
+def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
+    """The tolerance of a scan's log-likelihood in an ordinary scene of so many beams.
+
+    In a scene where beams have |log p_k| in the thousands, float32 cannot hold the sum to 2e-3 nats; there
+    :func:`per_scan` says what remains.
+
+    Raises:
+        ValueError: float32 and more than 10 000 beams, for which nothing is promised in nats.
+    """
+    if np.dtype(dtype) == np.float64:
+        return TOLERANCES["float64 scan"]
+    if beams > 10_000:
+        raise ValueError(f"beams: must be <= 10000 for a float32 scan, got {beams}; per_scan bounds longer ones")
+    return TOLERANCES["float32 scan, K = 1000" if beams <= 1000 else "float32 scan, K = 10 000"]
+
+
+def _scale(tolerance: Tolerance, dtype: DTypeLike) -> float:
+    """One unit of a tolerance of log-likelihoods, at log p = 0."""
+    return float(np.finfo(dtype).eps) if tolerance.unit.startswith("eps") else 1.0
+
+
+def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
+    """The largest error of each beam's log-likelihood.
+
+    Args:
+        log_p: Log-likelihoods of beams, of any shape.
+        dtype: The precision that is judged, float32 or float64.
+
+    Returns:
+        float64 of the same shape [nats]; 0 where log p is infinite, which must be met exactly.
+    """
+    tolerance = beam_tolerance(dtype)
+    size = np.abs(np.asarray(log_p, np.float64))
+    return np.where(np.isfinite(size), tolerance.value * _scale(tolerance, dtype) * (1 + size), 0.0)
+
+
+def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperature: float = 1.0) -> Floats:
+    """The largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
+
+    BLOCK_TERMS terms are added plainly, which loses (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes. The blocks
+    are added with compensation, which loses the square of what the plain sum of the blocks would; the final sum and its
+    product with the temperature round once each. float64 is held to its own, wider rule.
+
+    Args:
+        parts: (..., K) log-likelihoods of the beams before the temperature.
+        dtype: The precision that is judged, float32 or float64.
+        fixed: What is added for readings that do not depend on the pose.
+        temperature: The factor of the sum.
+
+    Returns:
+        (...) float64 [nats]; 0 where a beam's log-likelihood is infinite.
+    """
+    terms = np.asarray(parts, np.float64)
+    possible = np.isfinite(terms).all(axis=-1)
+    terms = np.where(np.isfinite(terms), terms, 0.0)
+    if np.dtype(dtype) == np.float64:
+        total = np.abs(temperature * (terms.sum(axis=-1) + fixed))
+        return np.where(possible, TOLERANCES["float64 scan"].value * (1 + total), 0.0)
+    half = 0.5 * float(np.finfo(dtype).eps)
+    blocks = terms.shape[-1] / BLOCK_TERMS + 1
+    magnitude = np.abs(terms).sum(axis=-1) + abs(fixed)
+    summation = (BLOCK_TERMS - 1 + 3 + blocks * blocks * half) * half * magnitude
+    return np.where(possible, temperature * (per_beam(terms, dtype).sum(axis=-1) + summation), 0.0)
+
+
+def differing(left: ArrayLike, right: ArrayLike) -> int:
+    """How many values of two arrays differ in their bits; NaN equals NaN, and 0 differs from -0."""
+    a, b = np.asarray(left), np.asarray(right)
+    if a.dtype != b.dtype or a.shape != b.shape:
+        return max(a.size, b.size, 1)
+    same = (a == b) & (np.signbit(a) == np.signbit(b)) if a.dtype.kind == "f" else a == b
+    if a.dtype.kind == "f":
+        same |= np.isnan(a) & np.isnan(b)
+    return int(np.count_nonzero(~same))
+
+
+def largest_relative(found: ArrayLike, truth: ArrayLike) -> float:
+    """Largest difference relative to the truth; values that are equal, infinite ones included, differ by 0."""
+    a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
+    with np.errstate(all="ignore"):
+        return _largest(a, b, np.abs(a - b) / np.abs(b))
+
+
+def largest_difference(found: ArrayLike, truth: ArrayLike, tolerance: Tolerance, dtype: DTypeLike) -> float:
+    """Largest difference of log-likelihoods in the unit of a tolerance: nats, 1 + |log p| or eps (1 + |log p|).
+
+    A NaN, or an infinity on one side only, is an infinite difference.
+    """
+    a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
+    size = np.float64(1) if tolerance.unit == "nats" else _scale(tolerance, dtype) * (1 + np.abs(b))
+    with np.errstate(all="ignore"):
+        return _largest(a, b, np.abs(a - b) / size)
+
+
+def _largest(a: Floats, b: Floats, difference: Floats) -> float:
+    difference = np.where(a == b, 0.0, np.where(np.isnan(difference), np.inf, difference))
+    # An infinite truth makes the quotient NaN or 0, whatever was found.
+    return float(np.max(np.where(np.isinf(a) != np.isinf(b), np.inf, difference), initial=0.0))

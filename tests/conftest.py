@@ -3,14 +3,49 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+# Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
+BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
 
 
 def required(feature: str) -> bool:
     """Whether GPUSENSE_REQUIRE, a comma-separated list, says that a feature must not be skipped."""
     return feature in [word.strip() for word in os.environ.get("GPUSENSE_REQUIRE", "").split(",")]
+
+
+def skip_or_fail(feature: str, reason: str) -> None:
+    """Skip the test, or fail it where the feature is required."""
+    if required(feature):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def present(selection: str) -> str:
+    """The tested selection string of a backend's name or selection; the test is skipped where it is absent."""
+    from gpusense.backends import get_backend
+
+    chosen = next((name for name in BACKENDS if name.split(":")[0] == selection), selection)
+    try:
+        get_backend(chosen)
+    except ValueError as error:
+        skip_or_fail(chosen.split(":")[0], str(error))
+    return chosen
+
+
+@pytest.fixture
+def needs() -> Callable[[str], str]:
+    """``needs("opencl")`` returns the selection string to test, or skips."""
+    return present
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request: pytest.FixtureRequest) -> str:
+    """The selection string of each tested backend in turn."""
+    return present(request.param)
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +55,7 @@ def data_dir() -> Path:
     if folder and Path(folder).is_dir():
         return Path(folder)
     reason = f"GPUSENSE_DATA must name the folder of recorded data, got {folder!r}"
-    if folder or required("data"):
+    if folder:
         pytest.fail(reason)
-    pytest.skip(reason)
+    skip_or_fail("data", reason)
+    raise AssertionError(reason)

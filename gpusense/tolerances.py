@@ -54,8 +54,8 @@ _ALL = (
         "a crossing distance is (k + a) / |d|: four roundings of 1.1e-16 and the conditioning of the direction",
     ),
     Tolerance("float32 ranges to float64", 1e-3, "cells", "rounded inputs, for a ray that grazes nothing"),
-    Tolerance("moved origin of a grazing ray", 1e-4, "cells", "backward error: an inverse of float32's 24 bits at 1e3"),
-    Tolerance("moved bearing of a grazing ray", 1e-6, "rad", "backward error: float32 sines and cosines and their sum"),
+    Tolerance("moved origin of a grazing ray", 1e-4, "cells", "a range jumps at a corner, so the ray is judged instead"),
+    Tolerance("moved bearing of a grazing ray", 1e-6, "rad", "float32 directions are rounded to some 1e-7"),
     Tolerance(
         "float32 beam", 16, "eps (1 + |log p_k|)",
         "exp, log, tanh and division within a few eps, erf within 16 eps (OpenCL), u^2 / 2 within 3 eps of itself",

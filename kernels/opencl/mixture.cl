@@ -11,7 +11,7 @@
 // Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
 real hit_mass(const real expected, const real erf_scale, const real range_max) {
     const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
-    if (fmin(below, above) > ERF_ONE) return (real)1;
+    if (below > ERF_ONE && above > ERF_ONE) return (real)1;
     return (real)0.5 * (erf(below) + erf(above));
 }
 #endif
@@ -35,7 +35,7 @@ real log_density(const real z, const real expected, global const real *terms) {
 #if SHORT
     if (z <= expected && expected > 0) {
         const real x = terms[4] * expected;
-        p += terms[3] * short_factor(x) * exp(-terms[4] * z) / fmax(expected, SMALLEST_RANGE);
+        p += terms[3] * short_factor(x) * exp(-terms[4] * z) / (expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE);
     }
 #endif
     return log(p + terms[5]);

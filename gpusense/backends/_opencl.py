@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -114,15 +115,22 @@ class OpenCLBackend:
         binary = self._cache.load(source, self.options)
         if binary is not None:
             try:
-                return cl.Program(self._context, [self._device], [binary]).build(self.options)
+                return self._built(cl.Program(self._context, [self._device], [binary]))
             except cl.Error:
                 self._cache.discard(source, self.options)
         try:
-            program = cl.Program(self._context, source).build(self.options, [self._device])
+            program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {error}") from error
         self._cache.store(source, self.options, program.get_info(cl.program_info.BINARIES)[0])
         return program
+
+
+    def _built(self, program: cl.Program) -> cl.Program:
+        with warnings.catch_warnings():
+            # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            return program.build(self.options, [self._device])
 
 
 class _Launch:

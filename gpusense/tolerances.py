@@ -8,12 +8,18 @@ judged against the float64 reference kernel *on the float32 launch's own rounded
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gpusense.reference.error_free import BLOCK_TERMS
+
+Floats = NDArray[np.floating]
+
+_EPS = float(np.finfo(np.float32).eps)
+_COUNTED = ("cells that differ", "values with other bits", "beams in another cell")
 
 
 @dataclass(frozen=True)
@@ -23,7 +29,7 @@ class Tolerance:
     Attributes:
         name: What is compared.
         value: The largest difference, itself allowed.
-        unit: What the difference is measured in.
+        unit: What the difference is measured in; eps is float32's, 1.2e-7.
         reason: Where the number comes from.
     """
 
@@ -38,7 +44,30 @@ class Tolerance:
 
     def twice(self) -> Tolerance:
         """The tolerance between two results that each keep this one against the truth."""
-        return Tolerance(self.name, 2 * self.value, self.unit, f"both keep half of it; {self.reason}")
+        return Tolerance(self.name, 2 * self.value, self.unit, f"both sides keep half of it: {self.reason}")
+
+    def difference(self, found: ArrayLike, truth: ArrayLike) -> float:
+        """Largest difference of two arrays of one shape in the tolerance's unit.
+
+        What is counted differs in its bits; NaN equals NaN and -0 does not equal 0. Elsewhere equal values, infinite
+        ones included, differ by 0, and a NaN, or an infinity on one side only, differs infinitely.
+        """
+        if self.unit in _COUNTED:
+            return differing(found, truth)
+        a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
+        if a.shape != b.shape:
+            return math.inf
+        with np.errstate(all="ignore"):
+            apart = np.abs(a - b) / self._size(np.abs(b))
+        apart = np.where(np.isnan(apart) | (np.isinf(a) != np.isinf(b)), np.inf, apart)
+        return float(np.max(np.where(a == b, 0.0, apart), initial=0.0))
+
+    def _size(self, size: Floats) -> Floats:
+        """One unit at each value of that size."""
+        if self.unit == "relative":
+            return size
+        scale = _EPS if self.unit.startswith("eps") else 1.0
+        return scale * (1 + size) if "|log p" in self.unit else np.ones_like(size)
 
 
 _ALL = (
@@ -54,7 +83,7 @@ _ALL = (
         "a crossing distance is (k + a) / |d|: four roundings of 1.1e-16 and the conditioning of the direction",
     ),
     Tolerance("float32 ranges to float64", 1e-3, "cells", "rounded inputs, for a ray that grazes nothing"),
-    Tolerance("moved origin of a grazing ray", 1e-4, "cells", "a range jumps at a corner, so the ray is judged instead"),
+    Tolerance("moved origin of a grazing ray", 1e-4, "cells", "a range jumps at a corner: move the ray instead"),
     Tolerance("moved bearing of a grazing ray", 1e-6, "rad", "float32 directions are rounded to some 1e-7"),
     Tolerance(
         "float32 beam", 16, "eps (1 + |log p_k|)",
@@ -75,8 +104,6 @@ _ALL = (
 
 TOLERANCES: dict[str, Tolerance] = {tolerance.name: tolerance for tolerance in _ALL}
 """Every tolerance by its name."""
-
-Floats = NDArray[np.floating]
 
 
 def beam_tolerance(dtype: DTypeLike) -> Tolerance:
@@ -100,11 +127,6 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
     return TOLERANCES["float32 scan, K = 1000" if beams <= 1000 else "float32 scan, K = 10 000"]
 
 
-def _scale(tolerance: Tolerance, dtype: DTypeLike) -> float:
-    """One unit of a tolerance of log-likelihoods, at log p = 0."""
-    return float(np.finfo(dtype).eps) if tolerance.unit.startswith("eps") else 1.0
-
-
 def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
     """The largest error of each beam's log-likelihood.
 
@@ -116,16 +138,17 @@ def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
         float64 of the same shape [nats]; 0 where log p is infinite, which must be met exactly.
     """
     tolerance = beam_tolerance(dtype)
+    scale = tolerance.value * (_EPS if tolerance.unit.startswith("eps") else 1.0)
     size = np.abs(np.asarray(log_p, np.float64))
-    return np.where(np.isfinite(size), tolerance.value * _scale(tolerance, dtype) * (1 + size), 0.0)
+    return np.where(np.isfinite(size), scale * (1 + size), 0.0)
 
 
 def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperature: float = 1.0) -> Floats:
     """The largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
 
-    BLOCK_TERMS terms are added plainly, which loses (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes. The blocks
-    are added with compensation, which loses the square of what the plain sum of the blocks would; the final sum and its
-    product with the temperature round once each. float64 is held to its own, wider rule.
+    BLOCK_TERMS terms are added plainly, which loses (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes. Blocks
+    are added with compensation, which loses the square of what their plain sum would. The final sum and its product
+    with the temperature round once each. float64 is held to its own, wider rule.
 
     Args:
         parts: (..., K) log-likelihoods of the beams before the temperature.
@@ -142,7 +165,7 @@ def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperat
     if np.dtype(dtype) == np.float64:
         total = np.abs(temperature * (terms.sum(axis=-1) + fixed))
         return np.where(possible, TOLERANCES["float64 scan"].value * (1 + total), 0.0)
-    half = 0.5 * float(np.finfo(dtype).eps)
+    half = _EPS / 2
     blocks = terms.shape[-1] / BLOCK_TERMS + 1
     magnitude = np.abs(terms).sum(axis=-1) + abs(fixed)
     summation = (BLOCK_TERMS - 1 + 3 + blocks * blocks * half) * half * magnitude
@@ -158,27 +181,3 @@ def differing(left: ArrayLike, right: ArrayLike) -> int:
     if a.dtype.kind == "f":
         same |= np.isnan(a) & np.isnan(b)
     return int(np.count_nonzero(~same))
-
-
-def largest_relative(found: ArrayLike, truth: ArrayLike) -> float:
-    """Largest difference relative to the truth; values that are equal, infinite ones included, differ by 0."""
-    a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
-    with np.errstate(all="ignore"):
-        return _largest(a, b, np.abs(a - b) / np.abs(b))
-
-
-def largest_difference(found: ArrayLike, truth: ArrayLike, tolerance: Tolerance, dtype: DTypeLike) -> float:
-    """Largest difference of log-likelihoods in the unit of a tolerance: nats, 1 + |log p| or eps (1 + |log p|).
-
-    A NaN, or an infinity on one side only, is an infinite difference.
-    """
-    a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
-    size = np.float64(1) if tolerance.unit == "nats" else _scale(tolerance, dtype) * (1 + np.abs(b))
-    with np.errstate(all="ignore"):
-        return _largest(a, b, np.abs(a - b) / size)
-
-
-def _largest(a: Floats, b: Floats, difference: Floats) -> float:
-    difference = np.where(a == b, 0.0, np.where(np.isnan(difference), np.inf, difference))
-    # An infinite truth makes the quotient NaN or 0, whatever was found.
-    return float(np.max(np.where(np.isinf(a) != np.isinf(b), np.inf, difference), initial=0.0))

@@ -170,16 +170,12 @@ class LikelihoodFieldModel(ScanModel):
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
         space, real = self._workspace, self._real
         cells = scan.readings / self.grid.resolution
-        if self._specialize:
-            points = scan.vectors * cells[:, None]
-        else:
-            points = np.where(np.isfinite(cells)[:, None], scan.vectors * np.nan_to_num(cells, posinf=0)[:, None],
-                              cells[:, None])  # fmt: skip
-        high, low = split(points, real)
-        low = np.where(np.isfinite(points), low, 0).astype(real)
+        finite = np.isfinite(cells)
+        high, low = split(scan.vectors * np.where(finite, cells, 0.0)[:, None], real)
+        high[~finite] = cells[~finite, None]
         point, point_low = space.upload("point", high), space.upload("point_low", low)
         terms = space.upload("terms", self._terms)
-        longest = np.max(cells, initial=0.0, where=np.isfinite(cells))
+        longest = np.max(cells, initial=0.0, where=finite)
         guard = 8 * np.finfo(real).eps * (longest + 2)
         readings = len(scan.readings)
 

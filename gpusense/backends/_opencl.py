@@ -61,6 +61,7 @@ class OpenCLBackend:
         self._device = device
         self._context = cl.Context([device])
         self._queue = cl.CommandQueue(self._context)
+        self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
         self._cache = ProgramCache(info)
         # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
@@ -97,16 +98,22 @@ class OpenCLBackend:
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""
+        launcher = self._launchers.get((kernel, flags))
+        if launcher is None:
+            launcher = self._launchers[kernel, flags] = self._launcher(kernel, flags)
+        return launcher
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""
+        self._queue.finish()
+
+    def _launcher(self, kernel: str, flags: frozenset[str]) -> _Launch:
         row = KERNELS[kernel]
         flags = relevant(row.file, flags)
         program = self._programs.get((row.file, flags))
         if program is None:
             program = self._programs[row.file, flags] = self._build(row.file, flags)
         return _Launch(self._queue, cl.Kernel(program, kernel), row, "FLOAT64" in flags)
-
-    def synchronize(self) -> None:
-        """See Backend.synchronize."""
-        self._queue.finish()
 
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:

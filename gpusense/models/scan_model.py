@@ -162,6 +162,10 @@ class ScanModel(ABC):
             return log_p
         return log_p, np.stack([parts for _, parts in scored])
 
+    @abstractmethod
+    def explain(self) -> str:
+        """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
+
     def _score_scan(self, poses: np.ndarray, ranges: np.ndarray, per_beam: bool) -> tuple[np.ndarray, np.ndarray]:
         scan = prepare_scan(ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize)
         self._last_scan = scan

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
+    from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
     "BeamModel": "gpusense.models.beam",
@@ -37,11 +38,14 @@ _HOME = {
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
     "Scanner": "gpusense.scanner",
+    "Weights": "gpusense.weights",
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
+    "resample": "gpusense.weights",
     "write_map": "gpusense.map_io",
 }
 
@@ -58,12 +62,15 @@ __all__ = [
     "Reading",
     "Scan",
     "Scanner",
+    "Weights",
     "__version__",
     "classify",
     "devices",
     "distance_transform",
+    "normalize_weights",
     "read_log",
     "read_map",
+    "resample",
     "write_map",
 ]
 

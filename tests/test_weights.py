@@ -1,0 +1,96 @@
+"""Log-likelihoods to weights, and resampling."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpusense.weights import normalize_weights, resample
+
+
+def test_weights_of_hand_computed_values():
+    result = normalize_weights([math.log(1.0), math.log(3.0), -math.inf])
+    np.testing.assert_allclose(result.weights, [0.25, 0.75, 0.0], rtol=1e-15)
+    assert result.log_evidence == pytest.approx(math.log(4 / 3), rel=1e-15)
+    assert result.effective_sample_size == pytest.approx(1 / (0.25**2 + 0.75**2), rel=1e-15)
+    assert not result.degenerate
+
+
+@pytest.mark.parametrize("level", [-1e9, -1e5, 0.0, 1e5, 1e9])
+def test_any_level_of_log_likelihood_gives_the_same_weights(level):
+    log_p = np.array([0.0, -1.0, -2.0, -800.0])
+    shifted = normalize_weights(log_p + level)
+    lost = 1e-6 if abs(level) == 1e9 else 1e-9
+    np.testing.assert_allclose(shifted.weights, normalize_weights(log_p).weights, rtol=lost)
+    assert abs(shifted.weights.sum() - 1) <= 1e-12
+
+
+def test_a_million_float32_log_likelihoods_sum_to_one():
+    log_p = np.random.default_rng(0).normal(-4e5, 30, 1_000_000).astype(np.float32)
+    result = normalize_weights(log_p)
+    assert abs(result.weights.sum() - 1) <= 1e-12
+    assert 1 <= result.effective_sample_size <= 1_000_000
+    assert math.isfinite(result.log_evidence)
+
+
+def test_an_impossible_scan_is_flagged_and_uniform():
+    result = normalize_weights(np.full(4, -np.inf))
+    assert result.degenerate
+    assert result.weights.tolist() == [0.25] * 4
+    assert result.log_evidence == -math.inf
+    assert result.effective_sample_size == 4
+
+
+@pytest.mark.parametrize(
+    ("log_p", "message"),
+    [
+        ([], "log_p: must hold at least one log-likelihood, got shape (0,)"),
+        ([0.0, math.nan], "log_p: every value must be finite or -inf, got nan at index 1"),
+        ([math.inf], "log_p: every value must be finite or -inf, got inf at index 0"),
+        ([[0.0]], "log_p: shape must be (N,), got (1, 1)"),
+    ],
+)
+def test_bad_log_likelihoods(log_p, message):
+    with pytest.raises(ValueError) as caught:
+        normalize_weights(log_p)
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ([], "weights: must have a positive sum, got 0.0"),
+        ([0.0, 0.0], "weights: must have a positive sum, got 0.0"),
+        ([1.0, -0.5], "weights: must be >= 0, got -0.5 at index 1"),
+        ([1.0, math.nan], "weights: every value must be finite, got nan at index 1"),
+    ],
+)
+def test_bad_weights(weights, message):
+    with pytest.raises(ValueError) as caught:
+        resample(weights, 3, np.random.default_rng(0))
+    assert str(caught.value) == message
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.floats(0, 1e6), min_size=1, max_size=50).filter(lambda w: max(w) > 1e-3),
+    st.integers(0, 500),
+    st.integers(0, 2**32 - 1),
+)
+def test_each_particle_appears_as_often_as_its_weight_says(weights, count, seed):
+    chosen = resample(weights, count, np.random.default_rng(seed))
+    assert len(chosen) == count
+    assert (np.diff(chosen) >= 0).all()
+    expected = count * np.array(weights) / np.sum(weights)
+    appearances = np.bincount(chosen, minlength=len(weights))
+    assert (np.abs(appearances - expected) < 1 + 1e-6).all()
+    assert (appearances[np.array(weights) == 0] == 0).all()
+
+
+def test_resampling_a_million_equal_weights_takes_each_once():
+    chosen = resample(np.full(1_000_000, 1e-6), 1_000_000, np.random.default_rng(3))
+    np.testing.assert_array_equal(chosen, np.arange(1_000_000))

@@ -12,6 +12,8 @@ from gpusense.backends.base import Buffer
 
 _INT = np.dtype(np.int32)
 _BYTE = np.dtype(np.uint8)
+# The square of a longer diagonal does not fit into 32 bits.
+_LONGEST_SIDE = (1 << 15) - 1
 # Kernels count cells of four padded planes in 32 bits.
 _MOST_CELLS = (1 << 31) // 4 - 1
 
@@ -30,9 +32,16 @@ def squared_distances(backend: Backend, obstacles: np.ndarray) -> Buffer:
     """Squared cell distance from each cell's centre to the nearest obstacle's, exactly; 2^31 - 1 without obstacles.
 
     Processors walk rows last, which is how memory runs; on a GPU neighbouring work-items take neighbouring columns.
+
+    Raises:
+        ValueError: more cells or longer sides than the kernels can count.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
+    if max(rows, cols) > _LONGEST_SIDE:
+        raise ValueError(
+            f"grid: the part in use must have at most {_LONGEST_SIDE} rows and columns, got {rows} x {cols}"
+        )
     count = rows * cols
     occupied = backend.upload(np.ascontiguousarray(obstacles, dtype=_BYTE))
     along, starts, squared = (backend.empty(count, _INT) for _ in range(3))

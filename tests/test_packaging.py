@@ -139,9 +139,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sdist(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The unpacked source distribution, built without a network."""
     folder = tmp_path_factory.mktemp("sdist")
-    run(
-        [sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", folder, checkout], cwd=folder
-    )
+    run([sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", folder, checkout], cwd=folder)
     with tarfile.open(next(folder.glob("*.tar.gz"))) as archive:
         archive.extractall(folder, filter="data")
     return next(path for path in folder.iterdir() if path.is_dir())
@@ -232,9 +230,7 @@ def test_warp_kernels_are_imported_under_one_name(layout: Layout, checkout: Path
     report = json.loads(layout.run(IMPORT, cwd=tmp_path))
     names = [path.stem for path in (checkout / "kernels" / "warp").glob("*.py") if path.stem != "__init__"]
     folder = layout.kernels / "warp"
-    assert report["modules"] == {
-        name: [f"gpusense.kernels.warp.{name}", str(folder / f"{name}.py")] for name in names
-    }
+    assert report["modules"] == {name: [f"gpusense.kernels.warp.{name}", str(folder / f"{name}.py")] for name in names}
     assert Path(report["library"]).parent != folder
 
 
@@ -277,9 +273,7 @@ def test_dependencies_on_linux_x86_64(wheel: Path) -> None:
     lines = [line.split(":", 1)[1] for line in metadata.splitlines() if line.startswith("Requires-Dist:")]
     machine = {"sys_platform": "linux", "platform_machine": "x86_64", "extra": ""}
     needed = [
-        item.name.lower()
-        for item in map(Requirement, lines)
-        if item.marker is None or item.marker.evaluate(machine)
+        item.name.lower() for item in map(Requirement, lines) if item.marker is None or item.marker.evaluate(machine)
     ]
     expected = "matplotlib numpy pillow pocl-binary-distribution pyopencl pyyaml rich scipy warp-lang"
     assert sorted(needed) == expected.split()

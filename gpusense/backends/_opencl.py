@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from typing import Any
 
@@ -129,9 +130,9 @@ class OpenCLBackend:
             program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {error}") from error
-        self._cache.store(source, self.options, program.get_info(cl.program_info.BINARIES)[0])
+        binaries: Any = program.get_info(cl.program_info.BINARIES)
+        self._cache.store(source, self.options, binaries[0])
         return program
-
 
     def _built(self, program: cl.Program) -> cl.Program:
         with warnings.catch_warnings():
@@ -145,6 +146,7 @@ class _Launch:
 
     def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel, row: Kernel, float64: bool) -> None:
         self._queue, self._kernel, self._row = queue, kernel, row
+        self._lock = threading.Lock()
         real = np.dtype(np.float64 if float64 else np.float32)
         self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
 
@@ -154,8 +156,9 @@ class _Launch:
         ]
         group = (self._row.group, *(1 for _ in size[1:]))
         rounded = (-(-size[0] // group[0]) * group[0], *size[1:])
-        self._kernel.set_args(*bound)
-        with _memory_errors():
+        # Arguments belong to the kernel object, so two threads must not interleave here.
+        with self._lock, _memory_errors():
+            self._kernel.set_args(*bound)
             cl.enqueue_nd_range_kernel(self._queue, self._kernel, rounded, group)
 
 

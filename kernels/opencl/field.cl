@@ -41,7 +41,6 @@ int floor_int(const real a) {
     return whole - ((real)whole > a);
 }
 
-#if CAREFUL
 // Whole cells below an offset of two parts, and what is left of it in [0, 1).
 int whole_cells(const real2 offset, real *rest) {
     const int whole = floor_int(offset.x);
@@ -50,30 +49,30 @@ int whole_cells(const real2 offset, real *rest) {
     *rest = left - (real)carry;
     return whole + carry;
 }
-#endif
 
 // Cell offsets of an end point from the pose's cell, and the position within that cell.
 // point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
 // nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
 int2 end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
                const real guard, real2 *rest) {
-    const real x = (pose.x - shift) + (pose.z * point.x - pose.w * point.y);
-    const real y = (pose.y - shift) + (pose.w * point.x + pose.z * point.y);
-    int whole_x = floor_int(x), whole_y = floor_int(y);
-    real left_x = x - (real)whole_x, left_y = y - (real)whole_y;
+    real2 x = (real2)((pose.x - shift) + (pose.z * point.x - pose.w * point.y), 0);
+    real2 y = (real2)((pose.y - shift) + (pose.w * point.x + pose.z * point.y), 0);
 #if CAREFUL
 #if !BILINEAR
-    if (left_x < guard || left_y < guard || left_x > 1 - guard || left_y > 1 - guard)
+    const int2 near = (int2)(floor_int(x.x), floor_int(y.x));
+    const real2 left = (real2)(x.x - (real)near.x, y.x - (real)near.y);
+    *rest = left;
+    if (left.x >= guard && left.y >= guard && left.x <= 1 - guard && left.y <= 1 - guard) return near;
 #endif
-    {
-        const real2 c = (real2)(pose.z, pose_low.z), s = (real2)(pose.w, pose_low.w);
-        const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
-        whole_x = whole_cells(careful_offset((real2)(pose.x - shift, pose_low.x), c, p, s, q, (real)-1), &left_x);
-        whole_y = whole_cells(careful_offset((real2)(pose.y - shift, pose_low.y), s, p, c, q, (real)1), &left_y);
-    }
+    const real2 c = (real2)(pose.z, pose_low.z), s = (real2)(pose.w, pose_low.w);
+    const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
+    x = careful_offset((real2)(pose.x - shift, pose_low.x), c, p, s, q, (real)-1);
+    y = careful_offset((real2)(pose.y - shift, pose_low.y), s, p, c, q, (real)1);
 #endif
+    real left_x, left_y;
+    const int2 whole = (int2)(whole_cells(x, &left_x), whole_cells(y, &left_y));
     *rest = (real2)(left_x, left_y);
-    return (int2)(whole_x, whole_y);
+    return whole;
 }
 
 #if BILINEAR
@@ -159,5 +158,5 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
         }
     }
     total = add_term(total, block);
-    log_p[n] = temperature * (total.x + total.y);
+    log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
 }

@@ -18,7 +18,8 @@ real2 ray_direction(const real4 pose, const real2 ray) {
 int crossed_before(const real t, const real speed, const real a, const real inv) {
     const real place = t * speed - a;
     const int whole = (int)place;
-    const int guess = whole + ((real)whole < place);
+    const int above = whole + ((real)whole < place);
+    const int guess = above < 0 ? 0 : above;
     if (((real)guess + a) * inv < t) return guess + 1;
     if (guess > 0 && ((real)(guess - 1) + a) * inv >= t) return guess - 1;
     return guess;

@@ -1,0 +1,100 @@
+"""Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
+
+Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from . import error_free, mixture, raycast
+from .error_free import BLOCK_TERMS
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel score_beams specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    caster = raycast.functions(flags)
+    cast_ray, expected_range = caster.cast_ray, caster.expected_range
+    log_density = mixture.functions(flags).log_density
+    add_term = error_free.functions(flags).add_term
+    SHARED_RAYS = "SHARED_RAYS" in flags
+    ALL_READINGS = "ALL_READINGS" in flags
+    PER_BEAM = "PER_BEAM" in flags
+    LINEAR = "LINEAR" in flags
+    ZERO = real(0.0)
+    NEVER = real(-math.inf)
+
+    # One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. A launch has
+    # fewer than 2^31 parts.
+    @kernel
+    def score_beams(
+        squares: wp.array(dtype=wp.uint8),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        ray: wp.array(dtype=vec2),
+        first: wp.array(dtype=wp.int32),
+        reading: wp.array(dtype=real),
+        terms: wp.array(dtype=real),
+        log_p: wp.array(dtype=real),
+        parts: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        rays: wp.int32,
+        readings: wp.int32,
+        limit: real,
+        resolution: real,
+        range_max: real,
+        fixed: real,
+        temperature: real,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        cell = pose_cell[n]
+        from_pose = pose[n]
+        total = vec2(fixed, ZERO)
+        block = real(0.0)
+        impossible = bool(False)
+        for r in range(rays):
+            t = cast_ray(squares, rows, cols, cell, from_pose, ray[r], limit)
+            expected = expected_range(t, limit, resolution, range_max)
+            begin = r
+            end = r + 1
+            if SHARED_RAYS:
+                begin = first[r]
+                end = first[r + 1]
+            for k in range(begin, end):
+                z = reading[k]
+                term = real(0.0)
+                if ALL_READINGS:
+                    if wp.isinf(z):
+                        term = terms[7]
+                    elif not wp.isnan(z):
+                        term = log_density(z, expected, terms)
+                else:
+                    term = log_density(z, expected, terms)
+                if PER_BEAM:
+                    parts[n * readings + k] = term
+                if LINEAR:
+                    block += term
+                else:
+                    if term == NEVER:
+                        impossible = True
+                    else:
+                        block += term
+                if (k + 1) % BLOCK_TERMS == 0:
+                    total = add_term(total, block)
+                    block = ZERO
+        total = add_term(total, block)
+        if impossible:
+            log_p[n] = NEVER
+        else:
+            log_p[n] = temperature * (total.x + total.y)
+
+    return {"score_beams": score_beams}[name]

@@ -1,0 +1,55 @@
+"""Error-free transformations: what a rounded operation leaves behind is kept in a second number.
+
+Source: Knuth (two_sum), Dekker and Veltkamp (two_product). They need fuse_fp and fast_math off.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import precision
+
+# Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of
+# compensating every term, at nearly the cost of none.
+BLOCK_TERMS = wp.constant(16)
+
+
+@functools.cache
+def functions(flags):
+    """two_sum, high_half, two_product and add_term in the precision of the flags."""
+    types = precision(flags)
+    real, vec2 = types.real, types.vec2
+    SPLITTER = real(134217729.0 if "FLOAT64" in flags else 4097.0)
+
+    # a + b = sum.x + sum.y exactly.
+    @wp.func
+    def two_sum(a: real, b: real):
+        total = a + b
+        shift = total - a
+        return vec2(total, (a - (total - shift)) + (b - shift))
+
+    # High half of a float: its leading bits, few enough that a product of two such halves is exact.
+    @wp.func
+    def high_half(a: real):
+        scaled = SPLITTER * a
+        return scaled - (scaled - a)
+
+    # a * b = product.x + product.y exactly, short of overflow and underflow.
+    @wp.func
+    def two_product(a: real, b: real):
+        product = a * b
+        a_high = high_half(a)
+        b_high = high_half(b)
+        a_low = a - a_high
+        b_low = b - b_high
+        error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+        return vec2(product, error)
+
+    # One more term in a compensated sum: total.x is the running sum, total.y what its roundings lost.
+    @wp.func
+    def add_term(total: vec2, term: real):
+        head = two_sum(total.x, term)
+        return vec2(head.x, total.y + head.y)
+
+    return SimpleNamespace(two_sum=two_sum, high_half=high_half, two_product=two_product, add_term=add_term)

@@ -1,0 +1,227 @@
+"""Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
+
+The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
+It has fewer than 2^31 cells, and a launch fewer than 2^31 parts, so indices fit int32.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import error_free
+from .error_free import BLOCK_TERMS
+from .prelude import kernel, precision
+
+FIELD_RING = wp.constant(2)
+
+
+# Index of a cell of the padded table; far cells become ring cells.
+@wp.func
+def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+    c = wp.clamp(col, -FIELD_RING, cols + FIELD_RING - 1)
+    r = wp.clamp(row, -FIELD_RING, rows + FIELD_RING - 1)
+    return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
+
+
+@functools.cache
+def functions(flags):
+    """careful_offset, whole_cells, end_point, bilinear and log_field specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    exact = error_free.functions(flags)
+    two_sum, two_product = exact.two_sum, exact.two_product
+    BILINEAR = "BILINEAR" in flags
+    CAREFUL = "CAREFUL" in flags
+    HIT = "HIT" in flags
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+    MINUS_HALF, MINUS_ONE = real(-0.5), real(-1.0)
+
+    # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
+    # the working precision.
+    @wp.func
+    def careful_offset(frac: vec2, a: vec2, b: vec2, c: vec2, d: vec2, sign: real):
+        ab = two_product(a.x, b.x)
+        cd = two_product(c.x, d.x)
+        products = two_sum(ab.x, sign * cd.x)
+        total = two_sum(products.x, frac.x)
+        low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
+        return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
+
+    # Whole cells below an offset of two parts, and what is left of it in [0, 1).
+    @wp.func
+    def whole_cells(offset: vec2):
+        whole = wp.floor(offset.x)
+        left = (offset.x - whole) + offset.y
+        if left < ZERO:
+            whole -= ONE
+            left += ONE
+        elif left >= ONE:
+            whole += ONE
+            left -= ONE
+        return int(whole), left
+
+    # Cell offsets of an end point from the pose's cell, and the position within that cell.
+    # point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
+    # nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
+    @wp.func
+    def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
+        x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
+        y = vec2((pose.y - shift) + (pose.w * point.x + pose.z * point.y), ZERO)
+        if CAREFUL:
+            if BILINEAR:
+                pass
+            else:
+                near = vec2(wp.floor(x.x), wp.floor(y.x))
+                left = vec2(x.x - near.x, y.x - near.y)
+                if left.x >= guard and left.y >= guard and left.x <= ONE - guard and left.y <= ONE - guard:
+                    return wp.vec2i(int(near.x), int(near.y)), left
+            c = vec2(pose.z, pose_low.z)
+            s = vec2(pose.w, pose_low.w)
+            p = vec2(point.x, point_low.x)
+            q = vec2(point.y, point_low.y)
+            x = careful_offset(vec2(pose.x - shift, pose_low.x), c, p, s, q, MINUS_ONE)
+            y = careful_offset(vec2(pose.y - shift, pose_low.y), s, p, c, q, ONE)
+        col, rest_x = whole_cells(x)
+        row, rest_y = whole_cells(y)
+        return wp.vec2i(col, row), vec2(rest_x, rest_y)
+
+    # Smooth distance between the four cell centres around an end point.
+    @wp.func
+    def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, rest: vec2, rows: wp.int32, cols: wp.int32):
+        a = table[field_cell(cell.x, cell.y, rows, cols)]
+        b = table[field_cell(cell.x + 1, cell.y, rows, cols)]
+        c = table[field_cell(cell.x, cell.y + 1, rows, cols)]
+        d = table[field_cell(cell.x + 1, cell.y + 1, rows, cols)]
+        low = a + rest.x * (b - a)
+        high = c + rest.x * (d - c)
+        return low + rest.y * (high - low)
+
+    # terms[4] = {hit, 1 / sigma, rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms in
+    # the log domain.
+    @wp.func
+    def log_field_linear(distance: real, terms: wp.array(dtype=real)):
+        p = terms[2]
+        if HIT:
+            u = distance * terms[1]
+            p += terms[0] * wp.exp(MINUS_HALF * u * u)
+        return wp.log(p)
+
+    @wp.func
+    def log_field_log(distance: real, terms: wp.array(dtype=real)):
+        u = distance * terms[1]
+        hit = terms[0] - HALF * u * u
+        largest = wp.max(hit, terms[2])
+        return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+
+    return SimpleNamespace(
+        field_cell=field_cell,
+        careful_offset=careful_offset,
+        whole_cells=whole_cells,
+        end_point=end_point,
+        bilinear=bilinear,
+        log_field=log_field_linear if "LINEAR" in flags else log_field_log,
+    )
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel fill_field or score_field specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    parts_of = functions(flags)
+    end_point, bilinear, log_field = parts_of.end_point, parts_of.bilinear, parts_of.log_field
+    add_term = error_free.functions(flags).add_term
+    BILINEAR = "BILINEAR" in flags
+    CAREFUL = "CAREFUL" in flags
+    LOG_TABLE = "LOG_TABLE" in flags
+    ALL_READINGS = "ALL_READINGS" in flags
+    PER_BEAM = "PER_BEAM" in flags
+    ZERO = real(0.0)
+    SHIFT = real(0.5 if BILINEAR else 0.0)
+
+    # Log density of each cell from its squared distance by a table of all squared distances up to the cap.
+    @kernel
+    def fill_field(
+        squared: wp.array(dtype=wp.int32),
+        density: wp.array(dtype=real),
+        table: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        cap: wp.int32,
+    ):
+        row, col = wp.tid()
+        if row >= rows or col >= cols:
+            return
+        cell = (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
+        table[cell] = density[wp.min(squared[row * cols + col], cap)]
+
+    # One work-item a particle. The table holds log densities, or capped distances in metres where it is interpolated.
+    @kernel
+    def score_field(
+        table: wp.array(dtype=real),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2),
+        terms: wp.array(dtype=real),
+        log_p: wp.array(dtype=real),
+        parts: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        readings: wp.int32,
+        guard: real,
+        fixed: real,
+        temperature: real,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        origin = pose_cell[n]
+        from_pose = pose[n]
+        from_low = vec4()
+        if CAREFUL:
+            from_low = pose_low[n]
+        total = vec2(fixed, ZERO)
+        block = real(0.0)
+        # A while loop shows the compiler that k is not negative; range would cost a tenth on processors.
+        k = int(0)
+        while k < readings:
+            to = point[k]
+            to_low = vec2()
+            if CAREFUL:
+                to_low = point_low[k]
+            term = real(0.0)
+            known = True
+            if ALL_READINGS:
+                known = not (wp.isnan(to.x) or wp.isinf(to.x))
+                if wp.isinf(to.x):
+                    term = terms[3]
+            if known:
+                offset, rest = end_point(from_pose, from_low, to, to_low, SHIFT, guard)
+                cell = origin + offset
+                if BILINEAR:
+                    term = log_field(bilinear(table, cell, rest, rows, cols), terms)
+                else:
+                    term = table[field_cell(cell.x, cell.y, rows, cols)]
+                    if LOG_TABLE:
+                        pass
+                    else:
+                        term = log_field(term, terms)
+            if PER_BEAM:
+                parts[n * readings + k] = term
+            block += term
+            k += 1
+            if k % BLOCK_TERMS == 0:
+                total = add_term(total, block)
+                block = ZERO
+        total = add_term(total, block)
+        # An impossible reading keeps total.x at -inf and turns total.y into nan.
+        if wp.isinf(total.x):
+            log_p[n] = total.x
+        else:
+            log_p[n] = temperature * (total.x + total.y)
+
+    return {"fill_field": fill_field, "score_field": score_field}[name]

@@ -1,0 +1,93 @@
+"""Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
+
+terms[8] = {hit, 1 / sigma, 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max}. In the linear domain hit
+is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain their logarithms.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import precision
+
+
+@functools.cache
+def functions(flags):
+    """hit_mass, short_factor and log_density specialised by the flags."""
+    real = precision(flags).real
+    HIT = "HIT" in flags
+    SHORT = "SHORT" in flags
+    RAND = "RAND" in flags
+    SINGLE = "SINGLE" in flags
+    ZERO, HALF, MINUS_HALF, ONE = real(0.0), real(0.5), real(-0.5), real(1.0)
+    NEVER = real(-math.inf)
+    # Above this the error function is 1 to the last bit.
+    ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
+    # Keep 2 / x and 1 / z* finite.
+    TINY = real(1e-30)
+    SMALLEST_RANGE = real(1e-37)
+
+    # Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
+    @wp.func
+    def hit_mass(expected: real, erf_scale: real, range_max: real):
+        below = expected * erf_scale
+        above = (range_max - expected) * erf_scale
+        if wp.min(below, above) > ERF_ONE:
+            return ONE
+        return HALF * (wp.erf(below) + wp.erf(above))
+
+    # x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
+    @wp.func
+    def short_factor(x: real):
+        h = HALF * x
+        if h > TINY:
+            return h / wp.tanh(h) + h
+        return ONE
+
+    # p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+    @wp.func
+    def log_density_linear(z: real, expected: real, terms: wp.array(dtype=real)):
+        p = real(0.0)
+        if HIT:
+            u = (z - expected) * terms[1]
+            p += terms[0] * wp.exp(MINUS_HALF * u * u) / hit_mass(expected, terms[2], terms[6])
+        if SHORT:
+            if z <= expected and expected > ZERO:
+                x = terms[4] * expected
+                p += terms[3] * short_factor(x) * wp.exp(-terms[4] * z) / wp.max(expected, SMALLEST_RANGE)
+        return wp.log(p + terms[5])
+
+    # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
+    @wp.func
+    def log_density_log(z: real, expected: real, terms: wp.array(dtype=real)):
+        hit = NEVER
+        shorter = NEVER
+        largest = NEVER
+        if HIT:
+            u = (z - expected) * terms[1]
+            hit = terms[0] - HALF * u * u - wp.log(hit_mass(expected, terms[2], terms[6]))
+            largest = hit
+        if SHORT:
+            if z <= expected and expected > ZERO:
+                shorter = terms[3] + wp.log(short_factor(terms[4] * expected)) - wp.log(expected) - terms[4] * z
+            largest = wp.max(largest, shorter)
+        if RAND:
+            largest = wp.max(largest, terms[5])
+        if SINGLE:
+            return largest
+        else:
+            if wp.isinf(largest):
+                return largest
+            p = real(0.0)
+            if HIT:
+                p += wp.exp(hit - largest)
+            if SHORT:
+                p += wp.exp(shorter - largest)
+            if RAND:
+                p += wp.exp(terms[5] - largest)
+            return largest + wp.log(p)
+
+    log_density = log_density_linear if "LINEAR" in flags else log_density_log
+    return SimpleNamespace(hit_mass=hit_mass, short_factor=short_factor, log_density=log_density)

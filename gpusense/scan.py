@@ -28,7 +28,8 @@ class PreparedScan:
         first: (R + 1,) int32; readings of ray r are first[r] to first[r + 1] - 1.
         constant: Log-likelihood of the readings that do not depend on the pose.
         max_columns: Positions of max readings that are in the constant.
-        missing: Readings without information, left out.
+        missing: Missing readings, left out.
+        ignored_max: Max readings that say nothing because z_max = 0, left out.
         thinned: Informative readings left out by ``beams=``.
     """
 
@@ -40,6 +41,7 @@ class PreparedScan:
     constant: float
     max_columns: np.ndarray
     missing: int
+    ignored_max: int
     thinned: int
 
     @property
@@ -129,7 +131,8 @@ def prepare_scan(
         first=first,
         constant=constant,
         max_columns=np.flatnonzero(is_max),
-        missing=len(kinds) - informative,
+        missing=int(np.count_nonzero(kinds == Reading.MISSING)),
+        ignored_max=0 if z_max > 0 else int(np.count_nonzero(kinds == Reading.MAX)),
         thinned=informative - int(np.count_nonzero(used)),
     )
 

@@ -67,11 +67,11 @@ def test_auto_takes_the_fastest_class_and_never_a_simulator(monkeypatch, present
 
 def test_a_backend_name_alone_prefers_a_gpu_and_refuses_simulators(monkeypatch):
     rows = [("opencl", "Oclgrind Simulator", "simulator"), ("opencl", "CPU", "cpu"), ("opencl", "GPU", "gpu")]
-    monkeypatch.setattr(backends, "devices", lambda: fake_devices(*rows))
+    monkeypatch.setattr(backends, "_devices_of", lambda backend: fake_devices(*rows))
     assert backends._find("opencl") == "opencl:2:0"
     assert backends._find("opencl:oclgrind") == "opencl:0:0"
     assert backends._find("opencl:1:0") == "opencl:1:0"
-    monkeypatch.setattr(backends, "devices", lambda: fake_devices(rows[0]))
+    monkeypatch.setattr(backends, "_devices_of", lambda backend: fake_devices(rows[0]))
     with pytest.raises(ValueError, match="only simulators are present and must be named, got 'opencl'"):
         backends._find("opencl")
 

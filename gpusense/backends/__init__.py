@@ -49,24 +49,27 @@ class Device:
 
 def devices() -> list[Device]:
     """Every device of this machine, and every backend that is absent with the reason and the remedy."""
-    found = [Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
-    for backend, install in (("opencl", _INSTALL_OPENCL), ("warp", _INSTALL_WARP)):
-        module, reason = _module(backend)
-        if module is None:
-            found.append(Device(backend, f"{backend} (absent)", "cpu", False, f"{reason}: {install}", ""))
-            continue
-        listed = module.list_devices()
-        for info, _ in listed:
-            simulated = backend == "opencl" and module.is_simulator(info.name)
-            kind = "simulator" if simulated else info.kind
-            found.append(Device(backend, info.name, kind, True, "", info.selection))
-        if not listed:
-            found.append(
-                Device(backend, f"{backend} (no device)", "cpu", False, f"no driver offers a device: {install}", "")
-            )
-        elif backend == "warp" and all(info.kind == "cpu" for info, _ in listed):
-            reason = "Warp sees no CUDA device: install NVIDIA's driver"
-            found.append(Device("warp", "CUDA (absent)", "gpu", False, reason, ""))
+    numpy = Device("numpy", "NumPy reference", "cpu", True, "", "numpy")
+    return [numpy, *_devices_of("opencl"), *_devices_of("warp")]
+
+
+def _devices_of(backend: str) -> list[Device]:
+    """The devices of one library, or why there are none."""
+    install = {"opencl": _INSTALL_OPENCL, "warp": _INSTALL_WARP}[backend]
+    module, reason = _module(backend)
+    if module is None:
+        return [Device(backend, f"{backend} (absent)", "cpu", False, f"{reason}: {install}", "")]
+    found = []
+    for info, _ in module.list_devices():
+        simulated = backend == "opencl" and module.is_simulator(info.name)
+        found.append(Device(backend, info.name, "simulator" if simulated else info.kind, True, "", info.selection))
+    if not found:
+        found.append(
+            Device(backend, f"{backend} (no device)", "cpu", False, f"no driver offers a device: {install}", "")
+        )
+    elif backend == "warp" and all(device.kind == "cpu" for device in found):
+        reason = "Warp sees no CUDA device: install NVIDIA's driver"
+        found.append(Device("warp", "CUDA (absent)", "gpu", False, reason, ""))
     return found
 
 
@@ -127,14 +130,13 @@ def _find(selection: str) -> str:
         )
     if head == "numpy":
         return "numpy"
-    listed = [device for device in devices() if device.available]
     if head == "auto":
-        real = [device for device in listed if device.kind != "simulator"]
+        real = [device for device in devices() if device.available and device.kind != "simulator"]
         return min(real, key=lambda device: SPEED_CLASSES.index((device.backend, device.kind))).selection
-    own = [device for device in listed if device.backend == head]
+    listed = _devices_of(head)
+    own = [device for device in listed if device.available]
     if not own:
-        reason = next(device.reason for device in devices() if device.backend == head)
-        raise ValueError(f"backend: {reason}, got {show(selection)}")
+        raise ValueError(f"backend: {listed[0].reason}, got {show(selection)}")
     return _choose(head, rest, own, selection)
 
 

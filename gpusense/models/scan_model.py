@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Literal, overload
 
 import numpy as np
 
@@ -131,6 +132,19 @@ class ScanModel(ABC):
         """``"float32"`` or ``"float64"``."""
         return self._real.name
 
+    @overload
+    def log_likelihood(self, poses: object, ranges: object, *, per_beam: Literal[False] = ...) -> np.ndarray: ...
+
+    @overload
+    def log_likelihood(
+        self, poses: object, ranges: object, *, per_beam: Literal[True]
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def log_likelihood(
+        self, poses: object, ranges: object, *, per_beam: bool
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]: ...
+
     def log_likelihood(
         self, poses: object, ranges: object, *, per_beam: bool = False
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
@@ -222,29 +236,14 @@ class ScanModel(ABC):
             return Plan(f"{title}, specialize=False", self._last_code, ())
         scan = self._last_scan
         if scan is not None:
-            count = self.scanner.count
-            if scan.missing:
-                omissions.append(
-                    Omission(
-                        "missing readings",
-                        f"{scan.missing} of {count} readings say nothing",
-                        f"{share(scan.missing, count)} of the beams",
-                    )
-                )
-            if len(scan.max_columns):
-                omissions.append(
-                    Omission(
-                        "max readings",
-                        f"{len(scan.max_columns)} of {count} readings have probability z_max at every pose",
-                        f"{share(len(scan.max_columns), count)} of the beams",
-                    )
-                )
-            if scan.thinned:
-                omissions.append(
-                    Omission(
-                        "thinned beams",
-                        f"beams= leaves out {scan.thinned}",
-                        f"{share(scan.thinned, count)} of the beams",
-                    )
-                )
+            count, constant = self.scanner.count, len(scan.max_columns)
+            for left, what, why in (
+                (scan.missing, "missing readings", "say nothing"),
+                (scan.ignored_max, "max readings", "say nothing while z_max = 0"),
+                (constant, "max readings", "have probability z_max at every pose"),
+                (scan.thinned, "thinned beams", "are not among those that beams= chose"),
+            ):
+                if left:
+                    why = f"{left} of {count} readings {why}"
+                    omissions.append(Omission(what, why, f"{share(left, count)} of the beams"))
         return Plan(title, self._last_code, tuple(omissions))

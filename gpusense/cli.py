@@ -1,0 +1,130 @@
+"""The command line: ``gpusense devices``, ``gpusense demo`` and the others."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import io
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from gpusense._version import __version__
+
+# In the order of the help: each is a module of gpusense.commands.
+COMMANDS = ("devices", "selftest", "demo", "score")
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+# Set in the environment, it lets an exception through: for developers.
+TRACEBACK = "GPUSENSE_TRACEBACK"
+
+_DESCRIPTION = """\
+Probabilistic range-sensor models p(z | x, m) for mobile robots, on any vendor's GPU.
+How likely is this scan, if the robot stands here? For thousands of poses at once."""
+
+_EPILOG = """\
+start here:
+  gpusense demo               localise a robot in a made-up building, and draw it
+  gpusense devices            what gpusense can run on, and what is missing for more
+  gpusense COMMAND --help     what a command does, its options and an example
+
+Exit codes: 0 success, 2 bad input (one line on standard error says what), 130 interrupted."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports an error as one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the message without the usage and exit."""
+        self.exit(BAD_INPUT, _error_line(message))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: What follows the program's name; ``sys.argv[1:]`` by default.
+
+    Returns:
+        The exit code: 0 success, 2 bad input, 130 interrupted, 141 when the reader of standard output went away, or
+        what the command says.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        # A device's name may hold what the terminal's encoding does not.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        code = _dispatch(list(sys.argv[1:] if argv is None else argv))
+        print(end="", flush=True)
+        return code
+    except BrokenPipeError:
+        _settle()
+        return BROKEN_PIPE
+    except KeyboardInterrupt:
+        sys.stderr.write("gpusense: interrupted\n")
+        return INTERRUPTED
+    except (ValueError, TypeError, OSError, MemoryError) as error:
+        if os.environ.get(TRACEBACK):
+            raise
+        _settle()
+        sys.stderr.write(_error_line(_message(error)))
+        return BAD_INPUT
+
+
+def _settle() -> None:
+    """See that standard output, which Python flushes at its end, does not fail there once more."""
+    try:
+        print(end="", flush=True)
+    except OSError:
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _dispatch(argv: list[str]) -> int:
+    # A command that does not import must not take the others along.
+    names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
+    parser = _build(names)
+    try:
+        args = parser.parse_args(argv)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else BAD_INPUT
+    if args.command is None:
+        parser.print_help()
+        return 0
+    code: int = args.run(args)
+    return code
+
+
+def _build(names: Sequence[str]) -> Parser:
+    """The parser of these commands."""
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = Parser(
+        prog="gpusense", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=layout, allow_abbrev=False
+    )
+    parser.add_argument("--version", action="version", version=f"gpusense {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
+    for name in names:
+        module = importlib.import_module(f"gpusense.commands.{name}")
+        own = commands.add_parser(
+            module.NAME, help=module.HELP, description=module.HELP, formatter_class=layout, allow_abbrev=False
+        )
+        module.add_arguments(own)
+        own.set_defaults(run=module.run)
+    return parser
+
+
+def _message(error: Exception) -> str:
+    """What an exception says, without the error numbers of the operating system."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    if isinstance(error, MemoryError) and not str(error):
+        return "out of memory"
+    return str(error) or type(error).__name__
+
+
+def _error_line(message: str) -> str:
+    return f"gpusense: error: {' '.join(message.split())}\n"

@@ -39,7 +39,9 @@ def required_files(name: str) -> list[str]:
 
 
 def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
-    """Keep the taken branches of ``#if FLAG``, ``#if !FLAG``, ``#else``, ``#endif`` and drop the rest.
+    """Keep the taken branches of ``#if FLAG``, ``#if !FLAG``, ``#else``, ``#endif``; the rest becomes empty lines.
+
+    Lines keep their numbers, so that a compiler's message names the place in the file.
 
     Raises:
         ValueError: a condition that is not a single known flag, or unbalanced directives.
@@ -59,8 +61,8 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
             last = taken.pop()
             if directive == "#else":
                 taken.append(not last)
-        elif all(taken):
-            kept.append(line)
+        keep = all(taken) and not directive.startswith(("#if", "#else", "#endif"))
+        kept.append(line if keep else "")
     if taken:
         raise ValueError(f"{name}: #if without #endif")
     return "\n".join(kept) + "\n"
@@ -70,7 +72,7 @@ def assemble(file: str, flags: frozenset[str]) -> str:
     """Complete OpenCL C source of a kernel file for a set of flags."""
     parts = [prelude(float64="FLOAT64" in flags)]
     for needed in required_files(file):
-        parts += [f"// ---- {needed}.cl\n", resolve(opencl_source(needed), flags, f"{needed}.cl")]
+        parts += [f'#line 1 "{needed}.cl"\n', resolve(opencl_source(needed), flags, f"{needed}.cl")]
     return "".join(parts)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from gpusense._checks import show
-from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.base import Backend, BackendInfo, ProcessBound
 
 __all__ = ["Backend", "BackendInfo", "Device", "devices", "get_backend"]
 
@@ -93,13 +93,17 @@ def get_backend(selection: str | Backend = "auto") -> Backend:
     Raises:
         TypeError: the selection is not a string.
         ValueError: the selection names nothing, or a device that is absent. Nothing falls back in silence.
+        RuntimeError: the device was opened before this process was forked.
     """
     if not isinstance(selection, str):
         if hasattr(selection, "compile") and hasattr(selection, "info"):
             return selection
         raise TypeError(f"backend: must be a selection string, got {show(selection)}")
     with _LOCK:
-        return _open(_find(selection))
+        backend = _open(_find(selection))
+    if isinstance(backend, ProcessBound):
+        backend.check_process()
+    return backend
 
 
 _LOCK = threading.Lock()

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends.base import BackendInfo, Launcher
+from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel
 from gpusense.sources import assemble, relevant
 
 # Devices that check or emulate: correct, but no one wants to wait for them unasked.
 SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
+_LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
 _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
@@ -54,10 +55,11 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
     )
 
 
-class OpenCLBackend:
+class OpenCLBackend(ProcessBound):
     """One OpenCL device: a context, an in-order queue and the programs compiled for it."""
 
     def __init__(self, info: BackendInfo, device: cl.Device) -> None:
+        super().__init__()
         self.info = info
         self._device = device
         self._context = cl.Context([device])
@@ -71,9 +73,10 @@ class OpenCLBackend:
 
     def upload(self, array: np.ndarray, out: cl.Buffer | None = None) -> cl.Buffer:
         """See Backend.upload."""
+        self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
-            with _memory_errors():
+            with _driver_errors():
                 cl.enqueue_copy(self._queue, buffer, np.ascontiguousarray(array))
         return buffer
 
@@ -84,7 +87,7 @@ class OpenCLBackend:
             raise MemoryError(
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
             )
-        with _memory_errors():
+        with _driver_errors():
             buffer = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
             if zero:
                 cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
@@ -93,12 +96,13 @@ class OpenCLBackend:
     def download(self, buffer: cl.Buffer, out: np.ndarray) -> np.ndarray:
         """See Backend.download."""
         if out.size:
-            with _memory_errors():
+            with _driver_errors():
                 cl.enqueue_copy(self._queue, out, buffer)
         return out
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""
+        self.check_process()
         launcher = self._launchers.get((kernel, flags))
         if launcher is None:
             launcher = self._launchers[kernel, flags] = self._launcher(kernel, flags)
@@ -157,17 +161,21 @@ class _Launch:
         group = (self._row.group, *(1 for _ in size[1:]))
         rounded = (-(-size[0] // group[0]) * group[0], *size[1:])
         # Arguments belong to the kernel object, so two threads must not interleave here.
-        with self._lock, _memory_errors():
+        with self._lock, _driver_errors():
             self._kernel.set_args(*bound)
             cl.enqueue_nd_range_kernel(self._queue, self._kernel, rounded, group)
 
 
-class _memory_errors:
-    """Turns the driver's out-of-memory codes into MemoryError."""
+class _driver_errors:
+    """Turns the driver's codes into MemoryError, or a RuntimeError that says the device is gone."""
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, cl.Error) and any(code in str(error) for code in _OUT_OF_MEMORY):
+        if not isinstance(error, cl.Error):
+            return
+        if any(code in str(error) for code in _OUT_OF_MEMORY):
             raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
+        if any(code in str(error) for code in _LOST):
+            raise RuntimeError(f"the OpenCL device is no longer available, make the model anew: {error}") from error

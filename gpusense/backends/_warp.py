@@ -19,7 +19,7 @@ import warp as wp
 
 from gpusense._kernel_files import warp_module
 from gpusense.backends._numpy import _memory
-from gpusense.backends.base import BackendInfo, Launcher
+from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import cache_folder
 from gpusense.signatures import KERNELS, Argument, Kernel
 from gpusense.sources import relevant
@@ -66,10 +66,11 @@ def _describe(device: wp.Device) -> BackendInfo:
     )
 
 
-class WarpBackend:
+class WarpBackend(ProcessBound):
     """One Warp device: flat arrays of numbers as buffers, launches on the device's current stream."""
 
     def __init__(self, info: BackendInfo, device: str) -> None:
+        super().__init__()
         _initialize()
         self.info = info
         self._device = wp.get_device(device)
@@ -79,6 +80,7 @@ class WarpBackend:
 
     def upload(self, array: np.ndarray, out: wp.array | None = None) -> wp.array:
         """See Backend.upload."""
+        self.check_process()
         array = np.ascontiguousarray(array)
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
@@ -113,6 +115,7 @@ class WarpBackend:
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""
+        self.check_process()
         launcher = self._asked.get((kernel, flags))
         if launcher is None:
             row = KERNELS[kernel]

@@ -6,6 +6,7 @@ it; models only pass buffers on. Kernels are asked for by name and flags, and ar
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -37,6 +38,27 @@ class BackendInfo:
     memory: int
     max_buffer: int
     float64: bool
+
+
+class ProcessBound:
+    """A device that was opened in this process; drivers do not survive a fork."""
+
+    info: BackendInfo
+
+    def __init__(self) -> None:
+        self._process = os.getpid()
+
+    def check_process(self) -> None:
+        """Refuse to work in a forked child, where the driver would hang or corrupt memory.
+
+        Raises:
+            RuntimeError: this process is not the one that opened the device.
+        """
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                f"{self.info.selection} was opened by process {self._process} and does not survive a fork: start "
+                "workers with multiprocessing.get_context('spawn') and make their models there"
+            )
 
 
 class Launcher(Protocol):

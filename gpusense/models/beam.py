@@ -10,12 +10,10 @@ import numpy as np
 from gpusense import _checks
 from gpusense.backends import Backend
 from gpusense.grid import OccupancyGrid
-from gpusense.models.caster import CASTERS, cast_all
-from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import ScanModel, check_poses
+from gpusense.models.caster import CASTERS, ExactCaster
+from gpusense.models.scan_model import ScanModel, check_poses, place_in
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
-from gpusense.prepare import quadrant_squares
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
@@ -74,10 +72,10 @@ class BeamModel(ScanModel):
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
         )  # fmt: skip
-        self._limit = scanner.range_max / grid.resolution
-        self._map = ReachableMap(
-            self._backend, grid, unknown, scanner.mount, self._limit, quadrant_squares, crop=specialize
-        )
+        self._caster = ExactCaster(
+            self._backend, self._real, grid, scanner.mount, scanner.range_max,
+            unknown=unknown, outside=outside, crop=specialize,
+        )  # fmt: skip
         self._components, self._terms = self._mixture()
 
     def expected_ranges(self, poses: object) -> np.ndarray:
@@ -93,10 +91,8 @@ class BeamModel(ScanModel):
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
         """
         checked = check_poses(poses)
-        return cast_all(
-            self._backend, self._workspace, self._map, self.grid, self.scanner.mount, self._vectors, checked,
-            self._real, self.scanner.range_max, self.outside == "occupied",
-        )  # fmt: skip
+        with self._lock:
+            return self._caster.cast(checked, self._vectors)
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
@@ -127,7 +123,7 @@ class BeamModel(ScanModel):
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
-        if (far := self._map.omission(_BYTES_PER_CELL)) is not None:
+        if (far := self._caster.map.omission(_BYTES_PER_CELL)) is not None:
             omissions.append(far)
         title = f"beam model, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
@@ -166,8 +162,8 @@ class BeamModel(ScanModel):
         rays, readings = len(scan.rays), len(scan.readings)
 
         def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
-            squares, region = self._map.ensure(poses)
-            placed, beyond = self._place(poses, region)
+            squares, region = self._caster.map.ensure(poses)
+            placed, beyond = place_in(region, poses, self.grid, self.scanner.mount, real)
             flags = self._components | self._scene_flags()
             flags |= {"SHARED_RAYS"} if scan.shared or not self._specialize else set()
             flags |= {"ORIGINS_OUTSIDE"} if beyond or not self._specialize else set()
@@ -179,7 +175,7 @@ class BeamModel(ScanModel):
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             self._backend.compile("score_beams", flags)(
                 (count,), squares, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, first,
-                reading, terms, result, parts, region.rows, region.cols, count, rays, readings, self._limit,
+                reading, terms, result, parts, region.rows, region.cols, count, rays, readings, self._caster.limit,
                 self.grid.resolution, self.scanner.range_max, scan.constant, self.temperature,
             )  # fmt: skip
             self._backend.download(result, log_p)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpusense import _checks
 from gpusense.backends import Backend, BackendInfo, get_backend
-from gpusense.frames import Mount, place_poses, ray_vectors
+from gpusense.backends.base import Buffer
+from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import CHUNK, CHUNK_BYTES, check_poses, check_scene, in_chunks, real_dtype
+from gpusense.models.scan_model import check_poses, check_scene, chunk_of, in_chunks, place_in, real_dtype
 from gpusense.prepare import quadrant_squares
 from gpusense.workspace import Workspace
 
@@ -82,11 +84,11 @@ class RayCaster:
         self.method = _checks.choice("method", method, CASTERS)
         self.unknown = _checks.choice("unknown", unknown, ("free", "occupied"))
         self.outside = _checks.choice("outside", outside, ("free", "occupied"))
-        self._backend = get_backend(backend)
-        self._real = real_dtype(precision, self._backend)
-        self._workspace = Workspace(self._backend)
-        reach = self.range_max / grid.resolution
-        self._map = ReachableMap(self._backend, grid, unknown, _NO_MOUNT, reach, quadrant_squares, crop=True)
+        device = get_backend(backend)
+        real = real_dtype(precision, device)
+        self._caster = ExactCaster(
+            device, real, grid, _NO_MOUNT, self.range_max, unknown=unknown, outside=outside, crop=True
+        )
 
     @staticmethod
     def methods() -> tuple[CasterMethod, ...]:
@@ -96,12 +98,12 @@ class RayCaster:
     @property
     def device(self) -> BackendInfo:
         """The device the caster is compiled for."""
-        return self._backend.info
+        return self._caster.backend.info
 
     @property
     def precision(self) -> str:
         """``"float32"`` or ``"float64"``."""
-        return self._real.name
+        return self._caster.real.name
 
     def cast(self, poses: object, bearings: object) -> np.ndarray:
         """Expected ranges.
@@ -118,45 +120,67 @@ class RayCaster:
             TypeError, ValueError: arguments that are not finite numbers of these shapes.
         """
         vectors = ray_vectors(_checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
-        return cast_all(
-            self._backend, self._workspace, self._map, self.grid, _NO_MOUNT, vectors, check_poses(poses), self._real,
-            self.range_max, self.outside == "occupied",
-        )  # fmt: skip
+        return self._caster.cast(check_poses(poses), vectors)
 
 
-def cast_all(
-    backend: Backend,
-    workspace: Workspace,
-    reachable: ReachableMap,
-    grid: OccupancyGrid,
-    mount: Mount,
-    vectors: np.ndarray,
-    poses: np.ndarray,
-    real: np.dtype,
-    range_max: float,
-    outside_occupied: bool,
-) -> np.ndarray:
-    """Expected ranges (N, K) of (N, 3) poses and (K, 2) ray vectors, in pieces that fit the device."""
-    rays = len(vectors)
-    ranges = np.empty((len(poses), rays), real)
-    if ranges.size == 0:
+class ExactCaster:
+    """The exact caster of one map, sensor mount and range on one device; models share its table of the map.
+
+    Args:
+        backend: The device.
+        real: Precision.
+        grid: The map.
+        mount: The sensor's pose on the robot; its yaw belongs to the ray vectors.
+        range_max: Longest range [m].
+        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
+        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
+        crop: False prepares the whole map at once.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        real: np.dtype,
+        grid: OccupancyGrid,
+        mount: Mount,
+        range_max: float,
+        *,
+        unknown: str,
+        outside: str,
+        crop: bool,
+    ) -> None:
+        self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
+        self.limit = range_max / grid.resolution
+        self.map = ReachableMap(backend, grid, unknown, mount, self.limit, quadrant_squares, crop)
+        self._flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
+        self._flags |= {"FLOAT64"} if real == np.float64 else set()
+        self._workspace = Workspace(backend)
+        # Threads may share a caster: its buffers serve one call at a time.
+        self._lock = threading.Lock()
+
+    def cast(self, poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+        """Expected ranges (N, K) of (N, 3) float64 poses and (K, 2) ray vectors, in pieces that fit the device."""
+        rays = len(vectors)
+        ranges = np.empty((len(poses), rays), self.real)
+        if ranges.size == 0:
+            return ranges
+        with self._lock:
+            ray = self._workspace.upload("ray", vectors.astype(self.real))
+            chunk = chunk_of(self.backend, rays, self.real.itemsize)
+            in_chunks(
+                len(poses), chunk, self._workspace,
+                lambda begin, end: self._cast_chunk(poses[begin:end], ray, ranges[begin:end]),
+            )  # fmt: skip
         return ranges
-    ray = workspace.upload("cast_ray", vectors.astype(real))
-    flags = {"FLOAT64"} if real == np.float64 else set()
-    flags |= {"OUTSIDE_OCCUPIED"} if outside_occupied else set()
 
-    def run(begin: int, end: int) -> None:
-        squares, region = reachable.ensure(poses[begin:end])
-        placed = place_poses(poses[begin:end], grid, mount, real)
-        placed.cell[:] -= (region.col, region.row)
-        inside = ((placed.cell >= 0) & (placed.cell < (region.cols, region.rows))).all()
-        count = end - begin
-        result = workspace.empty("ranges", count * rays, real)
-        backend.compile("cast_ranges", frozenset(flags if inside else flags | {"ORIGINS_OUTSIDE"}))(
-            (rays, count), squares, workspace.upload("cell", placed.cell), workspace.upload("pose", placed.pose), ray,
-            result, region.rows, region.cols, count, rays, range_max / grid.resolution, grid.resolution, range_max,
+    def _cast_chunk(self, poses: np.ndarray, ray: Buffer, ranges: np.ndarray) -> None:
+        space = self._workspace
+        squares, region = self.map.ensure(poses)
+        placed, beyond = place_in(region, poses, self.grid, self.mount, self.real)
+        count, rays = ranges.shape
+        result = space.empty("ranges", ranges.size, self.real)
+        self.backend.compile("cast_ranges", self._flags | {"ORIGINS_OUTSIDE"} if beyond else self._flags)(
+            (rays, count), squares, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, result,
+            region.rows, region.cols, count, rays, self.limit, self.grid.resolution, self.range_max,
         )  # fmt: skip
-        backend.download(result, ranges[begin:end])
-
-    in_chunks(len(poses), max(min(CHUNK, CHUNK_BYTES // (rays * real.itemsize)), 1), workspace, run)
-    return ranges
+        self.backend.download(result, ranges)

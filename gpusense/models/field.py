@@ -13,7 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import ScanModel
+from gpusense.models.scan_model import ScanModel, place_in
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
 from gpusense.prepare import check_size, squared_distances
@@ -181,7 +181,7 @@ class LikelihoodFieldModel(ScanModel):
 
         def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
             table, region = self._map.ensure(poses)
-            placed, _ = self._place(poses, region)
+            placed, _ = place_in(region, poses, self.grid, self.scanner.mount, real)
             flags = self._flags | ({"PER_BEAM"} if per_beam else set())
             self._last_code = flags
             count = len(poses)

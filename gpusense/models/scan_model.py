@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Literal, overload
@@ -10,7 +11,7 @@ import numpy as np
 
 from gpusense import _checks
 from gpusense.backends import Backend, BackendInfo, get_backend
-from gpusense.frames import PlacedPoses, place_poses, ray_vectors
+from gpusense.frames import Mount, PlacedPoses, place_poses, ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.plan import Omission, Plan, share
 from gpusense.region import Region
@@ -22,6 +23,8 @@ from gpusense.workspace import Workspace
 CHUNK = 1 << 20
 # Most bytes of a result with a number per particle and beam.
 CHUNK_BYTES = 256 << 20
+# Most particle-beams of one launch on a processor: it can be interrupted between launches, a few seconds apart.
+CHUNK_WORK = 1 << 24
 # A launch that does not fit is tried with half the particles down to this.
 SMALLEST_CHUNK = 256
 # Above this many cells neighbouring crossing counts could be confused in float32.
@@ -65,6 +68,26 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     return dtype
 
 
+def place_in(
+    region: Region, poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.dtype
+) -> tuple[PlacedPoses, bool]:
+    """Sensors in the frame of a window of the map, and whether any of them lies outside the window."""
+    placed = place_poses(poses, grid, mount, real)
+    placed.cell[:] -= (region.col, region.row)
+    inside = ((placed.cell >= 0) & (placed.cell < (region.cols, region.rows))).all()
+    return placed, not inside
+
+
+def chunk_of(backend: Backend, beams: int, itemsize: int = 0) -> int:
+    """Particles of one launch of so many beams, with a result of ``itemsize`` bytes per particle-beam."""
+    chunk = CHUNK
+    if itemsize:
+        chunk = min(chunk, CHUNK_BYTES // (beams * itemsize))
+    if backend.info.kind == "cpu":
+        chunk = min(chunk, CHUNK_WORK // beams)
+    return max(chunk, 1)
+
+
 def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, int], None]) -> None:
     """Call ``run(begin, end)`` over [0, count) in pieces; pieces that do not fit into memory are halved.
 
@@ -78,9 +101,10 @@ def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, 
             begin += chunk
         except MemoryError:
             workspace.release()
-            if chunk <= SMALLEST_CHUNK:
+            tried = min(chunk, count - begin)
+            if tried <= SMALLEST_CHUNK:
                 raise
-            chunk = max(chunk // 2, SMALLEST_CHUNK)
+            chunk = max(tried // 2, SMALLEST_CHUNK)
 
 
 class ScanModel(ABC):
@@ -117,6 +141,8 @@ class ScanModel(ABC):
         self._backend = get_backend(backend)
         self._real = real_dtype(precision, self._backend)
         self._workspace = Workspace(self._backend)
+        # Threads may share a model: its buffers serve one call at a time.
+        self._lock = threading.Lock()
         self._vectors = ray_vectors(scanner.bearings, scanner.mount)
         self._z_max = z_max
         self._last_scan: PreparedScan | None = None
@@ -167,10 +193,13 @@ class ScanModel(ABC):
         """
         scans = check_ranges(ranges, self.scanner)
         if scans.ndim == 1:
-            log_p, parts = self._score_scan(check_poses(poses), scans, per_beam)
+            checked = check_poses(poses)
+            with self._lock:
+                log_p, parts = self._score_scan(checked, scans, per_beam)
             return (log_p, parts) if per_beam else log_p
         clouds = _checks.array("poses", poses, (len(scans), "N", 3))
-        scored = [self._score_scan(cloud, scan, per_beam) for cloud, scan in zip(clouds, scans, strict=True)]
+        with self._lock:
+            scored = [self._score_scan(cloud, scan, per_beam) for cloud, scan in zip(clouds, scans, strict=True)]
         log_p = np.stack([one for one, _ in scored]) if scored else np.empty(clouds.shape[:2], self._real)
         if not per_beam:
             return log_p
@@ -197,9 +226,7 @@ class ScanModel(ABC):
                 parts[:, scan.columns] = -np.inf
             return log_p, parts
         launch = self._prepare_launch(scan)
-        chunk = CHUNK
-        if per_beam:
-            chunk = max(min(chunk, CHUNK_BYTES // (used * self._real.itemsize)), 1)
+        chunk = chunk_of(self._backend, used, self._real.itemsize if per_beam else 0)
 
         def run(begin: int, end: int) -> None:
             each = launch(poses[begin:end], log_p[begin:end], per_beam)
@@ -216,13 +243,6 @@ class ScanModel(ABC):
     @abstractmethod
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
         """What scores (n, 3) poses into a log-likelihood array and returns (n, M) parts where they are wanted."""
-
-    def _place(self, poses: np.ndarray, region: Region) -> tuple[PlacedPoses, bool]:
-        """Poses in the window's frame, and whether any starts outside the window."""
-        placed = place_poses(poses, self.grid, self.scanner.mount, self._real)
-        placed.cell[:] -= (region.col, region.row)
-        outside = not ((placed.cell >= 0) & (placed.cell < (region.cols, region.rows))).all()
-        return placed, outside
 
     def _scene_flags(self) -> set[str]:
         flags = {"FLOAT64"} if self._real == np.float64 else set()

@@ -38,10 +38,6 @@ class Tolerance:
     unit: str
     reason: str
 
-    def allows(self, difference: float) -> bool:
-        """Whether a difference is small enough; NaN never is."""
-        return difference <= self.value
-
     def twice(self) -> Tolerance:
         """The tolerance between two results that each keep this one against the truth."""
         return Tolerance(self.name, 2 * self.value, self.unit, f"both sides keep half of it: {self.reason}")

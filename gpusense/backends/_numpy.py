@@ -55,10 +55,8 @@ class NumpyBackend:
                     dtype = declared.dtype(real)
                     bound.append(int(value) if dtype.kind == "i" else dtype.type(value))
                 else:
-                    whole = value.size // declared.width
-                bound.append(
-                    value[: whole * declared.width].reshape(whole, declared.width) if declared.width > 1 else value
-                )
+                    whole = value.size // declared.width * declared.width
+                    bound.append(value[:whole].reshape(-1, declared.width) if declared.width > 1 else value)
             with np.errstate(all="ignore"):
                 body(flags, *bound)
 

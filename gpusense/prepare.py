@@ -9,11 +9,10 @@ import numpy as np
 from gpusense import _checks
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.base import Buffer
+from gpusense.region import LONGEST_SIDE
 
 _INT = np.dtype(np.int32)
 _BYTE = np.dtype(np.uint8)
-# The square of a longer diagonal does not fit into 32 bits.
-_LONGEST_SIDE = (1 << 15) - 1
 # Kernels count cells of four padded planes in 32 bits.
 _MOST_CELLS = (1 << 31) // 4 - 1
 
@@ -38,9 +37,9 @@ def squared_distances(backend: Backend, obstacles: np.ndarray) -> Buffer:
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
-    if max(rows, cols) > _LONGEST_SIDE:
+    if max(rows, cols) > LONGEST_SIDE:
         raise ValueError(
-            f"grid: the part in use must have at most {_LONGEST_SIDE} rows and columns, got {rows} x {cols}"
+            f"grid: the part in use must have at most {LONGEST_SIDE} rows and columns, got {rows} x {cols}"
         )
     count = rows * cols
     occupied = backend.upload(np.ascontiguousarray(obstacles, dtype=_BYTE))

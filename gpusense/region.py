@@ -11,6 +11,8 @@ from gpusense.grid import OccupancyGrid
 
 # Maps smaller than this are prepared faster than it takes to think about it.
 SMALLEST_CELLS = 1 << 20
+# Distances in cells are squared in 32 bits, so no window may be longer.
+LONGEST_SIDE = (1 << 15) - 1
 # A region that covers more than this share of the map is not worth refreshing.
 LARGEST_SHARE = 0.6
 # Room to move, as a share of the reach, before a region is made anew.
@@ -72,7 +74,8 @@ def needed(grid: OccupancyGrid, poses: np.ndarray, mount: Mount, reach: float, s
 def choose(grid: OccupancyGrid, current: Region | None, poses: np.ndarray, mount: Mount, reach: float) -> Region:
     """The window to prepare for a cloud of N > 0 poses: the current one where it suffices, else one with room."""
     everything = whole(grid)
-    if current == everything or everything.cells < SMALLEST_CELLS:
+    long = max(grid.shape) > LONGEST_SIDE
+    if current == everything or (everything.cells < SMALLEST_CELLS and not long):
         return everything
     least = needed(grid, poses, mount, reach)
     if current is not None and current.contains(least):
@@ -87,5 +90,6 @@ def choose(grid: OccupancyGrid, current: Region | None, poses: np.ndarray, mount
             max(roomy.col + roomy.cols, current.col + current.cols) - col,
         )
         # A cloud that jumped far away does not drag its old window along.
-        roomy = joined if joined.cells <= 2 * (roomy.cells + current.cells) else roomy
-    return everything if roomy.cells > LARGEST_SHARE * everything.cells else roomy
+        near = joined.cells <= 2 * (roomy.cells + current.cells)
+        roomy = joined if near and max(joined.rows, joined.cols) <= LONGEST_SIDE else roomy
+    return everything if roomy.cells > LARGEST_SHARE * everything.cells and not long else roomy

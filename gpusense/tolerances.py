@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -91,7 +92,8 @@ _ALL = (
     Tolerance("float64 scan", 1e-11, "1 + |log p|", "a few eps a beam, and a compensated sum"),
     Tolerance(
         "field look-ups", 0, "beams in another cell",
-        "end points near a cell's edge are found again with twice the digits, so float32 hits the cells of float64",
+        "end points near a cell's edge are found again with twice the digits, so float32 hits the cells of float64; "
+        "nearer than 1e-13 cells per cell of range twice the digits cannot tell, and either cell is right",
     ),
     Tolerance("specialize=False, float32", 32, "eps (1 + |log p_k|)", "both keep the bound of one beam"),
     Tolerance("specialize=False, float64", 2e-11, "1 + |log p_k|", "both keep the bound of one beam"),
@@ -100,6 +102,35 @@ _ALL = (
 
 TOLERANCES: dict[str, Tolerance] = {tolerance.name: tolerance for tolerance in _ALL}
 """Every tolerance by its name."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One comparison.
+
+    Attributes:
+        left: Selection string of a backend.
+        right: That of another one, or what the truth is.
+        quantity: What is compared.
+        difference: The largest difference, in the tolerance's unit.
+        tolerance: What is allowed.
+    """
+
+    left: str
+    right: str
+    quantity: str
+    difference: float
+    tolerance: Tolerance
+
+    @classmethod
+    def of(cls, left: str, right: str, quantity: str, found: Any, truth: Any, tolerance: Tolerance) -> Check:
+        """Compare what was found with what it should be."""
+        return cls(left, right, quantity, tolerance.difference(found, truth), tolerance)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the difference is allowed."""
+        return self.difference <= self.tolerance.value
 
 
 def beam_tolerance(dtype: DTypeLike) -> Tolerance:

@@ -11,7 +11,7 @@ from gpusense import _checks
 from gpusense.backends import Backend
 from gpusense.grid import OccupancyGrid
 from gpusense.models.caster import CASTERS, ExactCaster
-from gpusense.models.scan_model import ScanModel, check_poses, place_in
+from gpusense.models.scan_model import ScanModel, check_poses, log_weight, place_in
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
 from gpusense.scan import Beams, PreparedScan
@@ -141,12 +141,11 @@ class BeamModel(ScanModel):
             flags.add("LINEAR")
             head = (scale, p.z_short, rand)
         else:
-            log_scale = _log(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
-            head = (log_scale, _log(p.z_short), _log(p.z_rand) - math.log(range_max))
+            log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+            head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
         inverse = 1 / p.sigma_hit
-        terms = [
-            head[0], inverse, inverse * math.sqrt(0.5), head[1], p.lambda_short, head[2], range_max, _log(p.z_max),
-        ]  # fmt: skip
+        shape = (inverse, inverse * math.sqrt(0.5))
+        terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
         return frozenset(flags), np.array(terms).astype(self._real)
 
     def _impossible(self) -> bool:
@@ -183,7 +182,3 @@ class BeamModel(ScanModel):
             return self._backend.download(parts, each) if per_beam else each
 
         return launch
-
-
-def _log(weight: float) -> float:
-    return math.log(weight) if weight > 0 else -math.inf

@@ -13,7 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import ScanModel, place_in
+from gpusense.models.scan_model import ScanModel, log_weight, place_in
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
 from gpusense.prepare import check_size, squared_distances
@@ -117,9 +117,9 @@ class LikelihoodFieldModel(ScanModel):
             flags.add("LINEAR")
             head = (p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi)), rand)
         else:
-            log_scale = _log(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
-            head = (log_scale, _log(p.z_rand) - math.log(range_max))
-        terms = np.array([head[0], 1 / p.sigma_hit, head[1], _log(p.z_max)])
+            log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+            head = (log_scale, log_weight(p.z_rand) - math.log(range_max))
+        terms = np.array([head[0], 1 / p.sigma_hit, head[1], log_weight(p.z_max)])
         return frozenset(flags), terms.astype(self._real)
 
     def _values(self, squared: np.ndarray) -> np.ndarray:
@@ -131,8 +131,8 @@ class LikelihoodFieldModel(ScanModel):
     def _log_density(self, distance: np.ndarray) -> np.ndarray:
         p = self.parameters
         u = distance / p.sigma_hit
-        log_hit = _log(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - 0.5 * u * u
-        return np.logaddexp(log_hit, _log(p.z_rand) - math.log(self.scanner.range_max))
+        log_hit = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - 0.5 * u * u
+        return np.logaddexp(log_hit, log_weight(p.z_rand) - math.log(self.scanner.range_max))
 
     def _prepare_table(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
         """Padded table of a window; its ring holds what lies outside the grid."""
@@ -203,7 +203,3 @@ class LikelihoodFieldModel(ScanModel):
 def _with_infinity(squared: np.ndarray) -> np.ndarray:
     """Squared distances as float64, infinite where there is no obstacle."""
     return np.where(squared == np.iinfo(np.int32).max, np.inf, squared.astype(np.float64))
-
-
-def _log(weight: float) -> float:
-    return math.log(weight) if weight > 0 else -math.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -76,6 +77,11 @@ def place_in(
     placed.cell[:] -= (region.col, region.row)
     inside = ((placed.cell >= 0) & (placed.cell < (region.cols, region.rows))).all()
     return placed, not inside
+
+
+def log_weight(weight: float) -> float:
+    """Logarithm of a mixture weight; -inf for 0."""
+    return math.log(weight) if weight > 0 else -math.inf
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: int = 0) -> int:
@@ -200,10 +206,12 @@ class ScanModel(ABC):
         clouds = _checks.array("poses", poses, (len(scans), "N", 3))
         with self._lock:
             scored = [self._score_scan(cloud, scan, per_beam) for cloud, scan in zip(clouds, scans, strict=True)]
-        log_p = np.stack([one for one, _ in scored]) if scored else np.empty(clouds.shape[:2], self._real)
+        shape = clouds.shape[:2]
+        log_p = np.stack([one for one, _ in scored]) if scored else np.empty(shape, self._real)
         if not per_beam:
             return log_p
-        return log_p, np.stack([parts for _, parts in scored])
+        nothing = np.empty((*shape, self.scanner.count), self._real)
+        return log_p, np.stack([parts for _, parts in scored]) if scored else nothing
 
     @abstractmethod
     def explain(self) -> str:
@@ -216,14 +224,16 @@ class ScanModel(ABC):
         log_p = np.empty(count, self._real)
         parts = np.zeros((count, self.scanner.count if per_beam else 0), self._real)
         if per_beam and len(scan.max_columns):
-            parts[:, scan.max_columns] = np.log(self._z_max)
+            parts[:, scan.max_columns] = log_weight(self._z_max)
         if used == 0:
             log_p[:] = self.temperature * scan.constant
             return log_p, parts
-        if self._impossible():
+        hits = scan.columns[np.isfinite(scan.readings)]
+        if len(hits) and self._impossible():
             log_p[:] = -np.inf
             if per_beam:
-                parts[:, scan.columns] = -np.inf
+                parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)
+                parts[:, hits] = -np.inf
             return log_p, parts
         launch = self._prepare_launch(scan)
         chunk = chunk_of(self._backend, used, self._real.itemsize if per_beam else 0)

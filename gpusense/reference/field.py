@@ -12,6 +12,7 @@ from gpusense.reference.error_free import two_product, two_sum
 
 FIELD_RING = 2
 BLOCK = 1 << 18
+EDGE = 2.0**-33
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -42,11 +43,16 @@ def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) ->
 
 
 def whole_cells(offset: Pair) -> tuple[np.ndarray, np.ndarray]:
-    """Whole cells below an offset of two parts, and what is left of it in [0, 1)."""
-    whole = np.floor(np.where(np.isfinite(offset[0]), offset[0], 0))
-    left = (offset[0] - whole) + offset[1]
-    carry = np.where(left < 0, -1, np.where(left >= 1, 1, 0)).astype(left.dtype)
-    return (whole + carry).astype(np.int64), left - carry
+    """Whole cells below an offset of two parts, and what is left of it in [0, 1).
+
+    The sum is taken relative to the nearest edge, where small numbers keep their digits; an offset that is EDGE or less
+    short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
+    """
+    real = offset[0].dtype.type
+    nearest = np.floor(np.where(np.isfinite(offset[0]), offset[0], 0) + real(0.5))
+    past = (offset[0] - nearest) + offset[1]
+    below = past + real(EDGE) < 0
+    return nearest.astype(np.int64) - below, past + below
 
 
 def end_point(

@@ -41,13 +41,17 @@ int floor_int(const real a) {
     return whole - ((real)whole > a);
 }
 
-// Whole cells below an offset of two parts, and what is left of it in [0, 1).
+// Whole cells below an offset of two parts, and what is left of it in [0, 1). The sum is taken relative to the nearest
+// edge, where small numbers keep their digits; an offset that is EDGE or less short of an edge lies on it, so that end
+// points on edges fall into the same cell in every precision.
+#define EDGE ((real)1.1641532182693481e-10)
+
 int whole_cells(const real2 offset, real *rest) {
-    const int whole = floor_int(offset.x);
-    const real left = (offset.x - (real)whole) + offset.y;
-    const int carry = (left >= 1) - (left < 0);
-    *rest = left - (real)carry;
-    return whole + carry;
+    const int nearest = floor_int(offset.x + (real)0.5);
+    const real past = (offset.x - (real)nearest) + offset.y;
+    const int below = past + EDGE < 0;
+    *rest = past + (real)below;
+    return nearest - below;
 }
 
 // Cell offsets of an end point from the pose's cell, and the position within that cell.

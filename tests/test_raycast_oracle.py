@@ -290,6 +290,30 @@ def test_a_diagonal_pair_of_walls_never_leaks(backend):
                 np.testing.assert_array_equal(cast(scene, backend, precision), expected)
 
 
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_no_pair_of_walls_leaks_at_any_slope(precision, backend):
+    """Rays aimed at the common corner of two walls as exactly as floats can: however they round, a wall stops them."""
+    rng = np.random.default_rng(13)
+    for number in range(40):
+        sign = rng.choice([-1, 1], 2)
+        occupied = np.zeros((41, 41), bool)
+        # The corner is (20, 20). The cells before and behind it on the way are free, the two beside it are walls.
+        occupied[20 if sign[1] < 0 else 19, 20 if sign[0] > 0 else 19] = True
+        occupied[20 if sign[1] > 0 else 19, 20 if sign[0] < 0 else 19] = True
+        if number % 2:
+            away = rng.integers(1, 20, (100, 2)).astype(float)
+            direction = away / 2.0 ** rng.integers(5, 8, (100, 1))
+        else:
+            away = rng.integers(1, 20 << 16, (100, 2)) / (1 << 16)
+            direction = as_float32(away / np.hypot(*away.T)[:, None])
+        origin = 20 - sign * away
+        cell = np.floor(origin).astype(int)
+        scene = Scene(occupied, cell, origin - cell, direction * sign, 2000.0)
+        corner = np.hypot(*away.T) / np.hypot(*direction.T)
+        found = cast(scene, backend, precision)
+        assert (found <= corner * (1 + 1e-5)).all(), scene.ray(int(np.argmax(found - corner)))
+
+
 # ------------------------------------------------------------------------------------------ through RayCaster.cast
 
 

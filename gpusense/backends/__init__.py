@@ -100,13 +100,18 @@ def get_backend(selection: str | Backend = "auto") -> Backend:
             return selection
         raise TypeError(f"backend: must be a selection string, got {show(selection)}")
     with _LOCK:
+        # Before any driver is asked: in a forked child even listing devices may hang.
+        for opened in _OPENED:
+            if selection.partition(":")[0] in ("auto", opened.info.backend):
+                opened.check_process()
         backend = _open(_find(selection))
-    if isinstance(backend, ProcessBound):
-        backend.check_process()
+        if isinstance(backend, ProcessBound) and backend not in _OPENED:
+            _OPENED.append(backend)
     return backend
 
 
 _LOCK = threading.Lock()
+_OPENED: list[ProcessBound] = []
 
 
 @functools.cache
@@ -126,8 +131,8 @@ def _open(selection: str) -> Backend:
 
 def _find(selection: str) -> str:
     """The selection string of the one device that a user's selection means."""
-    head, _, rest = selection.partition(":")
-    if head not in ("auto", "numpy", "opencl", "warp") or (rest and head in ("auto", "numpy")):
+    head, colon, rest = selection.partition(":")
+    if head not in ("auto", "numpy", "opencl", "warp") or (colon and (not rest or head in ("auto", "numpy"))):
         raise ValueError(
             "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', "
             f"got {show(selection)}"

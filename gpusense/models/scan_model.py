@@ -53,7 +53,7 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
         raise TypeError(f"grid: must be an OccupancyGrid, got {_checks.show(grid)}")
     cells = range_max / grid.resolution
     if cells > _MOST_CELLS_PER_RANGE:
-        raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.0f}")
+        raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.15g}")
     return grid
 
 

@@ -139,9 +139,9 @@ def to_markdown(rows: list[dict]) -> str:
     return "\n".join([head, *lines])
 
 
-def machine() -> dict[str, str]:
-    """What the figures depend on beside the device."""
-    commit = subprocess.run(
+def machine(commit: str) -> dict[str, str]:
+    """What the figures depend on beside the device; the commit is asked of git where it is not given."""
+    commit = commit or subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False,
         cwd=Path(__file__).parent,
     ).stdout.strip()  # fmt: skip
@@ -164,6 +164,7 @@ def main() -> int:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=5.0, help="longest time of the repeats of one row")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
     parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
     arguments = parser.parse_args()
     rng = np.random.default_rng(arguments.seed)
@@ -184,8 +185,10 @@ def main() -> int:
         rows += rows_of(backend, clouds, (grid, scanner, ranges), arguments)
     scene = f"{arguments.map.name if arguments.map else 'built-in building'}, {grid.shape[0]} x {grid.shape[1]} cells"
     command = shlex.join(["python", "bench/speed.py", *sys.argv[1:]])
-    report = {"command": command, "scene": scene, "machine": machine(), "rows": rows}
-    table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {machine()}. Command: `{command}`.\n"
+    host = machine(arguments.commit)
+    report = {"command": command, "scene": scene, "machine": host, "rows": rows}
+    described = ", ".join(f"{name} {value}" for name, value in host.items())
+    table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {described}. Command: `{command}`.\n"
     print(table)
     if arguments.output:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)

@@ -81,6 +81,8 @@ def choose(grid: OccupancyGrid, current: Region | None, poses: np.ndarray, mount
     if current is not None and current.contains(least):
         return current
     roomy = needed(grid, poses, mount, reach, SLACK * reach)
+    if max(roomy.rows, roomy.cols) > LONGEST_SIDE:
+        roomy = least
     if current is not None:
         row, col = min(roomy.row, current.row), min(roomy.col, current.col)
         joined = Region(

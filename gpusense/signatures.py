@@ -17,6 +17,7 @@ FLAGS = {
     "HIT": "z_hit > 0",
     "SHORT": "z_short > 0",
     "RAND": "z_rand > 0",
+    "SHARP": "the normal density's peak is so high that exponents need more than the working precision",
     "SINGLE": "the mixture has one continuous component",
     "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
     "SHARED_RAYS": "several readings have the same bearing",
@@ -105,7 +106,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_beams": _kernel(
         "beam", "particle", "uchar squares [4 * (rows + 2) * (cols + 2)]", *_POSES, "real2 ray [rays]",
-        "int first [rays + 1]", "real reading [readings]", "real terms [8]", *_RESULT, *_MAP, "int particles",
+        "int first [rays + 1]", "real reading [readings]", "real terms [10]", *_RESULT, *_MAP, "int particles",
         "int rays", "int readings", *_RANGE, "real fixed", "real temperature",
     ),
     "fill_field": _kernel(

@@ -307,6 +307,7 @@ def test_explain_names_what_is_left_out(backend, monkeypatch):
     poses = np.column_stack([grid.cell_centers([200] * 9, range(245, 254)), np.zeros(9)])
     model = make("beam", grid, backend, REPEATED, weights=(0.9, 0.0, 0.1, 0.0), mount=(0.0, 0.0, 0.2), beams=12)
     always = {"short component", "rand component", "mount", "unknown branch", "bounds tests", "float64"}
+    always.add("exponents in two parts")
     assert set(left_out(model)) == always
     model.log_likelihood(poses, z)
     assert model.explain().startswith("beam model, float32, ")
@@ -335,7 +336,7 @@ def test_explain_of_a_full_beam_model(backend):
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())
-    assert set(left_out(model)) == {"unknown branch", "bounds tests", "log-domain sum"}
+    assert set(left_out(model)) == {"unknown branch", "bounds tests", "log-domain sum", "exponents in two parts"}
 
 
 @pytest.mark.parametrize("kind", ["field", "bilinear"])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import selftest
+from gpusense import selftest, stiff
 from gpusense.backends import get_backend
 from gpusense.cli import main
 from gpusense.reference import beam, distance, mixture, raycast
@@ -262,3 +262,21 @@ def test_a_single_backend_is_held_against_numpy():
     assert [b.info.selection for b in selftest.chosen_backends([name])] == ["numpy", name]
     assert [b.info.selection for b in selftest.chosen_backends(["numpy"])] == ["numpy"]
     assert not any("simulator" in b.info.name.lower() for b in selftest.chosen_backends())
+
+
+def test_the_stiff_catalogue_on_the_command_line(capsys):
+    assert main(["selftest", "--stiff", "--backend", "numpy", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["passed"]
+    assert {row["precision"] for row in document["rows"]} == {"float32", "float64"}
+    assert all(row["ok"] for row in document["rows"])
+    assert len(document["rows"]) > 400
+
+
+def test_a_stiff_breach_is_told_and_fails(capsys, monkeypatch):
+    row = stiff.Row("a case", "log p", 17.0, 16.0, 0, False)
+    monkeypatch.setattr(stiff, "run", lambda backend, precision: [row])
+    assert main(["selftest", "--stiff", "--backend", "numpy"]) == 1
+    output = capsys.readouterr().out
+    assert "BREACH" in output
+    assert "2 rows, 2 BREACHED" in output

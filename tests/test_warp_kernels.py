@@ -308,6 +308,7 @@ MIXTURES = {
     "steep short": (0.4, 0.4, 0.2, 0.2, 1e6),
     "hit": (1.0, 0.0, 0.0, 0.2, 0.0),
     "narrow hit": (1.0, 0.0, 0.0, 1e-8 * LIMIT * RESOLUTION, 0.0),
+    "narrow hit and rand": (0.9, 0.0, 0.1, 1e-6, 0.0),
     "wide hit": (1.0, 0.0, 0.0, 1e6 * LIMIT * RESOLUTION, 0.0),
     "short": (0.0, 1.0, 0.0, 0.2, 0.0),
     "hit and short": (0.5, 0.5, 0.0, 0.2, 3.0),
@@ -323,13 +324,18 @@ def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarra
     if len(flags) == 1:
         flags.add("SINGLE")
     head = np.array([z_hit / (sigma * np.sqrt(2 * np.pi)), z_short, z_rand / range_max])
+    if head[0] > 64:
+        flags.add("SHARP")
     if head[2] >= (1e-290 if real is np.float64 else 1e-30):
         flags.add("LINEAR")
     else:
         with np.errstate(divide="ignore"):
             head = np.log(head)
-    terms = [head[0], 1 / sigma, np.sqrt(0.5) / sigma, head[1], decay, head[2], range_max, np.log(z_max)]
-    return flags, np.array(terms).astype(real)
+    terms = [head[0], 0.5 / sigma**2, np.sqrt(0.5) / sigma, head[1], decay, head[2], range_max, np.log(z_max)]
+    rounded = np.array(terms).astype(real)
+    with np.errstate(invalid="ignore"):
+        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
+    return flags, np.append(rounded, low.astype(real))
 
 
 def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
@@ -443,7 +449,7 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
     z_hit, z_rand, sigma, range_max = 0.9, (0.1 if "LINEAR" in FIELDS[name] else 1e-40), 0.2, LIMIT * RESOLUTION
     distance = np.minimum(np.sqrt(squared_distances(occupied)) * RESOLUTION, 1.5)
     table = np.pad(distance, 2, constant_values=1.5)
-    terms = np.array([z_hit / (sigma * np.sqrt(2 * np.pi)), 1 / sigma, z_rand / range_max, 0.05])
+    terms = np.array([z_hit / (sigma * np.sqrt(2 * np.pi)), 0.5 / sigma**2, z_rand / range_max, 0.05])
     if "LOG_TABLE" in FIELDS[name]:
         table = np.log(terms[0] * np.exp(-0.5 * (table / sigma) ** 2) + terms[2])
     if "LINEAR" not in FIELDS[name]:

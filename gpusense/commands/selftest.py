@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from gpusense.commands._common import BACKEND_HELP, add_json, machine, machine_line, print_json, print_table, progress
 
 if TYPE_CHECKING:
+    from gpusense.stiff import Row
     from gpusense.tolerances import Check
 
 NAME = "selftest"
@@ -25,8 +26,13 @@ precision. The tolerances and their reasons are in gpusense.tolerances, and in t
 
 Exit codes: 0 every difference is allowed, 1 one is not, 2 bad input or an absent device.
 
+With --stiff the catalogue of stiff and extreme cases runs instead, on each backend and in each precision: sigma from
+1e-8 to 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, odd maps, resolutions, poses and scans. Errors are
+in eps (1 + |log p|) unless the unit says otherwise; the textbook's formulas are shown beside as what they are.
+
 example:
   gpusense selftest
+  gpusense selftest --stiff
   gpusense selftest --backend opencl --backend warp:cpu --json"""
 
 
@@ -38,11 +44,54 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"{BACKEND_HELP}; may be given several times; one alone is held against numpy (default: all present "
         "except simulators)",
     )  # fmt: skip
+    parser.add_argument(
+        "--stiff", action="store_true", help="run the stiff and extreme cases on each backend and in each precision"
+    )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Compare the backends and print a table of the differences."""
+    return _run_stiff(args) if args.stiff else _run_pairs(args)
+
+
+def _run_stiff(args: argparse.Namespace) -> int:
+    """Run the catalogue of stiff cases; every row of every backend and precision must keep its bound."""
+    from gpusense import selftest, stiff
+
+    backends = selftest.chosen_backends(args.backend)
+    jobs = [
+        (backend, precision)
+        for backend in backends
+        for precision in ("float32", "float64")
+        if precision == "float32" or backend.info.float64
+    ]
+    rows: list[tuple[str, str, Row]] = []
+    with progress(len(jobs)) as step:
+        for backend, precision in jobs:
+            step(f"{backend.info.selection} {precision}")
+            rows += [(backend.info.selection, precision, row) for row in stiff.run(backend, precision)]
+    breaches = sum(not row.ok for _, _, row in rows)
+    if args.json:
+        listed = [{"backend": backend, "precision": precision} | asdict(row) for backend, precision, row in rows]
+        document = {"passed": not breaches, "rows": listed, "machine": machine()}
+        print_json(document)
+    else:
+        columns = ("backend", "precision", "case", "quantity", "worst", "bound", "not finite", "verdict")
+        table = [
+            (backend, precision, row.case, row.quantity, f"{row.worst:.3g}", f"{row.bound:.3g}", str(row.nonfinite),
+             "ok" if row.ok else "BREACH")
+            for backend, precision, row in rows
+        ]  # fmt: skip
+        print_table(columns, table, right=("worst", "bound", "not finite"))
+        print()
+        print(machine_line())
+        print(f"{len(rows)} rows, {f'{breaches} BREACHED' if breaches else 'none breached'}")
+    return BREACH if breaches else 0
+
+
+def _run_pairs(args: argparse.Namespace) -> int:
+    """Compare the backends with the truth and with one another."""
     from gpusense import selftest
     from gpusense.backends import devices
 

@@ -11,15 +11,14 @@ from gpusense import _checks
 from gpusense.backends import Backend
 from gpusense.grid import OccupancyGrid
 from gpusense.models.caster import CASTERS, ExactCaster
-from gpusense.models.scan_model import ScanModel, check_poses, log_weight, place_in
+from gpusense.models.scan_model import ScanModel, check_poses, log_weight, place_in, rounded_terms, sums_linearly
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
 _BYTES_PER_CELL = 4
-# Below this p_rand could underflow beside the other densities, so the mixture is summed as logarithms.
-_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
+_HIGH_PEAK = 64.0
 
 
 class BeamModel(ScanModel):
@@ -123,6 +122,12 @@ class BeamModel(ScanModel):
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
+        if "SHARP" not in self._components:
+            omissions.append(
+                Omission(
+                    "exponents in two parts", f"the hit density's peak is at most {_HIGH_PEAK:g} / m", "37 operations"
+                )
+            )
         if (far := self._caster.map.omission(_BYTES_PER_CELL)) is not None:
             omissions.append(far)
         title = f"beam model, {self.precision}, {self.device.selection} ({self.device.name})"
@@ -133,20 +138,24 @@ class BeamModel(ScanModel):
         p, range_max = self.parameters, self.scanner.range_max
         weights = {"HIT": p.z_hit, "SHORT": p.z_short, "RAND": p.z_rand}
         flags = {name for name, weight in weights.items() if weight > 0 or not self._specialize}
-        rand = p.z_rand / range_max
+        rand, scale = p.z_rand / range_max, p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
         if self._specialize and len(flags) == 1:
             flags.add("SINGLE")
-        scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-        if rand >= _SMALLEST_DENSITY[self._real]:
+        # Above this peak an exponent's rounding errors could show beside a log density near 0.
+        if (p.z_hit > 0 and scale > _HIGH_PEAK) or not self._specialize:
+            flags.add("SHARP")
+        if sums_linearly(rand, max(scale, p.z_short * p.lambda_short), self._real):
             flags.add("LINEAR")
             head = (scale, p.z_short, rand)
         else:
             log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
             head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
-        inverse = 1 / p.sigma_hit
-        shape = (inverse, inverse * math.sqrt(0.5))
+        shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
         terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-        return frozenset(flags), np.array(terms).astype(self._real)
+        rounded = rounded_terms(terms, self._real)
+        with np.errstate(invalid="ignore"):
+            low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
+        return frozenset(flags), np.append(rounded, low.astype(self._real))
 
     def _impossible(self) -> bool:
         p = self.parameters

@@ -13,7 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import ScanModel, log_weight, place_in
+from gpusense.models.scan_model import ScanModel, log_weight, place_in, rounded_terms, sums_linearly
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
 from gpusense.prepare import check_size, squared_distances
@@ -23,7 +23,6 @@ from gpusense.scanner import Scanner
 _RING = 2
 # Longest table from squared distances to densities; a larger cap is looked up on the host while preparing.
 _LONGEST_TABLE = 1 << 22
-_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
 
 
 class LikelihoodFieldModel(ScanModel):
@@ -113,14 +112,15 @@ class LikelihoodFieldModel(ScanModel):
         flags |= {"CAREFUL"} if self._real == np.float32 else set()
         flags |= {"HIT"} if p.z_hit > 0 or not self._specialize else set()
         rand = p.z_rand / range_max
-        if rand >= _SMALLEST_DENSITY[self._real]:
+        scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        if sums_linearly(rand, scale, self._real):
             flags.add("LINEAR")
-            head = (p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi)), rand)
+            head = (scale, rand)
         else:
             log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
             head = (log_scale, log_weight(p.z_rand) - math.log(range_max))
-        terms = np.array([head[0], 1 / p.sigma_hit, head[1], log_weight(p.z_max)])
-        return frozenset(flags), terms.astype(self._real)
+        terms = [head[0], 0.5 / p.sigma_hit / p.sigma_hit, head[1], log_weight(p.z_max)]
+        return frozenset(flags), rounded_terms(terms, self._real)
 
     def _values(self, squared: np.ndarray) -> np.ndarray:
         """What the table holds for squared cell distances: log densities, or distances in metres. float64."""
@@ -130,8 +130,9 @@ class LikelihoodFieldModel(ScanModel):
 
     def _log_density(self, distance: np.ndarray) -> np.ndarray:
         p = self.parameters
-        u = distance / p.sigma_hit
-        log_hit = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - 0.5 * u * u
+        with np.errstate(over="ignore"):
+            exponent = 0.5 * (distance / p.sigma_hit) ** 2
+        log_hit = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - exponent
         return np.logaddexp(log_hit, log_weight(p.z_rand) - math.log(self.scanner.range_max))
 
     def _prepare_table(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
@@ -141,7 +142,8 @@ class LikelihoodFieldModel(ScanModel):
         p = self.parameters
         beyond = self._values(np.array([0.0 if self.outside == "occupied" else np.inf])).astype(self._real)
         size = (rows + 2 * _RING, cols + 2 * _RING)
-        farthest = min(math.floor((p.max_distance / self.grid.resolution) ** 2) + 1, rows * rows + cols * cols)
+        reach, diagonal = p.max_distance / self.grid.resolution, rows * rows + cols * cols
+        farthest = diagonal if reach * reach >= diagonal else math.floor(reach * reach) + 1
         if self.outside == "occupied":
             return backend.upload(self._table_with_walls(obstacles, size))
         squared = squared_distances(backend, obstacles)

@@ -79,6 +79,29 @@ def place_in(
     return placed, not inside
 
 
+# A density that takes part in a linear sum must dwarf what underflow takes from the others, denormals or not.
+_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
+
+
+def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
+    """Whether the uniform density is large enough, beside the peak of the others, to sum densities."""
+    return rand >= _SMALLEST_DENSITY[real] * max(peak, 1.0)
+
+
+def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
+    """The numbers of a mixture in a model's precision.
+
+    Raises:
+        ValueError: sigma_hit or lambda_short is beyond what the precision can hold.
+    """
+    with np.errstate(over="ignore"):
+        rounded = np.array(terms).astype(real)
+    # Logarithms of weights of 0 are -inf; nothing else may be infinite.
+    if np.isposinf(rounded).any() or rounded[1] < np.finfo(real).tiny:
+        raise ValueError(f"parameters: sigma_hit and lambda_short must fit {real.name}, got terms {terms}")
+    return rounded
+
+
 def log_weight(weight: float) -> float:
     """Logarithm of a mixture weight; -inf for 0."""
     return math.log(weight) if weight > 0 else -math.inf

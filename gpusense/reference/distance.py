@@ -10,7 +10,8 @@ import numpy as np
 
 NO_OBSTACLE = -1
 UNREACHABLE = np.iinfo(np.int32).max
-FAR = np.int32(1 << 30)
+# Above every squared distance; another square added to it still fits into 32 bits.
+FAR = np.uint32(1 << 31)
 BLOCK = 32
 
 
@@ -59,12 +60,12 @@ def distance_envelope(
     out = _lines(squared, lines, length, line_stride, step)
     for block in range(0, lines, BLOCK):
         g = across[block : block + BLOCK]
-        start = np.where(g == NO_OBSTACLE, FAR, g * g)
+        start = np.where(g == NO_OBSTACLE, FAR, (g * g).astype(np.uint32))
         best = start.copy()
         for offset in range(1, length):
-            square = offset * offset
+            square = np.uint32(offset * offset)
             if square >= best.max():
                 break
             np.minimum(best[:, offset:], start[:, :-offset] + square, out=best[:, offset:])
             np.minimum(best[:, :-offset], start[:, offset:] + square, out=best[:, :-offset])
-        out[block : block + BLOCK] = np.where(best >= FAR, UNREACHABLE, best)
+        out[block : block + BLOCK] = np.minimum(best, np.uint32(UNREACHABLE)).astype(np.int32)

@@ -90,14 +90,13 @@ def bilinear(table: np.ndarray, col: np.ndarray, row: np.ndarray, rest: Pair, ro
 
 
 def log_field(flags: frozenset[str], distance: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """terms = (hit, 1 / sigma, rand, log z_max): z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, or logarithms."""
-    u = distance * terms[1]
-    half = terms.dtype.type(0.5)
+    """terms = (hit, 1 / (2 sigma^2), rand, log z_max): z_hit / (sigma sqrt(2 pi)), z_rand / range_max, or logs."""
+    exponent = distance * (distance * terms[1])
     if "LINEAR" not in flags:
-        return np.logaddexp(terms[0] - half * u * u, terms[2])
+        return np.logaddexp(terms[0] - exponent, terms[2])
     p = np.full(distance.shape, terms[2])
     if "HIT" in flags:
-        p += terms[0] * np.exp(-half * u * u)
+        p += terms[0] * np.exp(-exponent)
     return np.log(p)
 
 

@@ -1,13 +1,16 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-``terms`` = (hit, 1 / sigma, 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max). In the linear domain hit is
-z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain their logarithms.
+``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding took
+from terms 0 and 1). In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
+z_rand / range_max; in the log domain their logarithms.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.special import erf
+
+from gpusense.reference.error_free import two_product
 
 TINY = 1e-30
 SMALLEST_RANGE = 1e-37
@@ -17,6 +20,22 @@ def hit_mass(expected: np.ndarray, erf_scale: np.floating, range_max: np.floatin
     """Mass of the normal around z* on [0, range_max]: a sum of positive terms, so nothing cancels."""
     half = expected.dtype.type(0.5)
     return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
+
+
+def hit_exponent(
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """``(z - z*)^2 / (2 sigma^2)`` as a sum of two numbers.
+
+    Where the density's peak is high, exponent and log peak are large and nearly cancel, and the second part keeps the
+    digits that are left.
+    """
+    off = z - expected
+    if "SHARP" not in flags:
+        return off * (off * terms[1]), np.zeros_like(off)
+    square = two_product(off, off)
+    product = two_product(square[0], terms[1])
+    return product[0], product[1] + (square[1] * terms[1] + square[0] * terms[9])
 
 
 def short_factor(x: np.ndarray) -> np.ndarray:
@@ -30,11 +49,11 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
     """log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
         return _linear(flags, z, expected, terms)
-    half = terms.dtype.type(0.5)
     parts = []
     if "HIT" in flags:
-        u = (z - expected) * terms[1]
-        parts.append(terms[0] - half * u * u - np.log(hit_mass(expected, terms[2], terms[6])))
+        exponent = hit_exponent(flags, z, expected, terms)
+        log_hit = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
+        parts.append(log_hit - np.log(hit_mass(expected, terms[2], terms[6])))
     if "SHORT" in flags:
         inside = (z <= expected) & (expected > 0)
         x = terms[4] * expected
@@ -48,11 +67,10 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
 
 
 def _linear(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    half = terms.dtype.type(0.5)
     p = np.zeros(z.shape, terms.dtype)
     if "HIT" in flags:
-        u = (z - expected) * terms[1]
-        p += terms[0] * np.exp(-half * u * u) / hit_mass(expected, terms[2], terms[6])
+        exponent = hit_exponent(flags, z, expected, terms)
+        p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
     if "SHORT" in flags:
         decay = np.exp(-terms[4] * z) / np.maximum(expected, SMALLEST_RANGE)
         density = terms[3] * short_factor(terms[4] * expected) * decay

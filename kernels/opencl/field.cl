@@ -92,18 +92,18 @@ real bilinear(global const real *table, const int2 cell, const real2 rest, const
 #endif
 
 #if !LOG_TABLE
-// terms[4] = {hit, 1 / sigma, rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms in the
+// terms[4] = {hit, 1 / (2 sigma^2), rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms in the
 // log domain.
 real log_field(const real distance, global const real *terms) {
-    const real u = distance * terms[1];
+    const real exponent = distance * (distance * terms[1]);
 #if LINEAR
     real p = terms[2];
 #if HIT
-    p += terms[0] * exp((real)-0.5 * u * u);
+    p += terms[0] * exp(-exponent);
 #endif
     return log(p);
 #else
-    const real hit = terms[0] - (real)0.5 * u * u;
+    const real hit = terms[0] - exponent;
     const real largest = fmax(hit, terms[2]);
     return largest + log(exp(hit - largest) + exp(terms[2] - largest));
 #endif

@@ -1,6 +1,8 @@
 // Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// terms[8] = {hit, 1 / sigma, 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max}. In the linear domain hit
-// is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain their logarithms.
+// terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding
+// took from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
+// z_rand / range_max; in the log domain their logarithms.
+// requires: error_free
 
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
@@ -13,6 +15,21 @@ real hit_mass(const real expected, const real erf_scale, const real range_max) {
     const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
     if (below > ERF_ONE && above > ERF_ONE) return (real)1;
     return (real)0.5 * (erf(below) + erf(above));
+}
+#endif
+
+#if HIT
+// (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large and
+// nearly cancel, and the second part keeps the digits that are left.
+real2 hit_exponent(const real z, const real expected, global const real *terms) {
+    const real off = z - expected;
+#if SHARP
+    const real2 square = two_product(off, off);
+    const real2 product = two_product(square.x, terms[1]);
+    return (real2)(product.x, product.y + (square.y * terms[1] + square.x * terms[9]));
+#else
+    return (real2)(off * (off * terms[1]), 0);
+#endif
 }
 #endif
 
@@ -29,8 +46,8 @@ real short_factor(const real x) {
 real log_density(const real z, const real expected, global const real *terms) {
     real p = 0;
 #if HIT
-    const real u = (z - expected) * terms[1];
-    p += terms[0] * exp((real)-0.5 * u * u) / hit_mass(expected, terms[2], terms[6]);
+    const real2 exponent = hit_exponent(z, expected, terms);
+    p += terms[0] * exp(-exponent.x) * (1 - exponent.y) / hit_mass(expected, terms[2], terms[6]);
 #endif
 #if SHORT
     if (z <= expected && expected > 0) {
@@ -45,8 +62,8 @@ real log_density(const real z, const real expected, global const real *terms) {
 real log_density(const real z, const real expected, global const real *terms) {
     real largest = -INFINITY;
 #if HIT
-    const real u = (z - expected) * terms[1];
-    const real hit = terms[0] - (real)0.5 * u * u - log(hit_mass(expected, terms[2], terms[6]));
+    const real2 exponent = hit_exponent(z, expected, terms);
+    const real hit = (terms[0] - exponent.x) + (terms[8] - exponent.y) - log(hit_mass(expected, terms[2], terms[6]));
     largest = hit;
 #endif
 #if SHORT

@@ -35,7 +35,7 @@ def functions(flags):
     CAREFUL = "CAREFUL" in flags
     HIT = "HIT" in flags
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
-    MINUS_HALF, MINUS_ONE = real(-0.5), real(-1.0)
+    MINUS_ONE = real(-1.0)
     EDGE = real(2.0**-33)
 
     # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
@@ -97,20 +97,20 @@ def functions(flags):
         high = c + rest.x * (d - c)
         return low + rest.y * (high - low)
 
-    # terms[4] = {hit, 1 / sigma, rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms in
-    # the log domain.
+    # terms[4] = {hit, 1 / (2 sigma^2), rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms
+    # in the log domain.
     @wp.func
     def log_field_linear(distance: real, terms: wp.array(dtype=real)):
         p = terms[2]
         if HIT:
-            u = distance * terms[1]
-            p += terms[0] * wp.exp(MINUS_HALF * u * u)
+            exponent = distance * (distance * terms[1])
+            p += terms[0] * wp.exp(-exponent)
         return wp.log(p)
 
     @wp.func
     def log_field_log(distance: real, terms: wp.array(dtype=real)):
-        u = distance * terms[1]
-        hit = terms[0] - HALF * u * u
+        exponent = distance * (distance * terms[1])
+        hit = terms[0] - exponent
         largest = wp.max(hit, terms[2])
         return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
 

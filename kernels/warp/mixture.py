@@ -1,7 +1,8 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-terms[8] = {hit, 1 / sigma, 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max}. In the linear domain hit
-is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain their logarithms.
+terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding took
+from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
+z_rand / range_max; in the log domain their logarithms.
 """
 
 import functools
@@ -10,18 +11,22 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import error_free
 from .prelude import precision
 
 
 @functools.cache
 def functions(flags):
     """hit_mass, short_factor and log_density specialised by the flags."""
-    real = precision(flags).real
+    types = precision(flags)
+    real, vec2 = types.real, types.vec2
+    two_product = error_free.functions(flags).two_product
+    SHARP = "SHARP" in flags
     HIT = "HIT" in flags
     SHORT = "SHORT" in flags
     RAND = "RAND" in flags
     SINGLE = "SINGLE" in flags
-    ZERO, HALF, MINUS_HALF, ONE = real(0.0), real(0.5), real(-0.5), real(1.0)
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     NEVER = real(-math.inf)
     # Above this the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
@@ -38,6 +43,18 @@ def functions(flags):
             return ONE
         return HALF * (wp.erf(below) + wp.erf(above))
 
+    # (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large
+    # and nearly cancel, and the second part keeps the digits that are left.
+    @wp.func
+    def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
+        off = z - expected
+        if SHARP:
+            square = two_product(off, off)
+            product = two_product(square.x, terms[1])
+            return vec2(product.x, product.y + (square.y * terms[1] + square.x * terms[9]))
+        else:
+            return vec2(off * (off * terms[1]), ZERO)
+
     # x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
     @wp.func
     def short_factor(x: real):
@@ -51,8 +68,8 @@ def functions(flags):
     def log_density_linear(z: real, expected: real, terms: wp.array(dtype=real)):
         p = real(0.0)
         if HIT:
-            u = (z - expected) * terms[1]
-            p += terms[0] * wp.exp(MINUS_HALF * u * u) / hit_mass(expected, terms[2], terms[6])
+            exponent = hit_exponent(z, expected, terms)
+            p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y) / hit_mass(expected, terms[2], terms[6])
         if SHORT:
             if z <= expected and expected > ZERO:
                 x = terms[4] * expected
@@ -66,8 +83,8 @@ def functions(flags):
         shorter = NEVER
         largest = NEVER
         if HIT:
-            u = (z - expected) * terms[1]
-            hit = terms[0] - HALF * u * u - wp.log(hit_mass(expected, terms[2], terms[6]))
+            exponent = hit_exponent(z, expected, terms)
+            hit = (terms[0] - exponent.x) + (terms[8] - exponent.y) - wp.log(hit_mass(expected, terms[2], terms[6]))
             largest = hit
         if SHORT:
             if z <= expected and expected > ZERO:

@@ -1,0 +1,222 @@
+"""The components of the beam mixture on their own, for any expected range; sources of every formula beside it.
+
+Kernels see expected ranges in [0, range_max], which is what casting returns. Who fits parameters or predicts ranges by
+other means may ask outside of that, and far in a tail the textbook's normaliser is 0. These functions stay finite
+there. They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
+
+The ``naive_`` functions are the textbook's formulas as printed. They are here to be compared with, not to be used.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf, erfcx
+
+Floats = NDArray[np.floating]
+
+_ROOT_HALF = math.sqrt(0.5)
+_ROOT_2PI = math.sqrt(2 * math.pi)
+_ROOT_HALF_PI = math.sqrt(math.pi / 2)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
+
+
+def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
+    """Log density of a normal around z*, truncated to [0, range_max] and renormalised (book equations 6.4 to 6.6).
+
+    For z* in [0, Z] the mass is ``(erf(z* / (sigma sqrt 2)) + erf((Z - z*) / (sigma sqrt 2))) / 2``, a sum of positive
+    terms: nothing cancels, however large sigma is. Then ``-u^2 / 2 - log(sigma sqrt(2 pi) mass)``, u = (z - z*) /
+    sigma; the product tends to Z for a huge sigma, so neither does the logarithm cancel.
+
+    For z* < 0 let a = -z* / sigma, u = z / sigma, w = Z / sigma. Numerator and normaliser share the factor
+    ``exp(-a^2 / 2)``, which is taken out before anything is evaluated: ``log p = -u (a + u / 2) - log(sigma I)`` with
+    I the integral of ``exp(-a v - v^2 / 2)`` over [0, w]. Where the exponent ``w (a + w / 2)`` exceeds 1 that is
+    ``sqrt(pi / 2) (erfcx(a / sqrt 2) - erfcx((a + w) / sqrt 2) exp(-w (a + w / 2)))``, a difference that loses at most
+    a bit; below, where it would cancel, ten Gauss-Legendre nodes are exact to rounding. z* > Z is the mirror image.
+
+    Source: Johnson, Kotz and Balakrishnan, *Continuous Univariate Distributions* 1 (1994), section 13.10.1, for the
+    distribution; Cody (1969) for erfc and its scaled form erfcx(x) = exp(x^2) erfc(x).
+
+    Args:
+        z: Readings [m].
+        expected: Expected ranges z*, any real numbers [m].
+        sigma: Standard deviations, > 0 [m].
+        range_max: Longest ranges Z, > 0 [m].
+
+    Returns:
+        Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, Z]. NaN where an argument is.
+    """
+    z, expected, sigma, range_max = _arrays(z, expected, sigma, range_max)
+    real = z.dtype.type
+    with np.errstate(all="ignore"):
+        scale = real(_ROOT_HALF) / sigma
+        mass = real(0.5) * (erf(expected * scale) + erf((range_max - expected) * scale))
+        u = (z - expected) / sigma
+        within = -real(0.5) * u * u - np.log(sigma * real(_ROOT_2PI) * mass)
+        beyond = expected > range_max
+        tail = _log_tail(
+            np.where(beyond, range_max - z, z) / sigma,
+            np.where(beyond, expected - range_max, -expected) / sigma,
+            range_max / sigma,
+            sigma,
+        )
+        log_p = np.where((expected < 0) | beyond, tail, within)
+    return _scalar(np.where((z < 0) | (z > range_max), real(-np.inf), log_p))
+
+
+def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
+    """Log density of an exponential on [0, z*], renormalised (book equations 6.7 to 6.9).
+
+    With x = rate z*, ``log p = log(x / (1 - exp(-x))) - log z* - rate z`` for x <= 1 and ``log(rate / (1 - exp(-x))) -
+    rate z`` above, ``1 - exp(-x)`` being ``-expm1(-x)``: no difference of nearly equal numbers, and no two logarithms
+    that nearly cancel. The first factor is 1 at x = 0, so rate 0 is the uniform density 1 / z*.
+
+    Args:
+        z: Readings [m].
+        expected: Expected ranges z* [m]; without a positive one there is no nearer obstacle.
+        rate: lambda_short, >= 0 [1/m].
+
+    Returns:
+        Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, z*] and where z* <= 0.
+    """
+    z, expected, rate = _arrays(z, expected, rate)
+    real = z.dtype.type
+    with np.errstate(all="ignore"):
+        x = rate * expected
+        rises = -np.expm1(-x)
+        factor = np.where(x > 0, x / rises, real(1))
+        log_p = np.where(x > 1, np.log(rate / rises), np.log(factor) - np.log(expected)) - rate * z
+    return _scalar(np.where((z < 0) | (z > expected) | (expected <= 0), real(-np.inf), log_p))
+
+
+def log_rand(z: ArrayLike, range_max: ArrayLike) -> Any:
+    """Log density of the uniform distribution on [0, range_max) (book equation 6.11); -inf elsewhere."""
+    z, range_max = _arrays(z, range_max)
+    flat = np.where(np.isnan(z), z, -np.log(range_max))
+    return _scalar(np.where((z < 0) | (z >= range_max), z.dtype.type(-np.inf), flat))
+
+
+def log_mixture(
+    z: ArrayLike,
+    expected: ArrayLike,
+    *,
+    z_hit: ArrayLike,
+    z_short: ArrayLike,
+    z_max: ArrayLike,
+    z_rand: ArrayLike,
+    sigma_hit: ArrayLike,
+    lambda_short: ArrayLike,
+    range_max: ArrayLike,
+) -> Any:
+    """log p(z | z*) of the whole mixture (book equation 6.12); ``**BeamParameters(...).to_dict()`` fits its arguments.
+
+    The components are added as logarithms, the largest taken out, so none is lost by underflow and a mixture that is 0
+    is -inf, not NaN. Continuous part and atom have mass 1 together, but for p_short's share where z* <= 0. An obstacle
+    expected beyond range_max leaves room for unexpected ones up to range_max: p_short sees ``min(z*, range_max)``.
+
+    Args:
+        z: Readings [m].
+        expected: Expected ranges z*, any real numbers [m].
+        z_hit: Weight of a correct range.
+        z_short: Weight of an unexpected obstacle.
+        z_max: Weight of no return.
+        z_rand: Weight of a random reading.
+        sigma_hit: Standard deviation of a correct range [m].
+        lambda_short: Rate of unexpected obstacles [1/m].
+        range_max: Longest range Z [m].
+
+    Returns:
+        Natural logarithms: of a density [1/m] for z in [0, Z), of the probability z_max for z >= Z, -inf for z < 0.
+    """
+    z, expected, hit, short, top, rand, sigma, rate, range_max = _arrays(
+        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max
+    )
+    with np.errstate(divide="ignore"):
+        parts = np.stack(
+            [
+                np.log(hit) + np.where(hit > 0, log_hit(z, expected, sigma, range_max), 0),
+                np.log(short) + np.where(short > 0, log_short(z, np.minimum(expected, range_max), rate), 0),
+                np.log(rand) + np.where(rand > 0, log_rand(z, range_max), 0),
+            ]
+        )
+        largest = parts.max(axis=0)
+        shift = np.where(np.isneginf(largest), z.dtype.type(0), largest)
+        continuous = shift + np.log(np.exp(parts - shift).sum(axis=0))
+        return _scalar(np.where(z >= range_max, np.log(top), np.where(np.isnan(z), z, continuous)))
+
+
+def naive_log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
+    """Equations 6.4 to 6.6 as printed, the normaliser a difference of two cumulative normals. Only to compare with."""
+    z, expected, sigma, range_max = _arrays(z, expected, sigma, range_max)
+    real = z.dtype.type
+    with np.errstate(all="ignore"):
+        normal = np.exp(-real(0.5) * (z - expected) ** 2 / sigma**2) / (real(_ROOT_2PI) * sigma)
+        scale = sigma * real(math.sqrt(2))
+        upper, lower = (real(0.5) * (real(1) + erf((x - expected) / scale)) for x in (range_max, real(0)))
+        return _scalar(np.log(normal / (upper - lower)))
+
+
+def naive_log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
+    """Equations 6.7 to 6.9 as printed, with ``1 - exp(-rate z*)``. Only to compare with."""
+    z, expected, rate = _arrays(z, expected, rate)
+    real = z.dtype.type
+    with np.errstate(all="ignore"):
+        normaliser = real(1) / (real(1) - np.exp(-rate * expected))
+        density = np.where((z >= 0) & (z <= expected), normaliser * rate * np.exp(-rate * z), real(0))
+        return _scalar(np.log(density))
+
+
+def naive_log_mixture(
+    z: ArrayLike,
+    expected: ArrayLike,
+    *,
+    z_hit: ArrayLike,
+    z_short: ArrayLike,
+    z_max: ArrayLike,
+    z_rand: ArrayLike,
+    sigma_hit: ArrayLike,
+    lambda_short: ArrayLike,
+    range_max: ArrayLike,
+) -> Any:
+    """Equation 6.12 as printed, components of weight 0 left out, z_max at z >= Z. Only to compare with."""
+    z, expected, hit, short, top, rand, sigma, rate, range_max = _arrays(
+        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max
+    )
+    with np.errstate(all="ignore"):
+        p = np.where(hit > 0, hit * np.exp(naive_log_hit(z, expected, sigma, range_max)), 0)
+        p = p + np.where(short > 0, short * np.exp(naive_log_short(z, expected, rate)), 0)
+        return _scalar(np.log(np.where(z >= range_max, top, p + rand / range_max)))
+
+
+def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
+    """``-u (a + u / 2) - log(sigma I)`` for a >= 0; see log_hit."""
+    real = u.dtype.type
+    fall = w * (a + real(0.5) * w)
+    scaled = real(_ROOT_HALF_PI) * (
+        erfcx(a * real(_ROOT_HALF)) - erfcx((a + w) * real(_ROOT_HALF)) * np.exp(-np.minimum(fall, real(1e4)))
+    )
+    nodes = [real(0.5 * (1 + node)) * w for node in _NODES]
+    ruled = np.zeros_like(w)
+    for weight, v in zip(_WEIGHTS, nodes, strict=True):
+        ruled += real(0.5 * weight) * w * np.exp(-v * (a + real(0.5) * v))
+    log_p: Floats = -u * (a + real(0.5) * u) - np.log(sigma * np.where(fall > 1, scaled, ruled))
+    return log_p
+
+
+def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
+    """The arguments broadcast to one shape in one dtype: float32 where arrays are and nothing is wider, else float64.
+
+    Python numbers take the dtype of the others.
+    """
+    arrays = [value if isinstance(value, int | float) else np.asarray(value) for value in values]
+    kind = np.result_type(*arrays)
+    real = np.dtype(np.float32 if kind == np.float32 else np.float64)
+    return tuple(np.broadcast_arrays(*(np.asarray(value, real) for value in arrays)))
+
+
+def _scalar(array: Floats) -> Any:
+    """A NumPy scalar where the shape is ()."""
+    return array[()]

@@ -27,8 +27,8 @@ precision. The tolerances and their reasons are in gpusense.tolerances, and in t
 Exit codes: 0 every difference is allowed, 1 one is not, 2 bad input or an absent device.
 
 With --stiff the catalogue of stiff and extreme cases runs instead, on each backend and in each precision: sigma from
-1e-8 to 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, odd maps, resolutions, poses and scans. Errors are
-in eps (1 + |log p|) unless the unit says otherwise; the textbook's formulas are shown beside as what they are.
+1e-8 to 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, odd maps, resolutions, poses and scans. Errors
+are in eps (1 + |log p|) unless the unit says otherwise; the textbook's formulas are shown beside as what they are.
 
 example:
   gpusense selftest

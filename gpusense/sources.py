@@ -76,6 +76,24 @@ def assemble(file: str, flags: frozenset[str]) -> str:
     return "".join(parts)
 
 
+def with_places(log: str, source: str) -> str:
+    """A compiler's log with places in the assembled source, ``<kernel>:114:``, as ``raycast.cl:48:``.
+
+    Most drivers heed the ``#line`` directives of a source; NVIDIA's counts the lines of the whole.
+    """
+
+    def place(match: re.Match[str]) -> str:
+        number = int(match.group(1))
+        above = source.splitlines()[:number]
+        marks = [i for i, line in enumerate(above, 1) if line.startswith("#line 1 ")]
+        if not marks:
+            return match.group(0)
+        file = above[marks[-1] - 1].split('"')[1]
+        return f"{file}:{number - marks[-1]}:"
+
+    return re.sub(r"<\w+>:(\d+):", place, log)
+
+
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """The flags that change a kernel file's code, so that one program serves all specs that agree on them."""
     text = "".join(opencl_source(needed) for needed in required_files(file))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -83,9 +82,16 @@ def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypat
         device._build("raycast", frozenset({"ORIGINS_OUTSIDE"}))
     message = str(caught.value)
     assert message.startswith("raycast.cl did not compile on ")
-    # Some drivers keep the file's name in their log, all of them the line's number.
-    assert re.search(rf"\b{line}\b", message)
+    assert f"raycast.cl:{line}:" in message
     assert "nonsense" in message
+
+
+def test_places_in_the_whole_source_become_places_in_files():
+    source = sources.assemble("raycast", frozenset())
+    number = 1 + source.split("int k_x = 0")[0].count("\n")
+    line = 1 + sources.opencl_source("raycast").split("int k_x = 0")[0].count("\n")
+    assert sources.with_places(f"<kernel>:{number}:15: error", source) == f"raycast.cl:{line}:15: error"
+    assert sources.with_places("<kernel>:1:1: error", source) == "<kernel>:1:1: error"
 
 
 def test_a_device_that_is_gone_says_so(needs, monkeypatch):

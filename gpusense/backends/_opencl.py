@@ -12,7 +12,7 @@ import pyopencl as cl
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel
-from gpusense.sources import assemble, relevant
+from gpusense.sources import assemble, relevant, with_places
 
 # Devices that check or emulate: correct, but no one wants to wait for them unasked.
 SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
@@ -133,7 +133,8 @@ class OpenCLBackend(ProcessBound):
         try:
             program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
-            raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {error}") from error
+            log = with_places(str(error), source)
+            raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
         binaries: Any = program.get_info(cl.program_info.BINARIES)
         self._cache.store(source, self.options, binaries[0])
         return program

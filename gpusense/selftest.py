@@ -98,8 +98,7 @@ class Recorder:
         for argument, value in given.items():
             if argument.shape is None or not needed.get(argument.name, True):
                 continue
-            # Shapes are products of the scalars' names; they come from the signature table.
-            count = int(eval(argument.shape, {"__builtins__": {}}, values))
+            count = argument.elements(values)
             array = self._backend.download(value, np.empty(count * argument.width, argument.dtype(real)))
             values[argument.name] = array.reshape(-1, argument.width) if argument.width > 1 else array
         expected = self._cast(flags, given, values, real) if kernel == "score_beams" else None

@@ -6,7 +6,10 @@ three to this table. ``real`` stands for the precision of a model, float32 or fl
 
 from __future__ import annotations
 
+import ast
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +35,19 @@ _SCALARS: dict[str, np.dtype] = {"int": np.dtype(np.int32), "uchar": np.dtype(np
 _WIDTHS = {"": 1, "2": 2, "4": 4}
 
 
+def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> int:
+    match node:
+        case ast.Constant(value=int(number)):
+            return number
+        case ast.Name(id=name):
+            return int(values[name])
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _evaluate(left, values) + _evaluate(right, values)
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            return _evaluate(left, values) * _evaluate(right, values)
+    raise ValueError(f"shape: must be a sum or product of integers and names, got {ast.unparse(node)!r}")
+
+
 @dataclass(frozen=True)
 class Argument:
     """One argument of a kernel: an array (with its shape in words) or a scalar (shape None)."""
@@ -45,6 +61,11 @@ class Argument:
     def width(self) -> int:
         """Numbers per element: 4 for real4."""
         return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
+
+    def elements(self, values: Mapping[str, Any]) -> int:
+        """Number of elements of an array by its shape: sums and products of integers and of the scalars' names."""
+        assert self.shape is not None
+        return _evaluate(ast.parse(self.shape, mode="eval").body, values)
 
     def dtype(self, real: np.dtype) -> np.dtype:
         """NumPy dtype of one number of the argument."""

@@ -136,7 +136,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [4]", *_RESULT, *_MAP, "int particles",
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_RESULT, *_MAP, "int particles",
         "int readings", "real guard", "real fixed", "real temperature",
     ),
 }  # fmt: skip

@@ -150,10 +150,9 @@ def _row(case: str, quantity: str, worst: float, bound: float, found: ArrayLike,
 def _grid_rows(backend: Backend, precision: str) -> Iterator[Row]:
     grid = density_grid(backend, precision)
     truth, naive, case = grid.truth(), grid.naive(), f"{len(grid.z)} densities"
-    few, bound = TOLERANCES["float32 beam"].value, TOLERANCES["float64 beam"].value / float(np.finfo(np.float64).eps)
-    bound = few if precision == "float32" else bound
+    few = TOLERANCES["float32 beam"].value
     worst = float(error_in_eps(grid.found, truth, precision).max())
-    yield _row(case, "beam model, eps (1 + |log p_k|)", worst, bound, grid.found, truth)
+    yield _row(case, "beam model, eps (1 + |log p_k|)", worst, few, grid.found, truth)
     share = float(np.mean(error_in_eps(naive, truth, precision) > few))
     quantity = f"textbook formulas, share above {few:g} eps"
     yield replace(_row(case, quantity, share, NAIVE_LOSES, naive, truth), ok=share >= NAIVE_LOSES)
@@ -171,7 +170,7 @@ class Case:
         readings: What a scan repeats [cells]; None is what the first pose expects, with missing and max readings.
         options: Arguments of the models, such as ``outside``.
         weights: z_hit, z_short, z_max and z_rand.
-        sigma: Standard deviation [cells]; for the interpolated field at least 1 / 4 (docs/numerics.md says why).
+        sigma: Standard deviation [cells].
         constant: log p where every particle has the same; else None.
     """
 
@@ -249,8 +248,7 @@ def _models(case: Case) -> Iterator[tuple[str, Callable[..., BeamModel | Likelih
     weights = (0.0, 1.0, 0.0) if case.constant == -math.inf else (hit, top, 1 - hit - top)
     nearest = LikelihoodFieldParameters(*weights, case.sigma * cell, 4 * cell)
     yield "field, nearest", LikelihoodFieldModel, nearest
-    bilinear = nearest.replace(sigma_hit=max(case.sigma, 0.25) * cell, interpolation="bilinear")
-    yield "field, bilinear", LikelihoodFieldModel, bilinear
+    yield "field, bilinear", LikelihoodFieldModel, nearest.replace(interpolation="bilinear")
 
 
 def _case_rows(case: Case, device: Backend, precision: str) -> Iterator[Row]:

@@ -316,6 +316,14 @@ MIXTURES = {
 }
 
 
+def with_low_parts(terms, real):
+    """Rounded terms, then what rounding took from the first two."""
+    rounded = np.array(terms).astype(real)
+    with np.errstate(invalid="ignore"):
+        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
+    return np.append(rounded, low.astype(real))
+
+
 def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarray]:
     """Flags and terms of the mixture kernels."""
     z_hit, z_short, z_rand, sigma, decay = MIXTURES[name]
@@ -332,10 +340,7 @@ def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarra
         with np.errstate(divide="ignore"):
             head = np.log(head)
     terms = [head[0], 0.5 / sigma**2, np.sqrt(0.5) / sigma, head[1], decay, head[2], range_max, np.log(z_max)]
-    rounded = np.array(terms).astype(real)
-    with np.errstate(invalid="ignore"):
-        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
-    return flags, np.append(rounded, low.astype(real))
+    return flags, with_low_parts(terms, real)
 
 
 def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
@@ -479,7 +484,7 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
         "pose_low": pose_low,
         "point": point,
         "point_low": point_low,
-        "terms": terms.astype(real),
+        "terms": with_low_parts(terms, real),
         "log_p": np.empty(count, real),
         "parts": np.full((count, len(end)), np.nan, real),
     }

@@ -11,14 +11,21 @@ from gpusense import _checks
 from gpusense.backends import Backend
 from gpusense.grid import OccupancyGrid
 from gpusense.models.caster import CASTERS, ExactCaster
-from gpusense.models.scan_model import ScanModel, check_poses, log_weight, place_in, rounded_terms, sums_linearly
+from gpusense.models.scan_model import (
+    HIGH_PEAK,
+    ScanModel,
+    check_poses,
+    log_weight,
+    place_in,
+    rounded_terms,
+    sums_linearly,
+)
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
 _BYTES_PER_CELL = 4
-_HIGH_PEAK = 64.0
 
 
 class BeamModel(ScanModel):
@@ -125,7 +132,7 @@ class BeamModel(ScanModel):
         if "SHARP" not in self._components:
             omissions.append(
                 Omission(
-                    "exponents in two parts", f"the hit density's peak is at most {_HIGH_PEAK:g} / m", "37 operations"
+                    "exponents in two parts", f"the hit density's peak is at most {HIGH_PEAK:g} / m", "37 operations"
                 )
             )
         if (far := self._caster.map.omission(_BYTES_PER_CELL)) is not None:
@@ -141,8 +148,7 @@ class BeamModel(ScanModel):
         rand, scale = p.z_rand / range_max, p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
         if self._specialize and len(flags) == 1:
             flags.add("SINGLE")
-        # Above this peak an exponent's rounding errors could show beside a log density near 0.
-        if (p.z_hit > 0 and scale > _HIGH_PEAK) or not self._specialize:
+        if (p.z_hit > 0 and scale > HIGH_PEAK) or not self._specialize:
             flags.add("SHARP")
         if sums_linearly(rand, max(scale, p.z_short * p.lambda_short), self._real):
             flags.add("LINEAR")
@@ -152,10 +158,7 @@ class BeamModel(ScanModel):
             head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
         shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
         terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-        rounded = rounded_terms(terms, self._real)
-        with np.errstate(invalid="ignore"):
-            low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
-        return frozenset(flags), np.append(rounded, low.astype(self._real))
+        return frozenset(flags), rounded_terms(terms, self._real)
 
     def _impossible(self) -> bool:
         p = self.parameters

@@ -13,7 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import ScanModel, log_weight, place_in, rounded_terms, sums_linearly
+from gpusense.models.scan_model import HIGH_PEAK, ScanModel, log_weight, place_in, rounded_terms, sums_linearly
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
 from gpusense.prepare import check_size, squared_distances
@@ -96,6 +96,10 @@ class LikelihoodFieldModel(ScanModel):
             omissions.append(
                 Omission("density per beam", "cells hold log densities (nearest)", "1 exp and 1 log per particle-beam")
             )
+        if "SHARP" not in self._flags:
+            low = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
+            why = low if self._bilinear else "no density is evaluated"
+            omissions.append(Omission("exponents in two parts", why, "some 200 operations per particle-beam"))
         if not self._bilinear:
             omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))
         if (far := self._map.omission(self._real.itemsize)) is not None:
@@ -113,6 +117,8 @@ class LikelihoodFieldModel(ScanModel):
         flags |= {"HIT"} if p.z_hit > 0 or not self._specialize else set()
         rand = p.z_rand / range_max
         scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        if not self._log_table and ((p.z_hit > 0 and scale > HIGH_PEAK) or not self._specialize):
+            flags.add("SHARP")
         if sums_linearly(rand, scale, self._real):
             flags.add("LINEAR")
             head = (scale, rand)

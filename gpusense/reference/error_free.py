@@ -9,6 +9,8 @@ import numpy as np
 
 BLOCK_TERMS = 16
 
+Pair = tuple[np.ndarray, np.ndarray]
+
 
 def two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """``a + b = sum + error`` exactly."""
@@ -30,6 +32,18 @@ def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a_high, b_high = high_half(a), high_half(b)
     a_low, b_low = a - a_high, b - b_high
     return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+
+
+def pair_sum(a: Pair, b: Pair) -> Pair:
+    """Sum of two numbers of two parts each, to about twice the working precision."""
+    total, error = two_sum(a[0], b[0])
+    return two_sum(total, error + (a[1] + b[1]))
+
+
+def pair_product(a: Pair, b: Pair) -> Pair:
+    """Product of two numbers of two parts each, to about twice the working precision."""
+    product, error = two_product(a[0], b[0])
+    return two_sum(product, error + (a[0] * b[1] + a[1] * b[0]))
 
 
 def add_term(total: tuple[np.ndarray, np.ndarray], term: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

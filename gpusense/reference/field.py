@@ -5,16 +5,16 @@ The table is padded by a ring of two cells that hold what lies outside the grid,
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gpusense.reference.beam import sum_terms
-from gpusense.reference.error_free import two_product, two_sum
+from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
 
 FIELD_RING = 2
 BLOCK = 1 << 18
 EDGE = 2.0**-33
-
-Pair = tuple[np.ndarray, np.ndarray]
 
 
 def fill_field(
@@ -42,26 +42,44 @@ def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) ->
     return total[0], ((ab[1] + sign * cd[1]) + (products[1] + frac[1])) + (low + total[1])
 
 
-def whole_cells(offset: Pair) -> tuple[np.ndarray, np.ndarray]:
-    """Whole cells below an offset of two parts, and what is left of it in [0, 1).
+def whole_cells(flags: frozenset[str], offset: Pair) -> tuple[np.ndarray, Pair, Pair]:
+    """Whole cells below an offset of two parts, what is left of it in [0, 1), and what is missing to 1.
 
-    The sum is taken relative to the nearest edge, where small numbers keep their digits; an offset that is EDGE or less
+    Both are found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or less
     short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
     """
     real = offset[0].dtype.type
     nearest = np.floor(np.where(np.isfinite(offset[0]), offset[0], 0) + real(0.5))
-    past = (offset[0] - nearest) + offset[1]
-    below = past + real(EDGE) < 0
-    return nearest.astype(np.int64) - below, past + below
+    zero = np.zeros_like(nearest)
+    past = (offset[0] - nearest) + offset[1], zero
+    if "SHARP" in flags:
+        past = two_sum(offset[0] - nearest, offset[1])
+    sign = np.where(past[0] < 0, real(1), real(-1))
+    other = 1 + sign * past[0], zero
+    if "SHARP" in flags:
+        other = pair_sum((np.ones_like(nearest), zero), (sign * past[0], sign * past[1]))
+    below = past[0] + real(EDGE) < 0
+    rest = np.where(below, other[0], past[0]), np.where(below, other[1], past[1])
+    to_next = np.where(below, -past[0], other[0]), np.where(below, -past[1], other[1])
+    return nearest.astype(np.int64) - below, rest, to_next
+
+
+@dataclass(frozen=True)
+class EndPoint:
+    """Where end points lie: cells as offsets from the pose's cell, and the places between those cells' edges."""
+
+    col: np.ndarray
+    row: np.ndarray
+    rest_x: Pair
+    rest_y: Pair
+    to_next_x: Pair
+    to_next_y: Pair
 
 
 def end_point(
     flags: frozenset[str], pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray
-) -> tuple[Pair, Pair]:
-    """Cell offsets (x, y) of end points from the pose's cell, and the position within those cells.
-
-    Poses are (M, 1, 4), points (1, K, 2): the reading times the beam's (cos, sin), in cells.
-    """
+) -> EndPoint:
+    """Poses are (M, 1, 4), points (1, K, 2): the reading times the beam's (cos, sin), in cells."""
     real = pose.dtype.type
     shift = real(0.5) if "BILINEAR" in flags else real(0)
     cos, sin = pose[..., 2], pose[..., 3]
@@ -69,34 +87,53 @@ def end_point(
     if "CAREFUL" in flags:
         c, s = (cos, pose_low[..., 2]), (sin, pose_low[..., 3])
         u, v = (p, point_low[..., 0]), (q, point_low[..., 1])
-        x = careful_offset((pose[..., 0] - shift, pose_low[..., 0]), c, u, s, v, -1)
-        y = careful_offset((pose[..., 1] - shift, pose_low[..., 1]), s, u, c, v, 1)
+        (frac_x, lost_x), (frac_y, lost_y) = two_sum(pose[..., 0], -shift), two_sum(pose[..., 1], -shift)
+        x = careful_offset((frac_x, lost_x + pose_low[..., 0]), c, u, s, v, -1)
+        y = careful_offset((frac_y, lost_y + pose_low[..., 1]), s, u, c, v, 1)
     else:
         x_plain = (pose[..., 0] - shift) + (cos * p - sin * q)
         y_plain = (pose[..., 1] - shift) + (sin * p + cos * q)
         x, y = (x_plain, np.zeros_like(x_plain)), (y_plain, np.zeros_like(y_plain))
-    (col, left_x), (row, left_y) = whole_cells(x), whole_cells(y)
-    return (col, row), (left_x, left_y)
+    (col, rest_x, to_next_x), (row, rest_y, to_next_y) = whole_cells(flags, x), whole_cells(flags, y)
+    return EndPoint(col, row, rest_x, rest_y, to_next_x, to_next_y)
 
 
-def bilinear(table: np.ndarray, col: np.ndarray, row: np.ndarray, rest: Pair, rows: int, cols: int) -> np.ndarray:
-    """Smooth distance between the four cell centres around an end point."""
-    a = table[field_cell(col, row, rows, cols)]
-    b = table[field_cell(col + 1, row, rows, cols)]
-    c = table[field_cell(col, row + 1, rows, cols)]
-    d = table[field_cell(col + 1, row + 1, rows, cols)]
-    low, high = a + rest[0] * (b - a), c + rest[0] * (d - c)
-    return low + rest[1] * (high - low)
+def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
+    """a and b weighed by numbers of two parts; the terms are not negative, so small values keep their digits."""
+    if "SHARP" in flags:
+        return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
+    return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
 
 
-def log_field(flags: frozenset[str], distance: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """terms = (hit, 1 / (2 sigma^2), rand, log z_max): z_hit / (sigma sqrt(2 pi)), z_rand / range_max, or logs."""
-    exponent = distance * (distance * terms[1])
+def bilinear(
+    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, rows: int, cols: int
+) -> Pair:
+    """Smooth distance between the four cell centres around an end point, in two parts."""
+    zero = np.zeros_like(end.rest_x[0])
+    a = table[field_cell(col, row, rows, cols)], zero
+    b = table[field_cell(col + 1, row, rows, cols)], zero
+    c = table[field_cell(col, row + 1, rows, cols)], zero
+    d = table[field_cell(col + 1, row + 1, rows, cols)], zero
+    low = between(flags, end.to_next_x, a, end.rest_x, b)
+    high = between(flags, end.to_next_x, c, end.rest_x, d)
+    return between(flags, end.to_next_y, low, end.rest_y, high)
+
+
+def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:
+    """terms = (hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1).
+
+    hit and rand are z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, or logs. Where the peak is high, exponent and
+    log peak nearly cancel.
+    """
+    if "SHARP" in flags:
+        exponent, low = pair_product(pair_product(distance, distance), (terms[1], terms[5]))
+    else:
+        exponent, low = distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
     if "LINEAR" not in flags:
-        return np.logaddexp(terms[0] - exponent, terms[2])
-    p = np.full(distance.shape, terms[2])
+        return np.logaddexp((terms[0] - exponent) + (terms[4] - low), terms[2])
+    p = np.full(exponent.shape, terms[2])
     if "HIT" in flags:
-        p += terms[0] * np.exp(-exponent)
+        p += terms[0] * np.exp(-exponent) * (1 - low)
     return np.log(p)
 
 
@@ -125,13 +162,13 @@ def score_field(
     for begin in range(0, particles, block):
         some = slice(begin, min(begin + block, particles))
         low = pose_low[some, None] if "CAREFUL" in flags else pose_low[None, :1]
-        (col, row), rest = end_point(flags, pose[some, None], low, points, point_low[None, :readings])
-        col, row = col + pose_cell[some, None, 0], row + pose_cell[some, None, 1]
+        end = end_point(flags, pose[some, None], low, points, point_low[None, :readings])
+        col, row = end.col + pose_cell[some, None, 0], end.row + pose_cell[some, None, 1]
         if "BILINEAR" in flags:
-            term = log_field(flags, bilinear(table, col, row, rest, rows, cols), terms)
+            term = log_field(flags, bilinear(flags, table, col, row, end, rows, cols), terms)
         else:
             term = table[field_cell(col, row, rows, cols)]
-            term = term if "LOG_TABLE" in flags else log_field(flags, term, terms)
+            term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
         if "ALL_READINGS" in flags:
             x = points[..., 0]
             term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)

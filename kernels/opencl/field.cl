@@ -41,69 +41,96 @@ int floor_int(const real a) {
     return whole - ((real)whole > a);
 }
 
-// Whole cells below an offset of two parts, and what is left of it in [0, 1). The sum is taken relative to the nearest
-// edge, where small numbers keep their digits; an offset that is EDGE or less short of an edge lies on it, so that end
-// points on edges fall into the same cell in every precision.
+// Whole cells below an offset of two parts. What is left of it in [0, 1) is rest, and what is missing to 1 is to_next:
+// both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or less short
+// of an edge lies on it, so that end points on edges fall into the same cell in every precision.
 #define EDGE ((real)1.1641532182693481e-10)
 
-int whole_cells(const real2 offset, real *rest) {
+int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
     const int nearest = floor_int(offset.x + (real)0.5);
-    const real past = (offset.x - (real)nearest) + offset.y;
-    const int below = past + EDGE < 0;
-    *rest = past + (real)below;
+#if SHARP
+    const real2 past = two_sum(offset.x - (real)nearest, offset.y);
+    const real2 other = pair_sum((real2)(1, 0), past.x < 0 ? past : -past);
+#else
+    const real2 past = (real2)((offset.x - (real)nearest) + offset.y, 0);
+    const real2 other = (real2)(past.x < 0 ? 1 + past.x : 1 - past.x, 0);
+#endif
+    const int below = past.x + EDGE < 0;
+    *rest = below ? other : past;
+    *to_next = below ? -past : other;
     return nearest - below;
 }
 
-// Cell offsets of an end point from the pose's cell, and the position within that cell.
+// Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
+typedef struct {
+    int2 cell;
+    real2 rest_x, rest_y, to_next_x, to_next_y;
+} EndPoint;
+
 // point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
 // nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
-int2 end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
-               const real guard, real2 *rest) {
+EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
+                   const real guard) {
+    EndPoint end;
     real2 x = (real2)((pose.x - shift) + (pose.z * point.x - pose.w * point.y), 0);
     real2 y = (real2)((pose.y - shift) + (pose.w * point.x + pose.z * point.y), 0);
 #if CAREFUL
 #if !BILINEAR
     const int2 near = (int2)(floor_int(x.x), floor_int(y.x));
     const real2 left = (real2)(x.x - (real)near.x, y.x - (real)near.y);
-    *rest = left;
-    if (left.x >= guard && left.y >= guard && left.x <= 1 - guard && left.y <= 1 - guard) return near;
+    if (left.x >= guard && left.y >= guard && left.x <= 1 - guard && left.y <= 1 - guard) {
+        end.cell = near;
+        return end;
+    }
 #endif
     const real2 c = (real2)(pose.z, pose_low.z), s = (real2)(pose.w, pose_low.w);
     const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
-    x = careful_offset((real2)(pose.x - shift, pose_low.x), c, p, s, q, (real)-1);
-    y = careful_offset((real2)(pose.y - shift, pose_low.y), s, p, c, q, (real)1);
+    x = careful_offset(two_sum(pose.x, -shift) + (real2)(0, pose_low.x), c, p, s, q, (real)-1);
+    y = careful_offset(two_sum(pose.y, -shift) + (real2)(0, pose_low.y), s, p, c, q, (real)1);
 #endif
-    real left_x, left_y;
-    const int2 whole = (int2)(whole_cells(x, &left_x), whole_cells(y, &left_y));
-    *rest = (real2)(left_x, left_y);
-    return whole;
+    end.cell.x = whole_cells(x, &end.rest_x, &end.to_next_x);
+    end.cell.y = whole_cells(y, &end.rest_y, &end.to_next_y);
+    return end;
 }
 
 #if BILINEAR
-// Smooth distance between the four cell centres around an end point.
-real bilinear(global const real *table, const int2 cell, const real2 rest, const int rows, const int cols) {
-    const real a = table[field_cell(cell.x, cell.y, rows, cols)];
-    const real b = table[field_cell(cell.x + 1, cell.y, rows, cols)];
-    const real c = table[field_cell(cell.x, cell.y + 1, rows, cols)];
-    const real d = table[field_cell(cell.x + 1, cell.y + 1, rows, cols)];
-    const real low = a + rest.x * (b - a), high = c + rest.x * (d - c);
-    return low + rest.y * (high - low);
+// a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their digits.
+real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const real2 b) {
+#if SHARP
+    return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b));
+#else
+    return (real2)(weight_a.x * a.x + weight_b.x * b.x, 0);
+#endif
+}
+
+// Smooth distance between the four cell centres around an end point, in two parts.
+real2 bilinear(global const real *table, const int2 cell, const EndPoint end, const int rows, const int cols) {
+    const real2 a = (real2)(table[field_cell(cell.x, cell.y, rows, cols)], 0);
+    const real2 b = (real2)(table[field_cell(cell.x + 1, cell.y, rows, cols)], 0);
+    const real2 c = (real2)(table[field_cell(cell.x, cell.y + 1, rows, cols)], 0);
+    const real2 d = (real2)(table[field_cell(cell.x + 1, cell.y + 1, rows, cols)], 0);
+    const real2 low = between(end.to_next_x, a, end.rest_x, b), high = between(end.to_next_x, c, end.rest_x, d);
+    return between(end.to_next_y, low, end.rest_y, high);
 }
 #endif
 
 #if !LOG_TABLE
-// terms[4] = {hit, 1 / (2 sigma^2), rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms in the
-// log domain.
-real log_field(const real distance, global const real *terms) {
-    const real exponent = distance * (distance * terms[1]);
+// terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1}: z_hit / (sigma sqrt(2 pi))
+// and z_rand / range_max, logarithms in the log domain. Where the peak is high, exponent and log peak nearly cancel.
+real log_field(const real2 distance, global const real *terms) {
+#if SHARP
+    const real2 exponent = pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
+#else
+    const real2 exponent = (real2)(distance.x * (distance.x * terms[1]), 0);
+#endif
 #if LINEAR
     real p = terms[2];
 #if HIT
-    p += terms[0] * exp(-exponent);
+    p += terms[0] * exp(-exponent.x) * (1 - exponent.y);
 #endif
     return log(p);
 #else
-    const real hit = terms[0] - exponent;
+    const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
     const real largest = fmax(hit, terms[2]);
     return largest + log(exp(hit - largest) + exp(terms[2] - largest));
 #endif
@@ -141,14 +168,13 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
         else
 #endif
         {
-            real2 rest;
-            const int2 offset = end_point(pose[n], low, point[k], point_low[k], shift, guard, &rest);
+            const EndPoint end = end_point(pose[n], low, point[k], point_low[k], shift, guard);
 #if BILINEAR
-            term = log_field(bilinear(table, origin + offset, rest, rows, cols), terms);
+            term = log_field(bilinear(table, origin + end.cell, end, rows, cols), terms);
 #else
-            term = table[field_cell(origin.x + offset.x, origin.y + offset.y, rows, cols)];
+            term = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, rows, cols)];
 #if !LOG_TABLE
-            term = log_field(term, terms);
+            term = log_field((real2)(term, 0), terms);
 #endif
 #endif
         }

@@ -17,7 +17,7 @@ BLOCK_TERMS = wp.constant(16)
 
 @functools.cache
 def functions(flags):
-    """two_sum, high_half, two_product and add_term in the precision of the flags."""
+    """two_sum, high_half, two_product, pair_sum, pair_product and add_term in the precision of the flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     SPLITTER = real(134217729.0 if "FLOAT64" in flags else 4097.0)
@@ -46,10 +46,28 @@ def functions(flags):
         error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
         return vec2(product, error)
 
+    # Sums and products of two numbers of two parts each, to about twice the working precision.
+    @wp.func
+    def pair_sum(a: vec2, b: vec2):
+        total = two_sum(a.x, b.x)
+        return two_sum(total.x, total.y + (a.y + b.y))
+
+    @wp.func
+    def pair_product(a: vec2, b: vec2):
+        product = two_product(a.x, b.x)
+        return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x))
+
     # One more term in a compensated sum: total.x is the running sum, total.y what its roundings lost.
     @wp.func
     def add_term(total: vec2, term: real):
         head = two_sum(total.x, term)
         return vec2(head.x, total.y + head.y)
 
-    return SimpleNamespace(two_sum=two_sum, high_half=high_half, two_product=two_product, add_term=add_term)
+    return SimpleNamespace(
+        two_sum=two_sum,
+        high_half=high_half,
+        two_product=two_product,
+        pair_sum=pair_sum,
+        pair_product=pair_product,
+        add_term=add_term,
+    )

@@ -31,12 +31,22 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
     two_sum, two_product = exact.two_sum, exact.two_product
+    pair_sum, pair_product = exact.pair_sum, exact.pair_product
     BILINEAR = "BILINEAR" in flags
     CAREFUL = "CAREFUL" in flags
     HIT = "HIT" in flags
+    SHARP = "SHARP" in flags
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_ONE = real(-1.0)
     EDGE = real(2.0**-33)
+
+    @wp.struct
+    class EndPoint:
+        cell: wp.vec2i
+        rest_x: vec2
+        rest_y: vec2
+        to_next_x: vec2
+        to_next_y: vec2
 
     # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
     # the working precision.
@@ -49,23 +59,35 @@ def functions(flags):
         low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
         return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
 
-    # Whole cells below an offset of two parts, and what is left of it in [0, 1). The sum is taken relative to the
-    # nearest edge, where small numbers keep their digits; an offset that is EDGE or less short of an edge lies on it,
-    # so that end points on edges fall into the same cell in every precision.
+    # Whole cells below an offset of two parts. What is left of it in [0, 1) comes second, and what is missing to 1
+    # third: both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or
+    # less short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
     @wp.func
     def whole_cells(offset: vec2):
         nearest = wp.floor(offset.x + HALF)
-        past = (offset.x - nearest) + offset.y
-        if past + EDGE < ZERO:
+        past = vec2((offset.x - nearest) + offset.y, ZERO)
+        if SHARP:
+            past = two_sum(offset.x - nearest, offset.y)
+        size = past
+        if past.x < ZERO:
+            size = -past
+        other = vec2(ONE - size.x, ZERO)
+        if SHARP:
+            other = pair_sum(vec2(ONE, ZERO), -size)
+        rest = past
+        to_next = other
+        if past.x + EDGE < ZERO:
             nearest -= ONE
-            past += ONE
-        return int(nearest), past
+            rest = other
+            to_next = -past
+        return int(nearest), rest, to_next
 
-    # Cell offsets of an end point from the pose's cell, and the position within that cell.
+    # Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
     # point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
     # nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
     @wp.func
     def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
+        end = EndPoint()
         x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
         y = vec2((pose.y - shift) + (pose.w * point.x + pose.z * point.y), ZERO)
         if CAREFUL:
@@ -75,42 +97,65 @@ def functions(flags):
                 near = vec2(wp.floor(x.x), wp.floor(y.x))
                 left = vec2(x.x - near.x, y.x - near.y)
                 if left.x >= guard and left.y >= guard and left.x <= ONE - guard and left.y <= ONE - guard:
-                    return wp.vec2i(int(near.x), int(near.y)), left
+                    end.cell = wp.vec2i(int(near.x), int(near.y))
+                    return end
             c = vec2(pose.z, pose_low.z)
             s = vec2(pose.w, pose_low.w)
             p = vec2(point.x, point_low.x)
             q = vec2(point.y, point_low.y)
-            x = careful_offset(vec2(pose.x - shift, pose_low.x), c, p, s, q, MINUS_ONE)
-            y = careful_offset(vec2(pose.y - shift, pose_low.y), s, p, c, q, ONE)
-        col, rest_x = whole_cells(x)
-        row, rest_y = whole_cells(y)
-        return wp.vec2i(col, row), vec2(rest_x, rest_y)
+            x = careful_offset(two_sum(pose.x, -shift) + vec2(ZERO, pose_low.x), c, p, s, q, MINUS_ONE)
+            y = careful_offset(two_sum(pose.y, -shift) + vec2(ZERO, pose_low.y), s, p, c, q, ONE)
+        col, rest_x, to_next_x = whole_cells(x)
+        row, rest_y, to_next_y = whole_cells(y)
+        end.cell = wp.vec2i(col, row)
+        end.rest_x = rest_x
+        end.rest_y = rest_y
+        end.to_next_x = to_next_x
+        end.to_next_y = to_next_y
+        return end
 
-    # Smooth distance between the four cell centres around an end point.
+    # a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their
+    # digits.
     @wp.func
-    def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, rest: vec2, rows: wp.int32, cols: wp.int32):
-        a = table[field_cell(cell.x, cell.y, rows, cols)]
-        b = table[field_cell(cell.x + 1, cell.y, rows, cols)]
-        c = table[field_cell(cell.x, cell.y + 1, rows, cols)]
-        d = table[field_cell(cell.x + 1, cell.y + 1, rows, cols)]
-        low = a + rest.x * (b - a)
-        high = c + rest.x * (d - c)
-        return low + rest.y * (high - low)
+    def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
+        if SHARP:
+            return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
+        else:
+            return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
 
-    # terms[4] = {hit, 1 / (2 sigma^2), rand, log z_max}: z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, logarithms
-    # in the log domain.
+    # Smooth distance between the four cell centres around an end point, in two parts.
     @wp.func
-    def log_field_linear(distance: real, terms: wp.array(dtype=real)):
+    def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, rows: wp.int32, cols: wp.int32):
+        a = vec2(table[field_cell(cell.x, cell.y, rows, cols)], ZERO)
+        b = vec2(table[field_cell(cell.x + 1, cell.y, rows, cols)], ZERO)
+        c = vec2(table[field_cell(cell.x, cell.y + 1, rows, cols)], ZERO)
+        d = vec2(table[field_cell(cell.x + 1, cell.y + 1, rows, cols)], ZERO)
+        low = between(end.to_next_x, a, end.rest_x, b)
+        high = between(end.to_next_x, c, end.rest_x, d)
+        return between(end.to_next_y, low, end.rest_y, high)
+
+    # terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1}: z_hit / (sigma
+    # sqrt(2 pi)) and z_rand / range_max, logarithms in the log domain. Where the peak is high, exponent and log peak
+    # nearly cancel.
+    @wp.func
+    def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
+        if SHARP:
+            return pair_product(pair_product(distance, distance), vec2(terms[1], terms[5]))
+        else:
+            return vec2(distance.x * (distance.x * terms[1]), ZERO)
+
+    @wp.func
+    def log_field_linear(distance: vec2, terms: wp.array(dtype=real)):
         p = terms[2]
         if HIT:
-            exponent = distance * (distance * terms[1])
-            p += terms[0] * wp.exp(-exponent)
+            exponent = field_exponent(distance, terms)
+            p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
         return wp.log(p)
 
     @wp.func
-    def log_field_log(distance: real, terms: wp.array(dtype=real)):
-        exponent = distance * (distance * terms[1])
-        hit = terms[0] - exponent
+    def log_field_log(distance: vec2, terms: wp.array(dtype=real)):
+        exponent = field_exponent(distance, terms)
+        hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
         largest = wp.max(hit, terms[2])
         return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
 
@@ -200,16 +245,16 @@ def make(name, flags):
                 if wp.isinf(to.x):
                     term = terms[3]
             if known:
-                offset, rest = end_point(from_pose, from_low, to, to_low, SHIFT, guard)
-                cell = origin + offset
+                end = end_point(from_pose, from_low, to, to_low, SHIFT, guard)
+                cell = origin + end.cell
                 if BILINEAR:
-                    term = log_field(bilinear(table, cell, rest, rows, cols), terms)
+                    term = log_field(bilinear(table, cell, end, rows, cols), terms)
                 else:
                     term = table[field_cell(cell.x, cell.y, rows, cols)]
                     if LOG_TABLE:
                         pass
                     else:
-                        term = log_field(term, terms)
+                        term = log_field(vec2(term, ZERO), terms)
             if PER_BEAM:
                 parts[n * readings + k] = term
             block += term

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense import _checks
-from gpusense.commands._common import write_whole
+from gpusense._files import write_whole
 from gpusense.grid import OccupancyGrid
 from gpusense.scanner import Reading, Scanner, classify
 

@@ -26,6 +26,7 @@ from gpusense.prepare import distance_transform, quadrant_squares
 from gpusense.reference import field as field_kernels
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.mixture import log_density
+from gpusense.reference.sensor_table import tabulated_density
 from gpusense.scanner import Scanner
 from gpusense.signatures import KERNELS
 from gpusense.tolerances import TOLERANCES, Check, Tolerance, beam_tolerance, scan_tolerance
@@ -94,7 +95,12 @@ class Recorder:
                 dtype = argument.dtype(real)
                 values[argument.name] = int(value) if dtype.kind == "i" else dtype.type(value)
         # Only where these flags are set does a kernel see the argument; rays are cast on the device.
-        needed = {"parts": {"PER_BEAM"} & flags, "pose_low": {"CAREFUL"} & flags, "squares": {}}
+        needed = {
+            "parts": {"PER_BEAM"} & flags,
+            "pose_low": {"CAREFUL"} & flags,
+            "sensor": {"SENSOR_TABLE"} & flags,
+            "map_table": {},
+        }
         for argument, value in given.items():
             if argument.shape is None or not needed.get(argument.name, True):
                 continue
@@ -151,7 +157,13 @@ def _replay_beams(launch: Launch, values: dict[str, Any]) -> np.ndarray:
     ray_of = np.repeat(np.arange(values["rays"]), np.diff(values["first"]))
     expected = launch.expected.astype(np.float64)[:, ray_of]
     z = np.broadcast_to(values["reading"], expected.shape)
-    parts = log_density(launch.flags, z, expected, values["terms"])
+    if "SENSOR_TABLE" in launch.flags:
+        # In the launch's own precision, or a range next to a bin's border would fall into another bin.
+        bins = (launch.values[name] for name in ("sensor", "cells", "per_metre", "range_max"))
+        own = np.broadcast_to(launch.values["reading"], expected.shape), launch.expected[:, ray_of]
+        parts = tabulated_density(*own, *bins).astype(np.float64)
+    else:
+        parts = log_density(launch.flags, z, expected, values["terms"])
     if "ALL_READINGS" in launch.flags:
         parts = np.where(np.isnan(z), 0.0, np.where(np.isinf(z), values["terms"][7], parts))
     return parts

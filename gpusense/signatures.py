@@ -23,6 +23,12 @@ FLAGS = {
     "SHARP": "the normal density's peak is so high that exponents need more than the working precision",
     "SINGLE": "the mixture has one continuous component",
     "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
+    "DDA": "rays are cast cell by cell",
+    "MARCH": "rays are cast by marching through the distance field",
+    "BRESENHAM": "rays are cast along Bresenham's lines",
+    "CDDT": "rays are cast through a compressed directional distance transform",
+    "LOOKUP": "ranges come from a look-up table",
+    "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "PER_BEAM": "the log-likelihood of each reading is wanted",
@@ -31,7 +37,14 @@ FLAGS = {
     "CAREFUL": "end points need more than the working precision to fall into the right cell",
 }
 
-_SCALARS: dict[str, np.dtype] = {"int": np.dtype(np.int32), "uchar": np.dtype(np.uint8)}
+# The kernel file of each caster's cast_ray; without such a flag it is the exact one.
+CASTER_FLAGS = {"DDA": "dda", "MARCH": "march", "BRESENHAM": "bresenham", "CDDT": "cddt", "LOOKUP": "lookup"}
+
+_SCALARS: dict[str, np.dtype] = {
+    "int": np.dtype(np.int32),
+    "uchar": np.dtype(np.uint8),
+    "ushort": np.dtype(np.uint16),
+}
 _WIDTHS = {"": 1, "2": 2, "4": 4}
 
 
@@ -97,6 +110,9 @@ def _kernel(file: str, launch: str, *rows: str, group: int = 64) -> Kernel:
 
 _MAP = ("int rows", "int cols")
 _POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
+# A map as a caster has it: what an entry is, and how many there are, is the caster's.
+_CAST = ("entry map_table [map]",)
+_CASTER = ("int bins", "real slack", "real tolerance")
 _RANGE = ("real limit", "real resolution", "real range_max")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 
@@ -122,13 +138,17 @@ KERNELS: dict[str, Kernel] = {
         *_MAP,
     ),
     "cast_ranges": _kernel(
-        "raycast", "ray particle", "uchar squares [4 * (rows + 2) * (cols + 2)]", *_POSES, "real2 ray [rays]",
-        "out real ranges [particles * rays]", *_MAP, "int particles", "int rays", *_RANGE,
+        "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,
+        "int particles", "int rays", *_CASTER, *_RANGE,
     ),
     "score_beams": _kernel(
-        "beam", "particle", "uchar squares [4 * (rows + 2) * (cols + 2)]", *_POSES, "real2 ray [rays]",
-        "int first [rays + 1]", "real reading [readings]", "real terms [10]", *_RESULT, *_MAP, "int particles",
-        "int rays", "int readings", *_RANGE, "real fixed", "real temperature",
+        "beam", "particle", *_CAST, *_POSES, "real2 ray [rays]", "int first [rays + 1]", "real reading [readings]",
+        "real terms [10]", "real sensor [cells * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
+        "int readings", *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
+    ),
+    "fill_lookup": _kernel(
+        "lookup_table", "bin cell", "uchar squares [4 * (rows + 2) * (cols + 2)]", "real2 ray [bins]",
+        "out ushort lookup [rows * cols * bins]", *_MAP, "int bins", "int first_row", "int count", "real limit",
     ),
     "fill_field": _kernel(
         "field", "col row", "int squared [rows * cols]", "real density [cap + 1]",

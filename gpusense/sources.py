@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from gpusense._kernel_files import opencl_source
-from gpusense.signatures import FLAGS
+from gpusense.signatures import CASTER_FLAGS, FLAGS
 
 _PRELUDE = """\
 #pragma OPENCL FP_CONTRACT OFF
@@ -29,13 +29,19 @@ def prelude(*, float64: bool) -> str:
     )
 
 
-def required_files(name: str) -> list[str]:
-    """Kernel files that a file needs, itself last."""
+def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
+    """Kernel files that a file needs, itself last; ``caster`` stands for the caster that the flags mean."""
     files: list[str] = []
-    match = _REQUIRES.search(opencl_source(name))
-    for needed in match.group(1).split() if match else ():
-        files += [file for file in required_files(needed) if file not in files]
+    for needed in _requirements(name):
+        if needed == "caster":
+            needed = next((CASTER_FLAGS[flag] for flag in CASTER_FLAGS if flag in flags), "raycast")
+        files += [file for file in required_files(needed, flags) if file not in files]
     return [*files, name]
+
+
+def _requirements(name: str) -> list[str]:
+    match = _REQUIRES.search(opencl_source(name))
+    return match.group(1).split() if match else []
 
 
 def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
@@ -71,7 +77,7 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
 def assemble(file: str, flags: frozenset[str]) -> str:
     """Complete OpenCL C source of a kernel file for a set of flags."""
     parts = [prelude(float64="FLOAT64" in flags)]
-    for needed in required_files(file):
+    for needed in required_files(file, flags):
         parts += [f'#line 1 "{needed}.cl"\n', resolve(opencl_source(needed), flags, f"{needed}.cl")]
     return "".join(parts)
 
@@ -96,8 +102,11 @@ def with_places(log: str, source: str) -> str:
 
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """The flags that change a kernel file's code, so that one program serves all specs that agree on them."""
-    text = "".join(opencl_source(needed) for needed in required_files(file))
+    files = required_files(file, flags)
+    text = "".join(opencl_source(needed) for needed in files)
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
+    if any("caster" in _requirements(needed) for needed in files):
+        words |= CASTER_FLAGS.keys()
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")

@@ -104,7 +104,8 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())
     world, limits = (*obstacles.shape, count, 1), (RANGE_MAX, 1.0, RANGE_MAX)
-    device.compile("cast_ranges", wide)((1, count), squares, cells, pose, ray, ranges, *world, *limits)
+    exact, none = (0, 0.0, 0.0), device.empty(1, real)
+    device.compile("cast_ranges", wide)((1, count), squares, cells, pose, ray, ranges, *world, *exact, *limits)
     expected = device.download(ranges, np.empty(count, real))
 
     # Warp takes seconds for each set of flags, so there everything is compiled in, once.
@@ -124,7 +125,8 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
             parts, first = device.empty(count * len(z), real), np.array([0, len(z)], np.int32)
             device.compile("score_beams", flags | model._components)(
                 (count,), squares, cells, pose, ray, device.upload(first), device.upload(z),
-                device.upload(model._terms), device.empty(count, real), parts, *world, len(z), *limits, 0.0, 1.0,
+                device.upload(model._terms), none, device.empty(count, real), parts, *world, len(z), *exact, 0, 0.0,
+                *limits, 0.0, 1.0,
             )  # fmt: skip
             found = device.download(parts, np.empty(count * len(z), real))
             own = np.repeat(np.array([list(p.to_dict().values())], real).T, found.size, axis=1)

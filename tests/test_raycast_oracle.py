@@ -62,7 +62,7 @@ def cast(scene: Scene, backend: str, precision: str) -> np.ndarray:
     cell, pose = device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real))
     rays, ranges = device.upload(np.array([[1.0, 0.0]], real)), device.empty(count, real)
     device.compile("cast_ranges", frozenset(flags))(
-        (1, count), squares, cell, pose, rays, ranges, rows, cols, count, 1, scene.limit, 1.0, scene.limit
+        (1, count), squares, cell, pose, rays, ranges, rows, cols, count, 1, 0, 0.0, 0.0, scene.limit, 1.0, scene.limit
     )
     return device.download(ranges, np.empty(count, real))
 

@@ -12,7 +12,7 @@ import gpusense as gs
 from gpusense import selftest, stiff
 from gpusense.backends import get_backend
 from gpusense.cli import main
-from gpusense.reference import beam, distance, mixture, raycast
+from gpusense.reference import beam, distance, mixture, ranges
 from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
 
 EPS = float(np.finfo(np.float32).eps)
@@ -196,9 +196,9 @@ def test_json_lists_every_comparison(capsys):
 
 
 def shift_ranges(*arguments):
-    raycast_cast_ranges(*arguments)
-    ranges = arguments[5]
-    ranges[17] = np.nextafter(ranges[17], ranges.dtype.type(100))
+    reference_cast_ranges(*arguments)
+    found = arguments[5]
+    found[17] = np.nextafter(found[17], found.dtype.type(100))
 
 
 def add_to_squares(*arguments):
@@ -208,13 +208,13 @@ def add_to_squares(*arguments):
 
 def add_to_scan(*arguments):
     score_beams(*arguments)
-    arguments[8][3] += 0.01
+    arguments[9][3] += 0.01
 
 
 def add_to_beam(*arguments):
     score_beams(*arguments)
     if "PER_BEAM" in arguments[0]:
-        arguments[9][7] += np.float32(1e-4)
+        arguments[10][7] += np.float32(1e-4)
 
 
 def densities_of_another_mixture(flags, z, expected, terms):
@@ -222,14 +222,14 @@ def densities_of_another_mixture(flags, z, expected, terms):
     return np.where(z < 1, found + 1e-3, found).astype(terms.dtype) if terms.dtype == np.float32 else found
 
 
-raycast_cast_ranges, envelope = raycast.cast_ranges, distance.distance_envelope
+reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
 
 @pytest.mark.parametrize(
     "module, name, broken, quantity",
     [
-        (raycast, "cast_ranges", shift_ranges, "float32 ranges"),
+        (ranges, "cast_ranges", shift_ranges, "float32 ranges"),
         (distance, "distance_envelope", add_to_squares, "distance transform"),
         (beam, "score_beams", add_to_scan, "float32 beam model, scans"),
         (beam, "score_beams", add_to_beam, "float32 beam model, beams"),

@@ -126,7 +126,7 @@ def test_warp_kernels_have_the_arguments_of_their_row(
 
     real = {np.float32: (wp.float32, wp.vec2f, wp.vec4f), np.float64: (wp.float64, wp.vec2d, wp.vec4d)}[precision]
     types = dict(zip(("real", "real2", "real4"), real, strict=True))
-    types |= {"int": wp.int32, "int2": wp.vec2i, "uchar": wp.uint8}
+    types |= {"int": wp.int32, "int2": wp.vec2i, "uchar": wp.uint8, "ushort": wp.uint16, "entry": wp.uint8}
     row = KERNELS[kernel]
     made = warp_module(row.file).make(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
     expected = {a.name: (types[a.type], a.shape is not None) for a in row.arguments}
@@ -259,6 +259,10 @@ def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tup
     return cell.astype(np.int32), pose
 
 
+# The exact caster's bins, slack and tolerance.
+EXACT = (0, 0.0, 0.0)
+
+
 def scene_flags(real: type, *names: str) -> frozenset[str]:
     return frozenset({*names, *(("FLOAT64",) if real is np.float64 else ())})
 
@@ -277,8 +281,8 @@ def ranges_on_both(
     ranges = np.full((len(pose), len(ray)), np.nan, real)
     size, counts = (len(ray), len(pose)), (*occupied.shape, len(pose), len(ray))
     reference, found = on_both(
-        device, "cast_ranges", flags, size, planes_of(occupied), cell, pose, ray, ranges, *counts, LIMIT, RESOLUTION,
-        LIMIT * RESOLUTION,
+        device, "cast_ranges", flags, size, planes_of(occupied), cell, pose, ray, ranges, *counts, *EXACT, LIMIT,
+        RESOLUTION, LIMIT * RESOLUTION,
     )  # fmt: skip
     return reference["ranges"], found["ranges"]
 
@@ -377,8 +381,8 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     parts = np.full((count, readings), np.nan, real)
     found = run(
         device, "score_beams", flags, (count,), planes_of(occupied), cell, pose, ray, first, reading, terms,
-        np.empty(count, real), parts, *occupied.shape, count, len(ray), readings, LIMIT, RESOLUTION,
-        LIMIT * RESOLUTION, fixed, temperature,
+        np.zeros(1, real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings, *EXACT, 0, 0.0,
+        LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
     )  # fmt: skip
 
     # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
@@ -408,8 +412,8 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     count, none = len(pose), np.zeros(0, real)
     found = run(
         device, "score_beams", frozenset(flags), (count,), planes_of(occupied), cell, pose, np.zeros((0, 2), real),
-        np.zeros(1, np.int32), none, terms, np.empty(count, real), none, *occupied.shape, count, 0, 0, LIMIT,
-        RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
+        np.zeros(1, np.int32), none, terms, none, np.empty(count, real), none, *occupied.shape, count, 0, 0, *EXACT,
+        0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
     )  # fmt: skip
     assert (found["log_p"] == -1.5).all()
 
@@ -542,6 +546,14 @@ def test_low_parts_of_poses_are_read_only_where_they_are_needed(device: Backend)
 TRACES = [
     ("cast_ranges", "FLOAT64", (), r"\bdouble\b", r"\bfloat64\b"),
     ("cast_ranges", "ORIGINS_OUTSIDE", (), r"\benter_x\b", r"\bwp::neg\("),
+    (
+        "cast_ranges",
+        "MARCH",
+        (),
+        r"\btolerance \+",
+        r"\bwp::float32\* *var_map_table|array_t<wp::float32> var_map_table",
+    ),
+    ("score_beams", "SENSOR_TABLE", ("LINEAR",), r"\btabulated_density\(z", r"tabulated_density_\d+\("),
     ("score_beams", "HIT", ("LINEAR", "RAND"), r"\berf\(", r"\bwp::erf\("),
     ("score_beams", "SHORT", ("LINEAR", "RAND"), r"\btanh\(", r"\bwp::tanh\("),
     ("score_beams", "SHORT", ("HIT",), r"\btanh\(", r"\bwp::tanh\("),
@@ -607,7 +619,7 @@ def test_cuda_code_rounds_every_operation_by_itself(
     architectures = wp.get_cuda_supported_archs()
     if not architectures:
         pytest.skip("this build of Warp has no CUDA compiler")
-    made = warp_module("raycast").make("cast_ranges", scene_flags(precision, "ORIGINS_OUTSIDE"))
+    made = warp_module("ranges").make("cast_ranges", scene_flags(precision, "ORIGINS_OUTSIDE"))
     arch = min(architectures, key=lambda number: abs(number - 90))
     wp.compile_aot_module(made.module, arch=arch, module_dir=tmp_path, use_ptx=True)
     (code,) = tmp_path.glob("*.ptx")

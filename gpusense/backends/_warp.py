@@ -26,6 +26,7 @@ from gpusense.sources import relevant
 
 _SCALARS = {
     np.dtype(np.uint8): wp.uint8,
+    np.dtype(np.uint16): wp.uint16,
     np.dtype(np.int32): wp.int32,
     np.dtype(np.float32): wp.float32,
     np.dtype(np.float64): wp.float64,

@@ -7,10 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gpusense import _checks
+from gpusense import _checks, casters
 from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.casters import Caster
 from gpusense.grid import OccupancyGrid
-from gpusense.models.caster import CASTERS, ExactCaster
+from gpusense.models.caster import MapCaster
 from gpusense.models.scan_model import (
     HIGH_PEAK,
     ScanModel,
@@ -22,10 +24,12 @@ from gpusense.models.scan_model import (
 )
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
+from gpusense.reference.densities import log_mixture
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
-_BYTES_PER_CELL = 4
+# Bins of a sensor's table along each axis: 268 MB in float32.
+_MOST_BINS = 8192
 
 
 class BeamModel(ScanModel):
@@ -40,7 +44,10 @@ class BeamModel(ScanModel):
         parameters: Weights and shapes of the mixture.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
-        caster: How expected ranges are found: ``"exact"``.
+        caster: How expected ranges are found: ``"exact"``, another name of ``RayCaster.methods()``, or one of
+            ``gpusense.casters`` with knobs of its own.
+        sensor_table: None evaluates the mixture; a number tabulates log p over readings and expected ranges in bins of
+            that width [m], at least range_max / 8192, as racing particle filters do.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
         temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
@@ -62,7 +69,8 @@ class BeamModel(ScanModel):
         *,
         backend: str | Backend = "auto",
         precision: str = "float32",
-        caster: str = "exact",
+        caster: str | Caster = "exact",
+        sensor_table: float | None = None,
         unknown: str = "free",
         outside: str = "free",
         temperature: float = 1.0,
@@ -73,16 +81,18 @@ class BeamModel(ScanModel):
         self.parameters = BeamParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BeamParameters):
             raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(parameters)}")
-        _checks.choice("caster", caster, CASTERS)
+        method = casters.choose("caster", caster)
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
         )  # fmt: skip
-        self._caster = ExactCaster(
-            self._backend, self._real, grid, scanner.mount, scanner.range_max,
+        self._caster = MapCaster(
+            self._backend, self._real, grid, scanner.mount, scanner.range_max, method,
             unknown=unknown, outside=outside, crop=specialize,
         )  # fmt: skip
+        self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
+        self._sensor, self._cells = self._tabulate(sensor_table)
 
     def expected_ranges(self, poses: object) -> np.ndarray:
         """z* of every beam of the scanner at each pose.
@@ -129,13 +139,16 @@ class BeamModel(ScanModel):
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
-        if "SHARP" not in self._components:
+        if self.sensor_table is not None:
+            why = f"log p is tabulated over {self._cells} x {self._cells + 1} bins of readings and expected ranges"
+            omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
+        elif "SHARP" not in self._components:
             omissions.append(
                 Omission(
                     "exponents in two parts", f"the hit density's peak is at most {HIGH_PEAK:g} / m", "37 operations"
                 )
             )
-        if (far := self._caster.map.omission(_BYTES_PER_CELL)) is not None:
+        if (far := self._caster.omission()) is not None:
             omissions.append(far)
         title = f"beam model, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
@@ -158,7 +171,21 @@ class BeamModel(ScanModel):
             head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
         shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
         terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
+        if self.sensor_table is not None:
+            flags = {"SENSOR_TABLE"} | (flags & {"LINEAR"})
         return frozenset(flags), rounded_terms(terms, self._real)
+
+    def _tabulate(self, width: float | None) -> tuple[Buffer, int]:
+        """The sensor's table on the device, and its number of bins; no table and 0 where the mixture is evaluated."""
+        if width is None:
+            return self._backend.upload(np.zeros(1, self._real)), 0
+        range_max = self.scanner.range_max
+        width = _checks.real("sensor_table", width, low=range_max / _MOST_BINS, high=range_max)
+        cells = max(round(range_max / width), 1)
+        middle = (np.arange(cells) + 0.5) * (range_max / cells)
+        expected = np.append(middle, range_max)
+        table = log_mixture(middle[:, None], expected, range_max=range_max, **self.parameters.to_dict())
+        return self._backend.upload(table.astype(self._real)), cells
 
     def _impossible(self) -> bool:
         p = self.parameters
@@ -173,20 +200,21 @@ class BeamModel(ScanModel):
         rays, readings = len(scan.rays), len(scan.readings)
 
         def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
-            squares, region = self._caster.map.ensure(poses)
+            table, region = self._caster.map.ensure(poses)
             placed, beyond = place_in(region, poses, self.grid, self.scanner.mount, real)
             flags = self._components | self._scene_flags()
             flags |= {"SHARED_RAYS"} if scan.shared or not self._specialize else set()
             flags |= {"ORIGINS_OUTSIDE"} if beyond or not self._specialize else set()
-            flags |= {"OUTSIDE_OCCUPIED"} if self.outside == "occupied" else set()
+            flags |= self._caster.flags
             flags |= {"PER_BEAM"} if per_beam else set()
             self._last_code = flags
             count = len(poses)
             result = space.empty("log_p", count, real)
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             self._backend.compile("score_beams", flags)(
-                (count,), squares, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, first,
-                reading, terms, result, parts, region.rows, region.cols, count, rays, readings, self._caster.limit,
+                (count,), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, first,
+                reading, terms, self._sensor, result, parts, region.rows, region.cols, count, rays, readings,
+                *self._caster.scalars, self._cells, self._cells / self.scanner.range_max, self._caster.limit,
                 self.grid.resolution, self.scanner.range_max, scan.constant, self.temperature,
             )  # fmt: skip
             self._backend.download(result, log_p)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from gpusense import _checks
+from gpusense import _checks, casters
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
+from gpusense.casters import Caster, Window
 from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
+from gpusense.lookup_files import describe, write_lookup
 from gpusense.models.reachable import ReachableMap
 from gpusense.models.scan_model import check_poses, check_scene, chunk_of, in_chunks, place_in, real_dtype
-from gpusense.prepare import quadrant_squares
+from gpusense.plan import Omission
 from gpusense.workspace import Workspace
 
 _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
@@ -30,6 +34,7 @@ class CasterMethod:
         memory: Bytes on the device.
         precomputation: What is made of the map beforehand.
         backends: Where it runs.
+        knobs: What its error and its time depend on; arguments of the class in ``gpusense.casters``.
     """
 
     name: str
@@ -37,18 +42,7 @@ class CasterMethod:
     memory: str
     precomputation: str
     backends: tuple[str, ...]
-
-
-_METHODS = (
-    CasterMethod(
-        "exact",
-        "exact: float64 to 1e-12 relative; float32 the same bits on every device",
-        "4 bytes per cell of the reachable map",
-        "quadrant empty squares, one pass over the map per quadrant",
-        ("numpy", "opencl", "warp"),
-    ),
-)
-CASTERS = tuple(method.name for method in _METHODS)
+    knobs: str
 
 
 class RayCaster:
@@ -57,7 +51,8 @@ class RayCaster:
     Args:
         grid: The map.
         range_max: Longest range [m], > 0; what a ray without a nearer obstacle returns.
-        method: ``"exact"``; see ``RayCaster.methods()``.
+        method: A name of ``RayCaster.methods()``, or one of ``gpusense.casters`` with knobs of its own, such as
+            ``casters.March(tolerance=0.02)``.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
@@ -73,7 +68,7 @@ class RayCaster:
         grid: OccupancyGrid,
         range_max: float,
         *,
-        method: str = "exact",
+        method: str | Caster = "exact",
         backend: str | Backend = "auto",
         precision: str = "float32",
         unknown: str = "free",
@@ -81,19 +76,23 @@ class RayCaster:
     ) -> None:
         self.range_max = _checks.real("range_max", range_max, above=0)
         self.grid = check_scene(grid, self.range_max)
-        self.method = _checks.choice("method", method, CASTERS)
+        self.method = casters.choose("method", method)
         self.unknown = _checks.choice("unknown", unknown, ("free", "occupied"))
         self.outside = _checks.choice("outside", outside, ("free", "occupied"))
         device = get_backend(backend)
         real = real_dtype(precision, device)
-        self._caster = ExactCaster(
-            device, real, grid, _NO_MOUNT, self.range_max, unknown=unknown, outside=outside, crop=True
+        self._caster = MapCaster(
+            device, real, grid, _NO_MOUNT, self.range_max, self.method, unknown=unknown, outside=outside, crop=True
         )
 
     @staticmethod
     def methods() -> tuple[CasterMethod, ...]:
-        """The methods there are, with their error, memory, precomputation and backends."""
-        return _METHODS
+        """The methods there are, with their error, memory, precomputation, backends and knobs."""
+        everywhere = ("numpy", "opencl", "warp")
+        return tuple(
+            CasterMethod(kind.name, kind.error, kind.memory, kind.precomputation, everywhere, kind.knobs)
+            for kind in casters.CASTERS.values()
+        )
 
     @property
     def device(self) -> BackendInfo:
@@ -104,6 +103,31 @@ class RayCaster:
     def precision(self) -> str:
         """``"float32"`` or ``"float64"``."""
         return self._caster.real.name
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of the map's table on the device; 0 before the first cast."""
+        return self._caster.table_bytes
+
+    def prepare(self, poses: object) -> None:
+        """Make the map's table for a cloud of (N, 3) poses now; ``cast`` does it otherwise.
+
+        Raises:
+            TypeError, ValueError: poses that are not (N, 3) finite numbers.
+            MemoryError: the device cannot hold the table.
+        """
+        self._caster.prepare(check_poses(poses))
+
+    def save_table(self, path: str | Path) -> None:
+        """Write the look-up table, whole or not at all, for ``casters.Lookup(bins, file=path)``.
+
+        Raises:
+            ValueError: the method has no table that is worth keeping: only ``"lookup"`` has.
+            OSError: the file cannot be written.
+        """
+        if not isinstance(self.method, casters.Lookup):
+            raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.method.name!r}")
+        self._caster.save(Path(path), self.method.bins)
 
     def cast(self, poses: object, bearings: object) -> np.ndarray:
         """Expected ranges.
@@ -123,8 +147,8 @@ class RayCaster:
         return self._caster.cast(check_poses(poses), vectors)
 
 
-class ExactCaster:
-    """The exact caster of one map, sensor mount and range on one device; models share its table of the map.
+class MapCaster:
+    """The caster of one map, sensor mount and range on one device; models share its table of the map.
 
     Args:
         backend: The device.
@@ -132,6 +156,7 @@ class ExactCaster:
         grid: The map.
         mount: The sensor's pose on the robot; its yaw belongs to the ray vectors.
         range_max: Longest range [m].
+        method: How ranges are found.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
         crop: False prepares the whole map at once.
@@ -144,6 +169,7 @@ class ExactCaster:
         grid: OccupancyGrid,
         mount: Mount,
         range_max: float,
+        method: Caster,
         *,
         unknown: str,
         outside: str,
@@ -151,12 +177,43 @@ class ExactCaster:
     ) -> None:
         self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
         self.limit = range_max / grid.resolution
-        self.map = ReachableMap(backend, grid, unknown, mount, self.limit, quadrant_squares, crop)
-        self._flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
-        self._flags |= {"FLOAT64"} if real == np.float64 else set()
+        self.method, self.outside, self.table_bytes = method, outside, 0
+        self.map = ReachableMap(backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole)
+        self.flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
+        self.flags |= {method.flag} if method.flag else set()
+        self._wide = {"FLOAT64"} if real == np.float64 else set()
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
         self._lock = threading.Lock()
+
+    @property
+    def scalars(self) -> tuple[Any, ...]:
+        """The kernels' arguments bins, slack and tolerance."""
+        return self.method.scalars()
+
+    def omission(self) -> Omission | None:
+        """What cropping the map left out, once a cloud has been seen."""
+        region = self.map.region
+        return self.map.omission(self.table_bytes / region.cells) if region is not None else None
+
+    def _prepare(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
+        table = self.method.prepare(backend, Window(obstacles, self.limit, self.outside))
+        self.table_bytes = table.size
+        return table.buffer
+
+    def prepare(self, poses: np.ndarray) -> None:
+        """Make the table for (N, 3) poses."""
+        if len(poses):
+            with self._lock:
+                self.map.ensure(poses)
+
+    def save(self, path: Path, bins: int) -> None:
+        """Write the look-up table."""
+        with self._lock:
+            buffer, region = self.map.ensure(np.array([self.grid.origin]))
+            entries = self.backend.download(buffer, np.empty(region.cells * bins, np.uint16))
+            obstacles = region.cut(self.map.obstacles)
+        write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
     def cast(self, poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
         """Expected ranges (N, K) of (N, 3) float64 poses and (K, 2) ray vectors, in pieces that fit the device."""
@@ -175,12 +232,13 @@ class ExactCaster:
 
     def _cast_chunk(self, poses: np.ndarray, ray: Buffer, ranges: np.ndarray) -> None:
         space = self._workspace
-        squares, region = self.map.ensure(poses)
+        table, region = self.map.ensure(poses)
         placed, beyond = place_in(region, poses, self.grid, self.mount, self.real)
         count, rays = ranges.shape
         result = space.empty("ranges", ranges.size, self.real)
-        self.backend.compile("cast_ranges", self._flags | {"ORIGINS_OUTSIDE"} if beyond else self._flags)(
-            (rays, count), squares, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, result,
-            region.rows, region.cols, count, rays, self.limit, self.grid.resolution, self.range_max,
+        flags = self.flags | self._wide | ({"ORIGINS_OUTSIDE"} if beyond else set())
+        self.backend.compile("cast_ranges", flags)(
+            (rays, count), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, result,
+            region.rows, region.cols, count, rays, *self.scalars, self.limit, self.grid.resolution, self.range_max,
         )  # fmt: skip
         self.backend.download(result, ranges)

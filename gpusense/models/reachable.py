@@ -39,7 +39,7 @@ class ReachableMap:
     ) -> None:
         self._backend, self._grid, self._mount, self._reach, self._crop = backend, grid, mount, reach, crop
         self._prepare = prepare
-        self._obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")
+        self.obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")
         self._table: Buffer = None
         self.region: Region | None = None
         self.preparations = 0
@@ -52,13 +52,13 @@ class ReachableMap:
             wanted = region.whole(self._grid)
         if wanted != self.region:
             self._table, self.region = None, None
-            self._table = self._prepare(self._backend, wanted.cut(self._obstacles))
+            self._table = self._prepare(self._backend, wanted.cut(self.obstacles))
             self.region = wanted
             self.preparations += 1
         assert self.region is not None
         return self._table, self.region
 
-    def omission(self, bytes_per_cell: int) -> Omission | None:
+    def omission(self, bytes_per_cell: float) -> Omission | None:
         """What cropping leaves out, once a cloud has been seen."""
         everything = region.whole(self._grid)
         if self.region is None or self.region == everything:

@@ -6,18 +6,20 @@ import numpy as np
 
 from gpusense.reference.error_free import BLOCK_TERMS, add_term
 from gpusense.reference.mixture import log_density
-from gpusense.reference.raycast import cast_ranges
+from gpusense.reference.ranges import cast_ranges
+from gpusense.reference.sensor_table import tabulated_density
 
 
 def score_beams(
     flags: frozenset[str],
-    squares: np.ndarray,
+    map_table: np.ndarray,
     pose_cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
     first: np.ndarray,
     reading: np.ndarray,
     terms: np.ndarray,
+    sensor: np.ndarray,
     log_p: np.ndarray,
     parts: np.ndarray,
     rows: int,
@@ -25,6 +27,11 @@ def score_beams(
     particles: int,
     rays: int,
     readings: int,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+    cells: int,
+    per_metre: np.floating,
     limit: np.floating,
     resolution: np.floating,
     range_max: np.floating,
@@ -39,12 +46,15 @@ def score_beams(
         end = min(begin + block, particles)
         ranges = np.empty((end - begin) * rays, real)
         cast_ranges(
-            flags, squares, pose_cell[begin:end], pose[begin:end], ray, ranges, rows, cols, end - begin, rays,
-            limit, resolution, range_max,
+            flags, map_table, pose_cell[begin:end], pose[begin:end], ray, ranges, rows, cols, end - begin, rays,
+            bins, slack, tolerance, limit, resolution, range_max,
         )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        term = log_density(flags, z, expected, terms)
+        if "SENSOR_TABLE" in flags:
+            term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+        else:
+            term = log_density(flags, z, expected, terms)
         if "ALL_READINGS" in flags:
             term = np.where(np.isnan(z), 0, np.where(np.isinf(z), terms[7], term)).astype(real)
         if "PER_BEAM" in flags:

@@ -1,13 +1,15 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 // Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
-// requires: error_free raycast mixture
+// requires: error_free caster mixture sensor_table
 
 // One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared.
-kernel void score_beams(global const uchar *squares, global const int2 *pose_cell, global const real4 *pose,
+kernel void score_beams(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
                         global const real2 *ray, global const int *first, global const real *reading,
-                        global const real *terms, global real *log_p, global real *parts, const int rows,
-                        const int cols, const int particles, const int rays, const int readings, const real limit,
-                        const real resolution, const real range_max, const real fixed, const real temperature) {
+                        global const real *terms, global const real *sensor, global real *log_p, global real *parts,
+                        const int rows, const int cols, const int particles, const int rays, const int readings,
+                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
+                        const real limit, const real resolution, const real range_max, const real fixed,
+                        const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     real2 total = (real2)(fixed, 0);
@@ -16,7 +18,7 @@ kernel void score_beams(global const uchar *squares, global const int2 *pose_cel
     int impossible = 0;
 #endif
     for (int r = 0; r < rays; ++r) {
-        const real t = cast_ray(squares, rows, cols, pose_cell[n], pose[n], ray[r], limit);
+        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
         const real expected = expected_range(t, limit, resolution, range_max);
 #if SHARED_RAYS
         for (int k = first[r]; k < first[r + 1]; ++k) {
@@ -24,11 +26,19 @@ kernel void score_beams(global const uchar *squares, global const int2 *pose_cel
         const int k = r;
         {
 #endif
-#if ALL_READINGS
             const real z = reading[k];
-            const real term = isnan(z) ? (real)0 : isinf(z) ? terms[7] : log_density(z, expected, terms);
+            real term;
+#if ALL_READINGS
+            if (isnan(z))
+                term = 0;
+            else if (isinf(z))
+                term = terms[7];
+            else
+#endif
+#if SENSOR_TABLE
+                term = tabulated_density(z, expected, sensor, cells, per_metre, range_max);
 #else
-            const real term = log_density(reading[k], expected, terms);
+                term = log_density(z, expected, terms);
 #endif
 #if PER_BEAM
             parts[(long)n * readings + k] = term;

@@ -8,9 +8,11 @@ import math
 
 import warp as wp
 
-from . import error_free, mixture, raycast
+from . import error_free, mixture, sensor_table
+from . import ray as ray_file
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
+from .ranges import caster_of
 
 
 @functools.cache
@@ -18,8 +20,12 @@ def make(name, flags):
     """The kernel score_beams specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    caster = raycast.functions(flags)
-    cast_ray, expected_range = caster.cast_ray, caster.expected_range
+    caster = caster_of(flags)
+    ENTRY = caster.ENTRY
+    cast_ray = caster.functions(flags).cast_ray
+    expected_range = ray_file.functions(flags).expected_range
+    tabulated_density = sensor_table.functions(flags).tabulated_density
+    SENSOR_TABLE = "SENSOR_TABLE" in flags
     log_density = mixture.functions(flags).log_density
     add_term = error_free.functions(flags).add_term
     SHARED_RAYS = "SHARED_RAYS" in flags
@@ -33,13 +39,14 @@ def make(name, flags):
     # fewer than 2^31 parts.
     @kernel
     def score_beams(
-        squares: wp.array(dtype=wp.uint8),
+        map_table: wp.array(dtype=ENTRY),
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
         ray: wp.array(dtype=vec2),
         first: wp.array(dtype=wp.int32),
         reading: wp.array(dtype=real),
         terms: wp.array(dtype=real),
+        sensor: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         rows: wp.int32,
@@ -47,6 +54,11 @@ def make(name, flags):
         particles: wp.int32,
         rays: wp.int32,
         readings: wp.int32,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+        cells: wp.int32,
+        per_metre: real,
         limit: real,
         resolution: real,
         range_max: real,
@@ -62,7 +74,7 @@ def make(name, flags):
         block = real(0.0)
         impossible = bool(False)
         for r in range(rays):
-            t = cast_ray(squares, rows, cols, cell, from_pose, ray[r], limit)
+            t = cast_ray(map_table, rows, cols, cell, from_pose, ray[r], limit, bins, slack, tolerance)
             expected = expected_range(t, limit, resolution, range_max)
             begin = r
             end = r + 1
@@ -72,13 +84,16 @@ def make(name, flags):
             for k in range(begin, end):
                 z = reading[k]
                 term = real(0.0)
+                known = True
                 if ALL_READINGS:
+                    known = not (wp.isnan(z) or wp.isinf(z))
                     if wp.isinf(z):
                         term = terms[7]
-                    elif not wp.isnan(z):
+                if known:
+                    if SENSOR_TABLE:
+                        term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+                    else:
                         term = log_density(z, expected, terms)
-                else:
-                    term = log_density(z, expected, terms)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:

@@ -1,0 +1,73 @@
+"""Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end.
+
+So cast nav2_amcl and Beluga: distances are from cell centre to cell centre, and a line may pass between two cells that
+touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.ray import make_ray, off_grid, start_walk
+
+
+def cast_ray(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    rows: int,
+    cols: int,
+    cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    limit: np.floating,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+) -> np.ndarray:
+    """Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+
+    Args:
+        flags: Flags of the signature table.
+        map_table: Padded cells, flat.
+        rows: Rows of the grid.
+        cols: Columns of the grid.
+        cell: (M, 2) integer column and row of each origin.
+        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
+        ray: (M, 2) cosine and sine of each bearing.
+        limit: Longest distance in cells.
+        bins: Not used.
+        slack: Not used.
+        tolerance: Not used.
+    """
+    r = make_ray(pose, ray)
+    origin = cell.T.astype(np.int64)
+    k, t = start_walk(flags, r, cell, rows, cols, limit)
+    found = np.full(len(cell), limit, pose.dtype)
+    active = np.flatnonzero(t < limit)
+    if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
+        outside = off_grid(origin, rows, cols)
+        found[outside] = 0
+        active = np.flatnonzero(~outside)
+    first = origin + r.step * k.astype(np.int64)
+    end = origin + np.floor(pose[:, :2].T + limit * r.direction).astype(np.int64)
+    far = np.abs(end - first)
+    longer, shorter = far.max(axis=0), far.min(axis=0)
+    sign = np.where(end >= first, 1, -1)
+    flat = far[0] >= far[1]
+    aside, error, along = np.zeros(len(cell), np.int64), np.zeros(len(cell), np.int64), 0
+    while len(active):
+        x = np.where(flat[active], along, aside[active])
+        y = np.where(flat[active], aside[active], along)
+        at = first[:, active] + sign[:, active] * np.stack([x, y])
+        state = map_table[(at[1] + 1) * (cols + 2) + at[0] + 1]
+        hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
+        i, j = x[hit].astype(pose.dtype), y[hit].astype(pose.dtype)
+        found[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)
+        active = active[state == 0]
+        error[active] += shorter[active]
+        over = active[2 * error[active] >= longer[active]]
+        aside[over] += 1
+        error[over] -= longer[over]
+        along += 1
+        active = active[along <= longer[active]]
+    return found

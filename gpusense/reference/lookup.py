@@ -1,0 +1,54 @@
+"""Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed").
+
+For each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.ray import angle_bin, make_ray, off_grid, start_walk
+
+
+def cast_ray(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    rows: int,
+    cols: int,
+    cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    limit: np.floating,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+) -> np.ndarray:
+    """Distance in cells as the table has it, or limit where there is no obstacle nearer.
+
+    Args:
+        flags: Flags of the signature table.
+        map_table: (rows * cols * bins) ranges.
+        rows: Rows of the grid.
+        cols: Columns of the grid.
+        cell: (M, 2) integer column and row of each origin.
+        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
+        ray: (M, 2) cosine and sine of each bearing.
+        limit: Longest distance in cells.
+        bins: Angle bins of a full turn.
+        slack: Not used.
+        tolerance: Not used.
+    """
+    r = make_ray(pose, ray)
+    origin = cell.T.astype(np.int64)
+    k, t = start_walk(flags, r, cell, rows, cols, limit)
+    found = np.full(len(cell), limit, pose.dtype)
+    active = np.flatnonzero(t < limit)
+    if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
+        outside = off_grid(origin, rows, cols)
+        found[outside] = 0
+        active = np.flatnonzero(~outside)
+    at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
+    part = map_table[(at[1] * cols + at[0]) * bins + angle_bin(r.direction[:, active], bins)]
+    far = t[active] + part.astype(pose.dtype) * (limit / pose.dtype.type(65535))
+    found[active] = np.where(part == 65535, limit, np.minimum(far, limit))
+    return found

@@ -1,0 +1,37 @@
+"""The look-up table of expected ranges, filled by the exact caster from the centres of cells, some rows at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.raycast import cast_ray
+
+BLOCK = 1 << 15
+
+
+def fill_lookup(
+    flags: frozenset[str],
+    squares: np.ndarray,
+    ray: np.ndarray,
+    lookup: np.ndarray,
+    rows: int,
+    cols: int,
+    bins: int,
+    first_row: int,
+    count: int,
+    limit: np.floating,
+) -> None:
+    """A hit is 65 534 parts of the limit at most."""
+    real = ray.dtype.type
+    block = max(BLOCK // bins, 1)
+    none = real(0)
+    for begin in range(first_row * cols, (first_row + count) * cols, block):
+        index = np.arange(begin, min(begin + block, (first_row + count) * cols))
+        cell = np.repeat(np.stack([index % cols, index // cols], axis=1), bins, axis=0)
+        pose = np.empty((len(cell), 4), ray.dtype)
+        pose[:, :2] = 0.5
+        pose[:, 2:] = np.tile(ray[:bins], (len(index), 1))
+        forward = np.broadcast_to(np.array([1, 0], ray.dtype), (len(cell), 2))
+        t = cast_ray(flags, squares, rows, cols, cell, pose, forward, limit, 0, none, none)
+        part = np.minimum((t * (real(65535) / limit) + real(0.5)).astype(np.int64), 65534)
+        lookup[begin * bins : begin * bins + len(t)] = np.where(t >= limit, 65535, part)

@@ -1,0 +1,48 @@
+"""Expected ranges of poses and bearings by any caster."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import numpy as np
+
+from gpusense.reference import bresenham, cddt, dda, lookup, march, raycast
+from gpusense.reference.ray import expected_range
+
+BLOCK = 1 << 15
+CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
+
+
+def caster_of(flags: frozenset[str]) -> ModuleType:
+    """The module whose ``cast_ray`` a set of flags means."""
+    return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
+
+
+def cast_ranges(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    ranges: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    rays: int,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+    limit: np.floating,
+    resolution: np.floating,
+    range_max: np.floating,
+) -> None:
+    """The expected ranges of all particles and rays."""
+    cast_ray = caster_of(flags).cast_ray
+    block = max(BLOCK // max(rays, 1), 1)
+    for first in range(0, particles, block):
+        some = slice(first, min(first + block, particles))
+        count = some.stop - first
+        lanes = (np.repeat(pose_cell[some], rays, axis=0), np.repeat(pose[some], rays, axis=0))
+        beams = np.tile(ray[:rays], (count, 1))
+        t = cast_ray(flags, map_table, rows, cols, *lanes, beams, limit, bins, slack, tolerance)
+        ranges[first * rays : some.stop * rays] = expected_range(t, limit, resolution, range_max)

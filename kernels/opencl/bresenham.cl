@@ -1,0 +1,47 @@
+// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as nav2_amcl and Beluga
+// cast: distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
+// The table holds 1 for occupied cells in a ring of twos.
+// requires: squares ray
+
+typedef uchar entry;
+
+int cell_below(const real a) {
+    const int whole = (int)a;
+    return whole - ((real)whole > a);
+}
+
+// Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
+              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+    const Ray r = make_ray(pose, ray);
+#if OUTSIDE_OCCUPIED
+#if ORIGINS_OUTSIDE
+    if (off_grid(cell.x, cell.y, rows, cols)) return 0;
+#endif
+#endif
+    const Walk start = start_walk(r, cell, rows, cols, limit);
+    if (start.t >= limit) return limit;
+    const int col = cell.x + r.step_x * start.k_x, row = cell.y + r.step_y * start.k_y;
+    const int end_col = cell.x + cell_below(pose.x + limit * r.direction.x);
+    const int end_row = cell.y + cell_below(pose.y + limit * r.direction.y);
+    const int far_x = abs(end_col - col), far_y = abs(end_row - row);
+    const int longer = max(far_x, far_y), shorter = min(far_x, far_y);
+    const int right = end_col >= col ? 1 : -1, up = end_row >= row ? 1 : -1;
+    int aside = 0, error = 0;
+    for (int along = 0; along <= longer; ++along) {
+        const int x = far_x >= far_y ? along : aside, y = far_x >= far_y ? aside : along;
+        const int state = map_table[padded(row + up * y, col + right * x, cols)];
+#if OUTSIDE_OCCUPIED
+        if (state != 0) return start.t + sqrt((real)x * (real)x + (real)y * (real)y);
+#else
+        if (state == 2) return limit;
+        if (state == 1) return start.t + sqrt((real)x * (real)x + (real)y * (real)y);
+#endif
+        error += shorter;
+        if (2 * error >= longer) {
+            ++aside;
+            error -= longer;
+        }
+    }
+    return limit;
+}

@@ -1,0 +1,36 @@
+// Expected range by the plain walk of Amanatides and Woo (1987), cell by cell: exact, and the same bits as the exact
+// caster's. The table holds 1 for occupied cells in a ring of twos.
+// requires: squares ray
+
+typedef uchar entry;
+
+// Distance in cells to the first occupied cell, or limit where there is none nearer.
+real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
+              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+    const Ray r = make_ray(pose, ray);
+#if OUTSIDE_OCCUPIED
+#if ORIGINS_OUTSIDE
+    if (off_grid(cell.x, cell.y, rows, cols)) return 0;
+#endif
+#endif
+    const Walk start = start_walk(r, cell, rows, cols, limit);
+    int k_x = start.k_x, k_y = start.k_y;
+    real t = start.t;
+    if (t >= limit) return limit;
+    for (;;) {
+        const int state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, cols)];
+#if OUTSIDE_OCCUPIED
+        if (state != 0) return t;
+#else
+        if (state != 0) return state == 1 ? t : limit;
+#endif
+        const real t_x = ((real)k_x + r.a_x) * r.inv_x;
+        const real t_y = ((real)k_y + r.a_y) * r.inv_y;
+        t = t_x <= t_y ? t_x : t_y;
+        if (t >= limit) return limit;
+        if (t_x <= t_y)
+            ++k_x;
+        else
+            ++k_y;
+    }
+}

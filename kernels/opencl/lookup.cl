@@ -1,0 +1,30 @@
+// Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed"):
+// for each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+// requires: ray
+
+typedef ushort entry;
+
+// Distance in cells as the table has it, or limit where there is no obstacle nearer.
+real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
+              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+    int col = cell.x, row = cell.y;
+    const Ray r = make_ray(pose, ray);
+    real t = 0;
+#if ORIGINS_OUTSIDE
+    if (off_grid(cell.x, cell.y, rows, cols)) {
+#if OUTSIDE_OCCUPIED
+        return 0;
+#else
+        const Walk start = start_walk(r, cell, rows, cols, limit);
+        if (start.t >= limit) return limit;
+        t = start.t;
+        col += r.step_x * start.k_x;
+        row += r.step_y * start.k_y;
+#endif
+    }
+#endif
+    const int part = map_table[((long)row * cols + col) * bins + angle_bin(r.direction, bins)];
+    if (part == 65535) return limit;
+    t += (real)part * (limit / (real)65535);
+    return t < limit ? t : limit;
+}

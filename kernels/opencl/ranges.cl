@@ -1,0 +1,13 @@
+// Expected ranges of poses and bearings by any caster.
+// requires: caster
+
+// One work-item a particle and ray.
+kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
+                        global const real2 *ray, global real *ranges, const int rows, const int cols,
+                        const int particles, const int rays, const int bins, const real slack, const real tolerance,
+                        const real limit, const real resolution, const real range_max) {
+    const int k = get_global_id(0), n = get_global_id(1);
+    if (k >= rays || n >= particles) return;
+    const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance);
+    ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
+}

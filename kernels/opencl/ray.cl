@@ -1,0 +1,113 @@
+// A ray on the grid and the walk along it, which all casters share. Crossing distances are (k + a) * inv with an integer
+// count k of boundaries, never accumulated.
+// Casts and comparisons stand where floor, ceil, fmin and fmax would do: some drivers call those as functions.
+
+// Smallest direction component that is told from zero: its inverse must be finite.
+#define TINY ((real)1e-30)
+
+// Direction of a ray in the grid's frame, of unit length: sign, size and inverse of each component, and the distance in
+// x and y to the first boundaries.
+typedef struct {
+    real2 direction;
+    int right, up, step_x, step_y;
+    real speed_x, speed_y, inv_x, inv_y, a_x, a_y;
+} Ray;
+
+// How far a walk is: boundaries crossed in x and y, and the distance in cells.
+typedef struct {
+    int k_x, k_y;
+    real t;
+} Walk;
+
+// pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
+real2 ray_direction(const real4 pose, const real2 ray) {
+    const real dx = pose.z * ray.x - pose.w * ray.y;
+    const real dy = pose.w * ray.x + pose.z * ray.y;
+    return (real2)(fabs(dx) < TINY ? (real)0 : dx, fabs(dy) < TINY ? (real)0 : dy);
+}
+
+Ray make_ray(const real4 pose, const real2 ray) {
+    Ray r;
+    r.direction = ray_direction(pose, ray);
+    r.right = r.direction.x >= 0, r.up = r.direction.y >= 0;
+    r.step_x = r.right ? 1 : -1, r.step_y = r.up ? 1 : -1;
+    r.speed_x = fabs(r.direction.x), r.speed_y = fabs(r.direction.y);
+    r.inv_x = (real)1 / r.speed_x, r.inv_y = (real)1 / r.speed_y;
+    r.a_x = r.right ? (real)1 - pose.x : pose.x, r.a_y = r.up ? (real)1 - pose.y : pose.y;
+    return r;
+}
+
+// Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t. The guess is off by one at most.
+int crossed_before(const real t, const real speed, const real a, const real inv) {
+    const real place = t * speed - a;
+    const int whole = (int)place;
+    const int above = whole + ((real)whole < place);
+    const int guess = above < 0 ? 0 : above;
+    if (((real)guess + a) * inv < t) return guess + 1;
+    if (guess > 0 && ((real)(guess - 1) + a) * inv >= t) return guess - 1;
+    return guess;
+}
+
+// The same, those at t included.
+int crossed_until(const real t, const real speed, const real a, const real inv) {
+    const real place = t * speed - a;
+    const int whole = (int)place;
+    const int guess = whole - ((real)whole > place) + 1;
+    if (((real)guess + a) * inv <= t) return guess + 1;
+    if (guess > 0 && ((real)(guess - 1) + a) * inv > t) return guess - 1;
+    return guess;
+}
+
+// Whether a cell is none of the grid's.
+int off_grid(const int col, const int row, const int rows, const int cols) {
+    return col < 0 || col >= cols || row < 0 || row >= rows;
+}
+
+// The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a ray
+// from outside meets the grid no nearer.
+Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, const real limit) {
+    Walk walk = {0, 0, 0};
+#if ORIGINS_OUTSIDE
+    if (off_grid(cell.x, cell.y, rows, cols)) {
+        const int enter_x = max(r.right ? -cell.x : cell.x - (cols - 1), 0);
+        const int enter_y = max(r.up ? -cell.y : cell.y - (rows - 1), 0);
+        const real enter_t_x = enter_x > 0 ? ((real)(enter_x - 1) + r.a_x) * r.inv_x : (real)-1;
+        const real enter_t_y = enter_y > 0 ? ((real)(enter_y - 1) + r.a_y) * r.inv_y : (real)-1;
+        const real t = enter_t_x > enter_t_y ? enter_t_x : enter_t_y;
+        walk.t = limit;
+        if (!(t >= 0 && t < limit)) return walk;
+        if (enter_t_x > enter_t_y) {
+            walk.k_x = enter_x;
+            walk.k_y = crossed_before(t, r.speed_y, r.a_y, r.inv_y);
+        } else {
+            walk.k_y = enter_y;
+            walk.k_x = crossed_until(t, r.speed_x, r.a_x, r.inv_x);
+        }
+        if (!off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols)) walk.t = t;
+    }
+#endif
+    return walk;
+}
+
+// Direction as a part of a full turn in [0, 1], to 2e-6: Abramowitz and Stegun 4.4.49 for the arc tangent.
+real turn_of(const real2 direction) {
+    const real x = fabs(direction.x), y = fabs(direction.y);
+    const real a = x > y ? y / x : x / y, s = a * a;
+    const real tail = (real)0.02867033 + s * ((real)-0.01354934 + s * (real)0.00331601);
+    const real eighth = a * ((real)0.15913362 + s * ((real)-0.05256880 + s * tail));
+    const real quarter = x > y ? eighth : (real)0.25 - eighth;
+    const real upper = direction.x >= 0 ? quarter : (real)0.5 - quarter;
+    return direction.y >= 0 ? upper : (real)1 - upper;
+}
+
+// Angle bin whose centre is nearest; centres are at 0, 1 / bins, ... of a turn.
+int angle_bin(const real2 direction, const int bins) {
+    const int bin = (int)(turn_of(direction) * (real)bins + (real)0.5);
+    return bin >= bins ? bin - bins : bin;
+}
+
+// Metres from cells: exactly range_max where nothing is nearer.
+real expected_range(const real t, const real limit, const real resolution, const real range_max) {
+    const real range = t * resolution;
+    return t >= limit || range > range_max ? range_max : range;
+}

@@ -1,0 +1,64 @@
+"""Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed"):
+for each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import ray as ray_file
+from .prelude import precision
+
+ENTRY = wp.uint16
+
+
+@functools.cache
+def functions(flags):
+    """cast_ray specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    geometry = ray_file.functions(flags)
+    make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
+    angle_bin = geometry.angle_bin
+    ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
+    OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
+    ZERO = real(0.0)
+    PARTS = real(65535.0)
+
+    # Distance in cells as the table has it, or limit where there is no obstacle nearer.
+    @wp.func
+    def cast_ray(
+        map_table: wp.array(dtype=ENTRY),
+        rows: wp.int32,
+        cols: wp.int32,
+        cell: wp.vec2i,
+        pose: vec4,
+        ray: vec2,
+        limit: real,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+    ):
+        col = int(cell.x)
+        row = int(cell.y)
+        r = make_ray(pose, ray)
+        t = real(0.0)
+        if ORIGINS_OUTSIDE:
+            if off_grid(cell.x, cell.y, rows, cols):
+                if OUTSIDE_OCCUPIED:
+                    return ZERO
+                else:
+                    start = start_walk(r, cell, rows, cols, limit)
+                    if start.t >= limit:
+                        return limit
+                    t = start.t
+                    col += r.step_x * start.k_x
+                    row += r.step_y * start.k_y
+        part = int(map_table[(row * cols + col) * bins + angle_bin(r.direction, bins)])
+        if part == 65535:
+            return limit
+        t += real(part) * (limit / PARTS)
+        return wp.min(t, limit)
+
+    return SimpleNamespace(cast_ray=cast_ray)

@@ -1,0 +1,43 @@
+"""The look-up table of expected ranges, filled by the exact caster from the centres of cells, some rows at a time."""
+
+import functools
+
+import warp as wp
+
+from . import raycast
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel fill_lookup specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    cast_ray = raycast.functions(flags).cast_ray
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+    PARTS = real(65535.0)
+
+    # One work-item a bin and cell; a hit is 65 534 parts of the limit at most. The table has fewer than 2^31 entries.
+    @kernel
+    def fill_lookup(
+        squares: wp.array(dtype=wp.uint8),
+        ray: wp.array(dtype=vec2),
+        lookup: wp.array(dtype=wp.uint16),
+        rows: wp.int32,
+        cols: wp.int32,
+        bins: wp.int32,
+        first_row: wp.int32,
+        count: wp.int32,
+        limit: real,
+    ):
+        index, bin = wp.tid()
+        if bin >= bins or index >= count * cols:
+            return
+        row = first_row + index / cols
+        col = index % cols
+        pose = vec4(HALF, HALF, ray[bin].x, ray[bin].y)
+        t = cast_ray(squares, rows, cols, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, 0, ZERO, ZERO)
+        part = int(t * (PARTS / limit) + HALF)
+        lookup[(row * cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))
+
+    return {"fill_lookup": fill_lookup}[name]

@@ -1,0 +1,54 @@
+"""Expected ranges of poses and bearings by any caster."""
+
+import functools
+
+import warp as wp
+
+from . import bresenham, cddt, dda, lookup, march, raycast
+from . import ray as ray_file
+from .prelude import kernel, precision
+
+CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
+
+
+def caster_of(flags):
+    """The kernel file whose cast_ray a set of flags means."""
+    return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel cast_ranges specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    caster = caster_of(flags)
+    ENTRY = caster.ENTRY
+    cast_ray = caster.functions(flags).cast_ray
+    expected_range = ray_file.functions(flags).expected_range
+
+    # One work-item a particle and ray, fewer than 2^31 in a launch.
+    @kernel
+    def cast_ranges(
+        map_table: wp.array(dtype=ENTRY),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        ray: wp.array(dtype=vec2),
+        ranges: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        rays: wp.int32,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+        limit: real,
+        resolution: real,
+        range_max: real,
+    ):
+        n, k = wp.tid()
+        if k >= rays or n >= particles:
+            return
+        t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance)
+        ranges[n * rays + k] = expected_range(t, limit, resolution, range_max)
+
+    return {"cast_ranges": cast_ranges}[name]

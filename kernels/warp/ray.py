@@ -1,0 +1,159 @@
+"""A ray on the grid and the walk along it, which all casters share.
+
+Crossing distances are (k + a) * inv with an integer count k of boundaries, never accumulated.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import precision
+
+
+# Whether a cell is none of the grid's.
+@wp.func
+def off_grid(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+    return col < 0 or col >= cols or row < 0 or row >= rows
+
+
+@functools.cache
+def functions(flags):
+    """The functions and the structs Ray and Walk, specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
+    ZERO, ONE, MINUS_ONE = real(0.0), real(1.0), real(-1.0)
+    QUARTER, HALF = real(0.25), real(0.5)
+    # Abramowitz and Stegun 4.4.49 for the arc tangent, in turns.
+    C1, C3, C5, C7, C9 = (real(c) for c in (0.15913362, -0.05256880, 0.02867033, -0.01354934, 0.00331601))
+    # Smallest direction component that is told from zero: its inverse must be finite.
+    TINY = real(1e-30)
+
+    # Direction of a ray in the grid's frame, of unit length: sign, size and inverse of each component, and the distance
+    # in x and y to the first boundaries.
+    @wp.struct
+    class Ray:
+        direction: vec2
+        right: wp.bool
+        up: wp.bool
+        step_x: wp.int32
+        step_y: wp.int32
+        speed_x: real
+        speed_y: real
+        inv_x: real
+        inv_y: real
+        a_x: real
+        a_y: real
+
+    # How far a walk is: boundaries crossed in x and y, and the distance in cells.
+    @wp.struct
+    class Walk:
+        k_x: wp.int32
+        k_y: wp.int32
+        t: real
+
+    # pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
+    @wp.func
+    def ray_direction(pose: vec4, ray: vec2):
+        dx = pose.z * ray.x - pose.w * ray.y
+        dy = pose.w * ray.x + pose.z * ray.y
+        return vec2(wp.where(wp.abs(dx) < TINY, ZERO, dx), wp.where(wp.abs(dy) < TINY, ZERO, dy))
+
+    @wp.func
+    def make_ray(pose: vec4, ray: vec2):
+        r = Ray()
+        r.direction = ray_direction(pose, ray)
+        r.right = r.direction.x >= ZERO
+        r.up = r.direction.y >= ZERO
+        r.step_x = wp.where(r.right, 1, -1)
+        r.step_y = wp.where(r.up, 1, -1)
+        r.speed_x = wp.abs(r.direction.x)
+        r.speed_y = wp.abs(r.direction.y)
+        r.inv_x = ONE / r.speed_x
+        r.inv_y = ONE / r.speed_y
+        r.a_x = wp.where(r.right, ONE - pose.x, pose.x)
+        r.a_y = wp.where(r.up, ONE - pose.y, pose.y)
+        return r
+
+    # Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t. The guess is off by one at most.
+    @wp.func
+    def crossed_before(t: real, speed: real, a: real, inv: real):
+        guess = wp.max(int(wp.ceil(t * speed - a)), 0)
+        if (real(guess) + a) * inv < t:
+            return guess + 1
+        if guess > 0 and (real(guess - 1) + a) * inv >= t:
+            return guess - 1
+        return guess
+
+    # The same, those at t included.
+    @wp.func
+    def crossed_until(t: real, speed: real, a: real, inv: real):
+        guess = wp.max(int(wp.floor(t * speed - a)) + 1, 0)
+        if (real(guess) + a) * inv <= t:
+            return guess + 1
+        if guess > 0 and (real(guess - 1) + a) * inv > t:
+            return guess - 1
+        return guess
+
+    # The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a
+    # ray from outside meets the grid no nearer.
+    @wp.func
+    def start_walk(r: Ray, cell: wp.vec2i, rows: wp.int32, cols: wp.int32, limit: real):
+        walk = Walk()
+        if ORIGINS_OUTSIDE:
+            if off_grid(cell.x, cell.y, rows, cols):
+                enter_x = wp.max(wp.where(r.right, -cell.x, cell.x - (cols - 1)), 0)
+                enter_y = wp.max(wp.where(r.up, -cell.y, cell.y - (rows - 1)), 0)
+                enter_t_x = wp.where(enter_x > 0, (real(enter_x - 1) + r.a_x) * r.inv_x, MINUS_ONE)
+                enter_t_y = wp.where(enter_y > 0, (real(enter_y - 1) + r.a_y) * r.inv_y, MINUS_ONE)
+                t = wp.max(enter_t_x, enter_t_y)
+                walk.t = limit
+                if t >= ZERO and t < limit:
+                    if enter_t_x > enter_t_y:
+                        walk.k_x = enter_x
+                        walk.k_y = crossed_before(t, r.speed_y, r.a_y, r.inv_y)
+                    else:
+                        walk.k_y = enter_y
+                        walk.k_x = crossed_until(t, r.speed_x, r.a_x, r.inv_x)
+                    if not off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols):
+                        walk.t = t
+        return walk
+
+    # Direction as a part of a full turn in [0, 1], to 2e-6.
+    @wp.func
+    def turn_of(direction: vec2):
+        x = wp.abs(direction.x)
+        y = wp.abs(direction.y)
+        a = wp.where(x > y, y / x, x / y)
+        s = a * a
+        tail = C5 + s * (C7 + s * C9)
+        eighth = a * (C1 + s * (C3 + s * tail))
+        quarter = wp.where(x > y, eighth, QUARTER - eighth)
+        upper = wp.where(direction.x >= ZERO, quarter, HALF - quarter)
+        return wp.where(direction.y >= ZERO, upper, ONE - upper)
+
+    # Angle bin whose centre is nearest; centres are at 0, 1 / bins, ... of a turn.
+    @wp.func
+    def angle_bin(direction: vec2, bins: wp.int32):
+        found = int(turn_of(direction) * real(bins) + HALF)
+        return wp.where(found >= bins, found - bins, found)
+
+    # Metres from cells: exactly range_max where nothing is nearer.
+    @wp.func
+    def expected_range(t: real, limit: real, resolution: real, range_max: real):
+        return wp.where(t >= limit, range_max, wp.min(t * resolution, range_max))
+
+    return SimpleNamespace(
+        Ray=Ray,
+        Walk=Walk,
+        off_grid=off_grid,
+        ray_direction=ray_direction,
+        make_ray=make_ray,
+        crossed_before=crossed_before,
+        crossed_until=crossed_until,
+        start_walk=start_walk,
+        turn_of=turn_of,
+        angle_bin=angle_bin,
+        expected_range=expected_range,
+    )

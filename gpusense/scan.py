@@ -98,7 +98,14 @@ def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
 
 
 def prepare_scan(
-    ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float, beams: Beams, specialize: bool
+    ranges: np.ndarray,
+    scanner: Scanner,
+    vectors: np.ndarray,
+    z_max: float,
+    beams: Beams,
+    specialize: bool,
+    *,
+    max_is_range: bool = False,
 ) -> PreparedScan:
     """Class, choose and group the readings of one scan.
 
@@ -109,8 +116,12 @@ def prepare_scan(
         z_max: Probability of a max reading; 0 makes it missing.
         beams: Which beams are used.
         specialize: False keeps readings without information, and casts equal bearings one by one.
+        max_is_range: Evaluate finite max readings like ranges, at range_max.
     """
     kinds = classify(ranges, scanner)
+    if max_is_range:
+        kinds[(kinds == Reading.MAX) & np.isfinite(ranges)] = Reading.HIT
+        ranges = np.minimum(ranges, scanner.range_max)
     used = choose_beams(kinds, beams, z_max > 0)
     is_max = used & (kinds == Reading.MAX)
     hit = used & (kinds == Reading.HIT)

@@ -149,7 +149,7 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
             for shift in itertools.product((-guard, guard), repeat=2):
                 moved = _replay_field(launch, values, shift)
                 parts = np.where(np.abs(moved - like) < np.abs(parts - like), moved, parts)
-        return sum_terms(parts, values["fixed"], values["temperature"]), parts
+        return sum_terms(launch.flags, parts, values["fixed"], values["temperature"]), parts
 
 
 def _replay_beams(launch: Launch, values: dict[str, Any]) -> np.ndarray:

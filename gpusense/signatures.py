@@ -29,6 +29,8 @@ FLAGS = {
     "CDDT": "rays are cast through a compressed directional distance transform",
     "LOOKUP": "ranges come from a look-up table",
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
+    "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
+    "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "PER_BEAM": "the log-likelihood of each reading is wanted",

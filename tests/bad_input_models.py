@@ -27,6 +27,8 @@ MODEL = gs.BeamModel(GRID, SCANNER, backend="numpy")
 FIELD = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
 CASTER = gs.RayCaster(GRID, 5.0, backend="numpy")
 
+CASTERS = "'exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup'"
+
 
 def beam(**changes: Any) -> Action:
     """Make a beam model of which some arguments are bad."""
@@ -104,14 +106,14 @@ MODEL_CASES = [
         ValueError,
         "z_hit + z_short + z_max + z_rand: must be 1 within 1e-06, got 0.9",
     ),
-    ("beam-caster-magic", beam(caster="magic"), ValueError, "caster: must be one of 'exact', got 'magic'"),
-    ("beam-caster-none", beam(caster=None), TypeError, "caster: must be one of 'exact', got None"),
+    ("beam-caster-magic", beam(caster="magic"), ValueError, f"caster: must be one of {CASTERS}, got 'magic'"),
+    ("beam-caster-number", beam(caster=3), TypeError, f"caster: must be one of {CASTERS}, got 3"),
     ("beam-precision-float16", beam(precision="float16"), ValueError, FLOATS("'float16'")),
     ("field-precision-dtype", field(precision=np.float32), TypeError, FLOATS("<class 'numpy.float32'>")),
     ("beam-unknown-maybe", beam(unknown="maybe"), ValueError, UNKNOWN("'maybe'")),
     ("field-unknown-bool", field(unknown=True), TypeError, UNKNOWN("True")),
     ("beam-outside-max", beam(outside="max"), ValueError, OUTSIDE("'max'")),
-    ("field-outside-none", field(outside=None), TypeError, OUTSIDE("None")),
+    ("field-outside-number", field(outside=3), TypeError, OUTSIDE("3")),
     ("beam-temperature-0", beam(temperature=0), ValueError, TEMPERATURE("0")),
     ("beam-temperature-2", beam(temperature=2), ValueError, TEMPERATURE("2")),
     ("field-temperature-nan", field(temperature=NAN), ValueError, TEMPERATURE("nan")),
@@ -131,7 +133,7 @@ MODEL_CASES = [
     ("beam-beams-ragged", beam(beams=[[0], [1, 2]]), TypeError, NO_BEAMS("[[0], [1, 2]]")),
     ("beam-beams-beyond", beam(beams=[0, 3]), ValueError, "beams: indices must be in [0, 3), got 3"),
     ("beam-beams-from-the-end", beam(beams=[-1]), ValueError, "beams: indices must be in [0, 3), got -1"),
-    ("beam-compat", beam(compat="amcl"), ValueError, "compat: must be None in this version, got 'amcl'"),
+    ("beam-compat", beam(compat="mrpt"), ValueError, "compat: must be one of 'amcl', 'beluga', got 'mrpt'"),
     ("beam-specialize-1", beam(specialize=1), TypeError, "specialize: must be True or False, got 1"),
     ("field-specialize-none", field(specialize=None), TypeError, "specialize: must be True or False, got None"),
     (
@@ -225,7 +227,7 @@ CASTER_CASES = [
         ValueError,
         "range_max: must be at most 4194304 cells of the grid, got 10000000",
     ),
-    ("caster-method", caster(method="bresenham"), ValueError, "method: must be one of 'exact', got 'bresenham'"),
+    ("caster-method", caster(method="embree"), ValueError, f"method: must be one of {CASTERS}, got 'embree'"),
     ("caster-precision", caster(precision="double"), ValueError, FLOATS("'double'")),
     ("caster-unknown", caster(unknown=True), TypeError, UNKNOWN("True")),
     ("caster-outside", caster(outside="clip"), ValueError, OUTSIDE("'clip'")),

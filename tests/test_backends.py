@@ -76,6 +76,18 @@ def test_a_backend_name_alone_prefers_a_gpu_and_refuses_simulators(monkeypatch):
         backends._find("opencl")
 
 
+def test_a_driver_is_named_like_a_device(monkeypatch):
+    """Intel's driver on any processor, and on Intel's own rather than another driver for it."""
+    rows = [("AMD EPYC", "Portable Computing Language 3.0"), ("AMD EPYC", "Intel(R) OpenCL 2026")]
+    own = [backends.Device("opencl", name, "cpu", True, "", f"opencl:{i}:0", d) for i, (name, d) in enumerate(rows)]
+    monkeypatch.setattr(backends, "_devices_of", lambda backend: own)
+    assert backends._find("opencl:intel") == "opencl:1:0"
+    assert backends._find("opencl:portable") == "opencl:0:0"
+    own[0] = backends.Device("opencl", "Intel Xeon", "cpu", True, "", "opencl:0:0", rows[0][1])
+    own[1] = backends.Device("opencl", "Intel Xeon", "cpu", True, "", "opencl:1:0", rows[1][1])
+    assert backends._find("opencl:intel") == "opencl:1:0"
+
+
 def test_one_device_has_one_backend():
     assert get_backend("numpy") is get_backend("numpy")
     assert get_backend(get_backend("numpy")) is get_backend("numpy")

@@ -26,7 +26,7 @@ def test_messages_are_one_line_that_names_the_argument():
     for name, _, _, message in CASES:
         text = message if isinstance(message, str) else message()
         argument, rule = text.split(": ", 1)
-        assert " must " in f" {rule}" and ", got " in rule and "\n" not in text, name
+        assert (" must " in f" {rule}" or "is not installed" in rule) and ", got " in rule and "\n" not in text, name
         assert argument.replace(" + ", "").isidentifier(), name
 
 

@@ -1,13 +1,14 @@
 """Where kernels run: the devices of this machine, and a backend for each.
 
 Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (platform and device number),
-``"opencl:<part of a device's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``.
+``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib.util
+import os
 import re
 import threading
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ class Device:
         available: Whether a model can run on it.
         reason: Why not, with the command that mends it; empty where it is available.
         selection: What to pass as ``backend=``; empty where it is absent.
+        driver: The name and version of what compiles for it; empty where it is absent.
     """
 
     backend: str
@@ -45,6 +47,7 @@ class Device:
     available: bool
     reason: str
     selection: str
+    driver: str = ""
 
 
 def devices() -> list[Device]:
@@ -62,15 +65,21 @@ def _devices_of(backend: str) -> list[Device]:
     found = []
     for info, _ in module.list_devices():
         simulated = backend == "opencl" and module.is_simulator(info.name)
-        found.append(Device(backend, info.name, "simulator" if simulated else info.kind, True, "", info.selection))
+        kind = "simulator" if simulated else info.kind
+        found.append(Device(backend, info.name, kind, True, "", info.selection, info.driver))
     if not found:
-        found.append(
-            Device(backend, f"{backend} (no device)", "cpu", False, f"no driver offers a device: {install}", "")
-        )
+        found.append(Device(backend, f"{backend} (no device)", "cpu", False, f"{_why_none()}: {install}", ""))
     elif backend == "warp" and all(device.kind == "cpu" for device in found):
         reason = "Warp sees no CUDA device: install NVIDIA's driver"
         found.append(Device("warp", "CUDA (absent)", "gpu", False, reason, ""))
     return found
+
+
+def _why_none() -> str:
+    """Why no driver offers a device; the variable that hides drivers is named where it is set."""
+    folder = os.environ.get("OCL_ICD_VENDORS")
+    hidden = f" (drivers are looked for in OCL_ICD_VENDORS={folder} alone)" if folder else ""
+    return f"no driver offers a device{hidden}"
 
 
 def _module(backend: str) -> tuple[ModuleType | None, str]:
@@ -158,7 +167,11 @@ def _choose(head: str, rest: str, own: list[Device], selection: str) -> str:
     for device in own:
         if device.selection == selection:
             return selection
-    matches = [] if re.fullmatch(r"[\d:]+", rest) else [d for d in own if rest.lower() in d.name.lower()]
+    word = rest.lower()
+    named = [(device, (word in device.name.lower()) + (word in device.driver.lower())) for device in own]
+    named = [] if re.fullmatch(r"[\d:]+", rest) else [pair for pair in named if pair[1]]
+    # A word of both, such as "intel" on a processor of Intel's, means Intel's driver rather than another one for it.
+    matches = [device for device, _ in sorted(named, key=lambda pair: -pair[1])]
     if head == "warp":
         matches = [device for device in own if device.selection.startswith(f"warp:{rest}:")]
     if not matches:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["check_writable", "write_whole"]
 
 BACKEND_HELP = (
-    "where it runs: auto (the fastest device present), numpy, opencl, opencl:<part of a device's name>, "
+    "where it runs: auto (the fastest device present), numpy, opencl, opencl:<part of a device's or driver's name>, "
     "opencl:<platform>:<device>, warp:cpu or warp:cuda:<number>; 'gpusense devices' lists what is here"
 )
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gpusense import _checks, casters
+from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
@@ -44,16 +45,17 @@ class BeamModel(ScanModel):
         parameters: Weights and shapes of the mixture.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
-        caster: How expected ranges are found: ``"exact"``, another name of ``RayCaster.methods()``, or one of
-            ``gpusense.casters`` with knobs of its own.
+        caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
+            one of ``gpusense.casters`` with knobs of its own.
         sensor_table: None evaluates the mixture; a number tabulates log p over readings and expected ranges in bins of
             that width [m], at least range_max / 8192, as racing particle filters do.
-        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
+        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
+        outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
         temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
             independent. 1 is the book's plain product.
         beams: Use only so many informative beams, evenly chosen, or the beams of these indices.
-        compat: None.
+        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights that these programs compute, with their defaults of
+            parameters, caster, unknown and outside; see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:
@@ -69,27 +71,37 @@ class BeamModel(ScanModel):
         *,
         backend: str | Backend = "auto",
         precision: str = "float32",
-        caster: str | Caster = "exact",
+        caster: str | Caster | None = None,
         sensor_table: float | None = None,
-        unknown: str = "free",
-        outside: str = "free",
+        unknown: str | None = None,
+        outside: str | None = None,
         temperature: float = 1.0,
         beams: Beams = None,
-        compat: None = None,
+        compat: str | None = None,
         specialize: bool = True,
     ) -> None:
-        self.parameters = BeamParameters() if parameters is None else parameters
+        peer = compat_module.choose(compat)
+        default = BeamParameters() if peer is None else peer.beam
+        self.parameters = default if parameters is None else parameters
         if not isinstance(self.parameters, BeamParameters):
             raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(parameters)}")
-        method = casters.choose("caster", caster)
+        compat_module.check_weights(self.parameters, compat)
+        if peer is not None:
+            caster = "bresenham" if caster is None else caster
+            unknown, outside = unknown or "occupied", outside or peer.outside
+            if sensor_table is not None:
+                raise ValueError(f"sensor_table: must be None with compat, got {_checks.show(sensor_table)}")
+        method = casters.choose("caster", "exact" if caster is None else caster)
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
+            end_points=False,
         )  # fmt: skip
         self._caster = MapCaster(
             self._backend, self._real, grid, scanner.mount, scanner.range_max, method,
-            unknown=unknown, outside=outside, crop=specialize,
+            unknown=self.unknown, outside=self.outside, crop=specialize,
         )  # fmt: skip
+        self._lead = 0.0 if peer is None else peer.beam_lead
         self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
         self._sensor, self._cells = self._tabulate(sensor_table)
@@ -139,7 +151,9 @@ class BeamModel(ScanModel):
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
-        if self.sensor_table is not None:
+        if self._peer is not None:
+            omissions.append(Omission("normalised density", f"compat='{self.compat}' sums cubes", "the likelihood"))
+        elif self.sensor_table is not None:
             why = f"log p is tabulated over {self._cells} x {self._cells + 1} bins of readings and expected ranges"
             omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
         elif "SHARP" not in self._components:
@@ -150,11 +164,25 @@ class BeamModel(ScanModel):
             )
         if (far := self._caster.omission()) is not None:
             omissions.append(far)
-        title = f"beam model, {self.precision}, {self.device.selection} ({self.device.name})"
+        title = f"beam model{self._peer_note()}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
+
+    def _peer_mixture(self) -> tuple[frozenset[str], np.ndarray]:
+        """Flags and numbers of the kernel file ``compat``."""
+        p, range_max = self.parameters, self.scanner.range_max
+        flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}
+        hit = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        if self.compat == "amcl":
+            flags.add("AMCL")
+            hit = p.z_hit
+        shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
+        terms = [hit, *shape, p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
+        return frozenset(flags), rounded_terms(terms, self._real)
 
     def _mixture(self) -> tuple[frozenset[str], np.ndarray]:
         """Flags of the components, and the numbers of the kernel file ``mixture``."""
+        if self._peer is not None:
+            return self._peer_mixture()
         p, range_max = self.parameters, self.scanner.range_max
         weights = {"HIT": p.z_hit, "SHORT": p.z_short, "RAND": p.z_rand}
         flags = {name for name, weight in weights.items() if weight > 0 or not self._specialize}
@@ -215,7 +243,7 @@ class BeamModel(ScanModel):
                 (count,), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, first,
                 reading, terms, self._sensor, result, parts, region.rows, region.cols, count, rays, readings,
                 *self._caster.scalars, self._cells, self._cells / self.scanner.range_max, self._caster.limit,
-                self.grid.resolution, self.scanner.range_max, scan.constant, self.temperature,
+                self.grid.resolution, self.scanner.range_max, scan.constant + self._lead, self.temperature,
             )  # fmt: skip
             self._backend.download(result, log_p)
             each = np.empty((count, readings if per_beam else 0), real)

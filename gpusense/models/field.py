@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gpusense import _checks
+from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.frames import split
@@ -37,11 +38,12 @@ class LikelihoodFieldModel(ScanModel):
         parameters: Weights, deviation, cap and interpolation.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
-        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: ``"free"``, or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
+        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
+        outside: ``"free"`` (the default), or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
         temperature: In (0, 1]: multiplies the sum over beams. 1 is the book's plain product.
         beams: Use only so many informative beams, evenly chosen, or the beams of these indices.
-        compat: None.
+        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights that these programs compute, with their default
+            parameters; see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:
@@ -57,27 +59,34 @@ class LikelihoodFieldModel(ScanModel):
         *,
         backend: str | Backend = "auto",
         precision: str = "float32",
-        unknown: str = "free",
-        outside: str = "free",
+        unknown: str | None = None,
+        outside: str | None = None,
         temperature: float = 1.0,
         beams: Beams = None,
-        compat: None = None,
+        compat: str | None = None,
         specialize: bool = True,
     ) -> None:
-        self.parameters = LikelihoodFieldParameters() if parameters is None else parameters
+        peer = compat_module.choose(compat)
+        default = LikelihoodFieldParameters() if peer is None else peer.field
+        self.parameters = default if parameters is None else parameters
         if not isinstance(self.parameters, LikelihoodFieldParameters):
             raise TypeError(f"parameters: must be LikelihoodFieldParameters, got {_checks.show(parameters)}")
+        compat_module.check_weights(self.parameters, compat)
+        if peer is not None:
+            _checks.choice("interpolation", self.parameters.interpolation, ("nearest",))
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
+            end_points=True,
         )  # fmt: skip
         p = self.parameters
         self._bilinear = p.interpolation == "bilinear"
-        self._log_table = specialize and not self._bilinear
+        self._lead = 0.0 if peer is None else 1.0
+        self._log_table = (specialize or peer is not None) and not self._bilinear
         self._flags, self._terms = self._mixture()
         reach = (scanner.range_max + p.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self._backend, grid, unknown, scanner.mount, reach, self._prepare_table, crop=specialize
+            self._backend, grid, self.unknown, scanner.mount, reach, self._prepare_table, crop=specialize
         )
 
     def explain(self) -> str:
@@ -104,7 +113,7 @@ class LikelihoodFieldModel(ScanModel):
             omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))
         if (far := self._map.omission(self._real.itemsize)) is not None:
             omissions.append(far)
-        title = f"likelihood field, {self.precision}, {self.device.selection} ({self.device.name})"
+        title = f"likelihood field{self._peer_note()}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
 
     def _mixture(self) -> tuple[frozenset[str], np.ndarray]:
@@ -114,6 +123,7 @@ class LikelihoodFieldModel(ScanModel):
         flags |= {"BILINEAR"} if self._bilinear else set()
         flags |= {"LOG_TABLE"} if self._log_table else set()
         flags |= {"CAREFUL"} if self._real == np.float32 else set()
+        flags |= {"CUBES"} if self._peer is not None else set()
         flags |= {"HIT"} if p.z_hit > 0 or not self._specialize else set()
         rand = p.z_rand / range_max
         scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
@@ -132,7 +142,16 @@ class LikelihoodFieldModel(ScanModel):
         """What the table holds for squared cell distances: log densities, or distances in metres. float64."""
         p = self.parameters
         distance = np.minimum(np.sqrt(squared) * self.grid.resolution, p.max_distance)
+        if self._peer is not None:
+            return self._cubes(distance)
         return self._log_density(distance) if self._log_table else distance
+
+    def _cubes(self, distance: np.ndarray) -> np.ndarray:
+        """What the peer sums: the cube of its density at a distance."""
+        p, amcl = self.parameters, self.compat == "amcl"
+        hit = p.z_hit if amcl else p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        density = hit * np.exp(-0.5 * (distance / p.sigma_hit) ** 2) + p.z_rand / self.scanner.range_max
+        return np.asarray(density**3)
 
     def _log_density(self, distance: np.ndarray) -> np.ndarray:
         p = self.parameters
@@ -147,6 +166,8 @@ class LikelihoodFieldModel(ScanModel):
         check_size(rows, cols)
         p = self.parameters
         beyond = self._values(np.array([0.0 if self.outside == "occupied" else np.inf])).astype(self._real)
+        if self.compat == "beluga" and self.outside == "free":
+            beyond[:] = 1 / self.scanner.range_max**3
         size = (rows + 2 * _RING, cols + 2 * _RING)
         reach, diagonal = p.max_distance / self.grid.resolution, rows * rows + cols * cols
         farthest = diagonal if reach * reach >= diagonal else math.floor(reach * reach) + 1
@@ -199,7 +220,7 @@ class LikelihoodFieldModel(ScanModel):
             self._backend.compile("score_field", flags)(
                 (count,), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose),
                 space.upload("pose_low", placed.low if careful else placed.low[:1]), point, point_low, terms, result,
-                parts, region.rows, region.cols, count, readings, guard, scan.constant, self.temperature,
+                parts, region.rows, region.cols, count, readings, guard, scan.constant + self._lead, self.temperature,
             )  # fmt: skip
             self._backend.download(result, log_p)
             each = np.empty((count, readings if per_beam else 0), real)

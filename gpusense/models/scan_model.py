@@ -11,6 +11,7 @@ from typing import Literal, overload
 import numpy as np
 
 from gpusense import _checks
+from gpusense import compat as compat_module
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.frames import Mount, PlacedPoses, place_poses, ray_vectors
 from gpusense.grid import OccupancyGrid
@@ -150,24 +151,27 @@ class ScanModel(ABC):
         *,
         backend: str | Backend,
         precision: str,
-        unknown: str,
-        outside: str,
+        unknown: str | None,
+        outside: str | None,
         temperature: float,
         beams: Beams,
-        compat: None,
+        compat: str | None,
         specialize: bool,
         z_max: float,
+        end_points: bool,
     ) -> None:
         if not isinstance(scanner, Scanner):
             raise TypeError(f"scanner: must be a Scanner, got {_checks.show(scanner)}")
         self.grid = check_scene(grid, scanner.range_max)
         self.scanner = scanner
-        self.unknown = _checks.choice("unknown", unknown, ("free", "occupied"))
-        self.outside = _checks.choice("outside", outside, ("free", "occupied"))
+        self._peer = compat_module.choose(compat)
+        # What the sum over beams begins with, and whether readings are end points.
+        self._lead, self._end_points = 0.0, end_points
+        self.compat = compat
+        self.unknown = _checks.choice("unknown", "free" if unknown is None else unknown, ("free", "occupied"))
+        self.outside = _checks.choice("outside", "free" if outside is None else outside, ("free", "occupied"))
         self.temperature = _checks.real("temperature", temperature, above=0, high=1)
         self.beams = check_beams(beams, scanner.count)
-        if compat is not None:
-            raise ValueError(f"compat: must be None in this version, got {_checks.show(compat)}")
         if not isinstance(specialize, bool):
             raise TypeError(f"specialize: must be True or False, got {_checks.show(specialize)}")
         self._specialize = specialize
@@ -177,7 +181,7 @@ class ScanModel(ABC):
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
         self._vectors = ray_vectors(scanner.bearings, scanner.mount)
-        self._z_max = z_max
+        self._z_max = z_max if self._peer is None else 0.0
         self._last_scan: PreparedScan | None = None
         self._last_code: frozenset[str] = frozenset()
 
@@ -217,7 +221,8 @@ class ScanModel(ABC):
 
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
-            each max reading. With ``per_beam`` also (N, K) or (S, N, K) parts; left-out readings have 0.
+            each max reading. With ``per_beam`` also (N, K) or (S, N, K) parts; left-out readings have 0. With
+            ``compat`` the logarithm of a particle's weight, and the cubes that it sums.
 
         Raises:
             TypeError: an argument does not hold real numbers.
@@ -245,7 +250,12 @@ class ScanModel(ABC):
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
 
     def _score_scan(self, poses: np.ndarray, ranges: np.ndarray, per_beam: bool) -> tuple[np.ndarray, np.ndarray]:
-        scan = prepare_scan(ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize)
+        if self._peer is not None:
+            ranges = self._peer.readings(ranges, self.scanner, self._end_points)
+        scan = prepare_scan(
+            ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize,
+            max_is_range=self._peer is not None,
+        )  # fmt: skip
         self._last_scan = scan
         count, used = len(poses), len(scan.readings)
         log_p = np.empty(count, self._real)
@@ -253,10 +263,11 @@ class ScanModel(ABC):
         if per_beam and len(scan.max_columns):
             parts[:, scan.max_columns] = log_weight(self._z_max)
         if used == 0:
-            log_p[:] = self.temperature * scan.constant
+            with np.errstate(divide="ignore"):
+                log_p[:] = self.temperature * (scan.constant if self._peer is None else np.log(self._lead))
             return log_p, parts
         hits = scan.columns[np.isfinite(scan.readings)]
-        if len(hits) and self._impossible():
+        if len(hits) and self._peer is None and self._impossible():
             log_p[:] = -np.inf
             if per_beam:
                 parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)
@@ -280,6 +291,9 @@ class ScanModel(ABC):
     @abstractmethod
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
         """What scores (n, 3) poses into a log-likelihood array and returns (n, M) parts where they are wanted."""
+
+    def _peer_note(self) -> str:
+        return "" if self._peer is None else f" with the weights of {self.compat} (no likelihood)"
 
     def _scene_flags(self) -> set[str]:
         flags = {"FLOAT64"} if self._real == np.float64 else set()

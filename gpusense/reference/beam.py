@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.reference.compat import compat_density
 from gpusense.reference.error_free import BLOCK_TERMS, add_term
 from gpusense.reference.mixture import log_density
 from gpusense.reference.ranges import cast_ranges
@@ -51,7 +52,9 @@ def score_beams(
         )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        if "SENSOR_TABLE" in flags:
+        if "CUBES" in flags:
+            term = compat_density(flags, z, expected, terms) ** 3
+        elif "SENSOR_TABLE" in flags:
             term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
         else:
             term = log_density(flags, z, expected, terms)
@@ -59,11 +62,11 @@ def score_beams(
             term = np.where(np.isnan(z), 0, np.where(np.isinf(z), terms[7], term)).astype(real)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
-        log_p[begin:end] = sum_terms(term, fixed, temperature)
+        log_p[begin:end] = sum_terms(flags, term, fixed, temperature)
 
 
-def sum_terms(term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:
-    """Sum of (M, K) terms and a fixed one, in the order of the beams; -inf where one term is.
+def sum_terms(flags: frozenset[str], term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:
+    """Sum of (M, K) terms and a fixed one, in the order of the beams, or its logarithm; -inf where one term is.
 
     BLOCK_TERMS terms are added plainly, then the block's sum to a compensated total.
     """
@@ -74,4 +77,6 @@ def sum_terms(term: np.ndarray, fixed: np.floating, temperature: np.floating) ->
         for k in range(first, min(first + BLOCK_TERMS, term.shape[1])):
             block += finite[:, k]
         total = add_term(total, block)
-    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * (total[0] + total[1]))
+    scan = total[0] + total[1]
+    scan = np.log(scan) if "CUBES" in flags else scan
+    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan)

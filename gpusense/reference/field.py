@@ -174,4 +174,4 @@ def score_field(
             term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
         if "PER_BEAM" in flags:
             parts[begin * readings : some.stop * readings] = term.ravel()
-        log_p[some] = sum_terms(term, fixed, temperature)
+        log_p[some] = sum_terms(flags, term, fixed, temperature)

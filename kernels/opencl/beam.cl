@@ -1,6 +1,30 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 // Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
-// requires: error_free caster mixture sensor_table
+// requires: error_free caster mixture sensor_table compat
+
+// What one reading adds to the sum.
+real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
+                  const int cells, const real per_metre, const real range_max) {
+#if CUBES
+    const real p = compat_density(z, expected, terms);
+    return p * p * p;
+#else
+#if SENSOR_TABLE
+    return tabulated_density(z, expected, sensor, cells, per_metre, range_max);
+#else
+    return log_density(z, expected, terms);
+#endif
+#endif
+}
+
+// The scan's logarithm from its sum.
+real scan_log(const real sum) {
+#if CUBES
+    return log(sum);
+#else
+    return sum;
+#endif
+}
 
 // One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared.
 kernel void score_beams(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
@@ -35,11 +59,7 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
                 term = terms[7];
             else
 #endif
-#if SENSOR_TABLE
-                term = tabulated_density(z, expected, sensor, cells, per_metre, range_max);
-#else
-                term = log_density(z, expected, terms);
-#endif
+                term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -59,7 +79,7 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
     }
     total = add_term(total, block);
 #if LINEAR
-    log_p[n] = temperature * (total.x + total.y);
+    log_p[n] = temperature * scan_log(total.x + total.y);
 #else
     log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
 #endif

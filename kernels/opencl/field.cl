@@ -137,7 +137,8 @@ real log_field(const real2 distance, global const real *terms) {
 }
 #endif
 
-// One work-item a particle. The table holds log densities, or capped distances in metres where it is interpolated.
+// One work-item a particle. The table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
+// capped distances in metres where it is interpolated.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                         global const real *terms, global real *log_p, global real *parts, const int rows,
@@ -188,5 +189,9 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
         }
     }
     total = add_term(total, block);
+#if CUBES
+    log_p[n] = temperature * log(total.x + total.y);
+#else
     log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
+#endif
 }

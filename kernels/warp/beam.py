@@ -8,7 +8,7 @@ import math
 
 import warp as wp
 
-from . import error_free, mixture, sensor_table
+from . import compat, error_free, mixture, sensor_table
 from . import ray as ray_file
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
@@ -25,7 +25,9 @@ def make(name, flags):
     cast_ray = caster.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
     tabulated_density = sensor_table.functions(flags).tabulated_density
+    compat_density = compat.functions(flags).compat_density
     SENSOR_TABLE = "SENSOR_TABLE" in flags
+    CUBES = "CUBES" in flags
     log_density = mixture.functions(flags).log_density
     add_term = error_free.functions(flags).add_term
     SHARED_RAYS = "SHARED_RAYS" in flags
@@ -34,6 +36,33 @@ def make(name, flags):
     LINEAR = "LINEAR" in flags
     ZERO = real(0.0)
     NEVER = real(-math.inf)
+
+    # What one reading adds to the sum.
+    @wp.func
+    def reading_term(
+        z: real,
+        expected: real,
+        terms: wp.array(dtype=real),
+        sensor: wp.array(dtype=real),
+        cells: wp.int32,
+        per_metre: real,
+        range_max: real,
+    ):
+        if CUBES:
+            p = compat_density(z, expected, terms)
+            return p * p * p
+        elif SENSOR_TABLE:
+            return tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+        else:
+            return log_density(z, expected, terms)
+
+    # The scan's logarithm from its sum.
+    @wp.func
+    def scan_log(total: real):
+        if CUBES:
+            return wp.log(total)
+        else:
+            return total
 
     # One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. A launch has
     # fewer than 2^31 parts.
@@ -90,10 +119,7 @@ def make(name, flags):
                     if wp.isinf(z):
                         term = terms[7]
                 if known:
-                    if SENSOR_TABLE:
-                        term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
-                    else:
-                        term = log_density(z, expected, terms)
+                    term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -110,6 +136,6 @@ def make(name, flags):
         if impossible:
             log_p[n] = NEVER
         else:
-            log_p[n] = temperature * (total.x + total.y)
+            log_p[n] = temperature * scan_log(total.x + total.y)
 
     return {"score_beams": score_beams}[name]

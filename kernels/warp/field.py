@@ -180,6 +180,7 @@ def make(name, flags):
     BILINEAR = "BILINEAR" in flags
     CAREFUL = "CAREFUL" in flags
     LOG_TABLE = "LOG_TABLE" in flags
+    CUBES = "CUBES" in flags
     ALL_READINGS = "ALL_READINGS" in flags
     PER_BEAM = "PER_BEAM" in flags
     ZERO = real(0.0)
@@ -201,7 +202,8 @@ def make(name, flags):
         cell = (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
         table[cell] = density[wp.min(squared[row * cols + col], cap)]
 
-    # One work-item a particle. The table holds log densities, or capped distances in metres where it is interpolated.
+    # One work-item a particle. The table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
+    # capped distances in metres where it is interpolated.
     @kernel
     def score_field(
         table: wp.array(dtype=real),
@@ -264,7 +266,9 @@ def make(name, flags):
                 block = ZERO
         total = add_term(total, block)
         # An impossible reading keeps total.x at -inf and turns total.y into nan.
-        if wp.isinf(total.x):
+        if CUBES:
+            log_p[n] = temperature * wp.log(total.x + total.y)
+        elif wp.isinf(total.x):
             log_p[n] = total.x
         else:
             log_p[n] = temperature * (total.x + total.y)

@@ -1,0 +1,27 @@
+"""What nav2_amcl and Beluga sum over the beams of a scan, the cube of a density, for migration.
+
+terms[10] are those of the mixture in the linear domain, but that terms[0] is z_hit alone for amcl and terms[7] is
+z_max, not its logarithm.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.mixture import hit_mass, short_factor
+
+
+def compat_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """The density that is cubed: amcl's without normalisers, Beluga's with both (book table 6.1).
+
+    A reading of range_max is a max reading.
+    """
+    off = z - expected
+    p = terms[0] * np.exp(-(off * (off * terms[1])))
+    if "AMCL" in flags:
+        short = terms[3] * terms[4] * np.exp(-terms[4] * z)
+    else:
+        p = p / hit_mass(expected, terms[2], terms[6])
+        short = terms[3] * short_factor(terms[4] * expected) * np.exp(-terms[4] * z) / expected
+    p = p + np.where(z < expected, short, 0)
+    return (p + np.where(z >= terms[6], terms[7], terms[5])).astype(terms.dtype)

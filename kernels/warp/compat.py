@@ -1,0 +1,43 @@
+"""What nav2_amcl and Beluga sum over the beams of a scan, the cube of a density, for migration.
+
+terms[10] are those of the mixture in the linear domain, but that terms[0] is z_hit alone for amcl and terms[7] is
+z_max, not its logarithm.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import mixture
+from .prelude import precision
+
+
+@functools.cache
+def functions(flags):
+    """compat_density specialised by the flags."""
+    real = precision(flags).real
+    parts = mixture.functions(flags)
+    hit_mass, short_factor = parts.hit_mass, parts.short_factor
+    AMCL = "AMCL" in flags
+
+    # The density that is cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of range_max
+    # is a max reading.
+    @wp.func
+    def compat_density(z: real, expected: real, terms: wp.array(dtype=real)):
+        off = z - expected
+        p = terms[0] * wp.exp(-(off * (off * terms[1])))
+        if AMCL:
+            if z < expected:
+                p += terms[3] * terms[4] * wp.exp(-terms[4] * z)
+        else:
+            p /= hit_mass(expected, terms[2], terms[6])
+            if z < expected:
+                p += terms[3] * short_factor(terms[4] * expected) * wp.exp(-terms[4] * z) / expected
+        if z >= terms[6]:
+            p += terms[7]
+        else:
+            p += terms[5]
+        return p
+
+    return SimpleNamespace(compat_density=compat_density)

@@ -69,7 +69,7 @@ def test_per_scan_bound_holds_for_perturbed_beams(count, scale):
     truth = random.normal(-2, 3, (20, count)) * scale
     for sign in (1, -1, random.choice([-1, 1], truth.shape)):
         wrong = truth + 0.9 * sign * per_beam(truth, np.float32)
-        found = beam.sum_terms(wrong.astype(np.float32), np.float32(-7), np.float32(0.5))
+        found = beam.sum_terms(frozenset(), wrong.astype(np.float32), np.float32(-7), np.float32(0.5))
         exact = 0.5 * (np.array([math.fsum(row) for row in truth]) - 7)
         bound = per_scan(truth, np.float32, fixed=-7, temperature=0.5)
         assert (np.abs(found - exact) <= bound).all()

@@ -31,6 +31,8 @@ FLAGS = {
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
+    "WIDE": "a work-item computes 8 particles or beams at once, for processors whose compilers do not do so",
+    "LANES_16": "a work-item computes 16 at once",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "PER_BEAM": "the log-likelihood of each reading is wanted",
@@ -92,22 +94,31 @@ class Argument:
 class Kernel:
     """A kernel: the concept (file) it belongs to, what one work-item is, its arguments, and its work-group size.
 
-    A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group.
+    A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group. Where a
+    kernel is compiled for several lanes (WIDE), its groups have ``wide_group`` work-items, and with ``wide`` each of
+    them takes as many neighbours of the first axis as there are lanes.
     """
 
     file: str
     launch: tuple[str, ...]
     arguments: tuple[Argument, ...]
     group: int
+    wide: bool = False
+    wide_group: int = 1
 
 
-def _kernel(file: str, launch: str, *rows: str, group: int = 64) -> Kernel:
+def lanes_of(flags: frozenset[str]) -> int:
+    """How many particles or beams a work-item computes at once."""
+    return (16 if "LANES_16" in flags else 8) if "WIDE" in flags else 1
+
+
+def _kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = False, wide_group: int = 1) -> Kernel:
     arguments = []
     for row in rows:
         head, _, shape = row.partition("[")
         *output, kind, name = head.split()
         arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
-    return Kernel(file, tuple(launch.split()), tuple(arguments), group)
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group, wide, wide_group)
 
 
 _MAP = ("int rows", "int cols")
@@ -141,12 +152,13 @@ KERNELS: dict[str, Kernel] = {
     ),
     "cast_ranges": _kernel(
         "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,
-        "int particles", "int rays", *_CASTER, *_RANGE,
+        "int particles", "int rays", *_CASTER, *_RANGE, wide=True,
     ),
     "score_beams": _kernel(
         "beam", "particle", *_CAST, *_POSES, "real2 ray [rays]", "int first [rays + 1]", "real reading [readings]",
         "real terms [10]", "real sensor [cells * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
         "int readings", *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
+        wide_group=16,
     ),
     "fill_lookup": _kernel(
         "lookup_table", "bin cell", "uchar squares [4 * (rows + 2) * (cols + 2)]", "real2 ray [bins]",
@@ -159,6 +171,6 @@ KERNELS: dict[str, Kernel] = {
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_RESULT, *_MAP, "int particles",
-        "int readings", "real guard", "real fixed", "real temperature",
+        "int readings", "real guard", "real fixed", "real temperature", wide=True, wide_group=8,
     ),
 }  # fmt: skip

@@ -11,7 +11,7 @@ import pyopencl as cl
 
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
-from gpusense.signatures import KERNELS, Kernel
+from gpusense.signatures import KERNELS, Kernel, lanes_of
 from gpusense.sources import assemble, relevant, with_places
 
 # Devices that check or emulate: correct, but no one wants to wait for them unasked.
@@ -52,7 +52,15 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
         memory=int(device.global_mem_size),
         max_buffer=int(device.max_mem_alloc_size),
         float64=bool(device.double_fp_config),
+        lanes=_lanes(device),
     )
+
+
+def _lanes(device: cl.Device) -> int:
+    """PoCL compiles loops in kernels as they are written; other drivers make vectors of neighbouring work-items."""
+    if "Portable Computing Language" not in device.platform.name or not device.type & cl.device_type.CPU:
+        return 1
+    return 16 if device.native_vector_width_float >= 16 else 8
 
 
 class OpenCLBackend(ProcessBound):
@@ -118,7 +126,7 @@ class OpenCLBackend(ProcessBound):
         program = self._programs.get((row.file, flags))
         if program is None:
             program = self._programs[row.file, flags] = self._build(row.file, flags)
-        return _Launch(self._queue, cl.Kernel(program, kernel), row, "FLOAT64" in flags)
+        return _Launch(self._queue, cl.Kernel(program, kernel), row, flags)
 
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:
@@ -149,8 +157,12 @@ class OpenCLBackend(ProcessBound):
 class _Launch:
     """Binds arguments by the signature table and enqueues."""
 
-    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel, row: Kernel, float64: bool) -> None:
-        self._queue, self._kernel, self._row = queue, kernel, row
+    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel, row: Kernel, flags: frozenset[str]) -> None:
+        self._queue, self._kernel = queue, kernel
+        self._lanes, self._group = (1, row.group)
+        if "WIDE" in flags:
+            self._lanes, self._group = (lanes_of(flags) if row.wide else 1), row.wide_group
+        float64 = "FLOAT64" in flags
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if float64 else np.float32)
         self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
@@ -159,8 +171,8 @@ class _Launch:
         bound = [
             value if scalar is None else scalar(value) for scalar, value in zip(self._scalars, arguments, strict=True)
         ]
-        group = (self._row.group, *(1 for _ in size[1:]))
-        rounded = (-(-size[0] // group[0]) * group[0], *size[1:])
+        group = (self._group, *(1 for _ in size[1:]))
+        rounded = (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:])
         # Arguments belong to the kernel object, so two threads must not interleave here.
         with self._lock, _driver_errors():
             self._kernel.set_args(*bound)

@@ -28,6 +28,7 @@ class BackendInfo:
         memory: Bytes of device memory.
         max_buffer: Bytes of the largest buffer.
         float64: Whether float64 kernels exist on it.
+        lanes: How many particles or beams a work-item should compute at once; 1 leaves that to the compiler.
     """
 
     selection: str
@@ -38,6 +39,7 @@ class BackendInfo:
     memory: int
     max_buffer: int
     float64: bool
+    lanes: int = 1
 
 
 class ProcessBound:

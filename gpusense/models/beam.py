@@ -13,6 +13,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
 from gpusense.grid import OccupancyGrid
+from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
 from gpusense.models.scan_model import (
     HIGH_PEAK,
@@ -235,7 +236,7 @@ class BeamModel(ScanModel):
             flags |= {"ORIGINS_OUTSIDE"} if beyond or not self._specialize else set()
             flags |= self._caster.flags
             flags |= {"PER_BEAM"} if per_beam else set()
-            self._last_code = flags
+            flags = self._last_code = widened(self._backend.info, "score_beams", flags)
             count = len(poses)
             result = space.empty("log_p", count, real)
             parts = space.empty("parts", count * readings if per_beam else 1, real)

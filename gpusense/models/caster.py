@@ -15,6 +15,7 @@ from gpusense.backends.base import Buffer
 from gpusense.casters import Caster, Window
 from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
+from gpusense.lanes import widened
 from gpusense.lookup_files import describe, write_lookup
 from gpusense.models.reachable import ReachableMap
 from gpusense.models.scan_model import check_poses, check_scene, chunk_of, in_chunks, place_in, real_dtype
@@ -237,6 +238,7 @@ class MapCaster:
         count, rays = ranges.shape
         result = space.empty("ranges", ranges.size, self.real)
         flags = self.flags | self._wide | ({"ORIGINS_OUTSIDE"} if beyond else set())
+        flags = widened(self.backend.info, "cast_ranges", flags)
         self.backend.compile("cast_ranges", flags)(
             (rays, count), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, result,
             region.rows, region.cols, count, rays, *self.scalars, self.limit, self.grid.resolution, self.range_max,

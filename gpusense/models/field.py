@@ -13,6 +13,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
+from gpusense.lanes import widened
 from gpusense.models.reachable import ReachableMap
 from gpusense.models.scan_model import HIGH_PEAK, ScanModel, log_weight, place_in, rounded_terms, sums_linearly
 from gpusense.parameters import LikelihoodFieldParameters
@@ -212,7 +213,7 @@ class LikelihoodFieldModel(ScanModel):
             table, region = self._map.ensure(poses)
             placed, _ = place_in(region, poses, self.grid, self.scanner.mount, real)
             flags = self._flags | ({"PER_BEAM"} if per_beam else set())
-            self._last_code = flags
+            flags = self._last_code = widened(self._backend.info, "score_field", flags)
             count = len(poses)
             result = space.empty("log_p", count, real)
             parts = space.empty("parts", count * readings if per_beam else 1, real)

@@ -2,6 +2,7 @@
 // Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
 // requires: error_free caster mixture sensor_table compat
 
+#if !WIDE
 // What one reading adds to the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const int cells, const real per_metre, const real range_max) {
@@ -25,7 +26,45 @@ real scan_log(const real sum) {
     return sum;
 #endif
 }
+#endif
 
+#if WIDE
+// One work-item a particle, LANES rays at a time, each with one reading. Lanes are added in their order, so that sums
+// are those of the scalar kernel.
+kernel void score_beams(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
+                        global const real2 *ray, global const int *first, global const real *reading,
+                        global const real *terms, global const real *sensor, global real *log_p, global real *parts,
+                        const int rows, const int cols, const int particles, const int rays, const int readings,
+                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
+                        const real limit, const real resolution, const real range_max, const real fixed,
+                        const real temperature) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    real2 total = (real2)(fixed, 0);
+    real block = 0, one[LANES];
+    for (int k = 0; k < readings; k += LANES) {
+        lanes x, y;
+        load_rays(ray, k, rays, &x, &y);
+        const lanes expected = expected_ranges(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit, resolution,
+                                               range_max);
+        const int count = min(readings - k, LANES);
+        for (int i = 0; i < LANES; ++i) one[i] = reading[k + min(i, count - 1)];
+        store_lanes(log_density(load_lanes(0, one), expected, terms), 0, one);
+        for (int i = 0; i < count; ++i) {
+#if PER_BEAM
+            parts[(long)n * readings + k + i] = one[i];
+#endif
+            block += one[i];
+        }
+        if ((k + LANES) % BLOCK_TERMS == 0) {
+            total = add_term(total, block);
+            block = 0;
+        }
+    }
+    total = add_term(total, block);
+    log_p[n] = temperature * (total.x + total.y);
+}
+#else
 // One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared.
 kernel void score_beams(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
                         global const real2 *ray, global const int *first, global const real *reading,
@@ -84,3 +123,4 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
     log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
 #endif
 }
+#endif

@@ -1,6 +1,6 @@
 // Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 // The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
-// requires: error_free
+// requires: lanes error_free
 
 #define FIELD_RING 2
 
@@ -137,6 +137,83 @@ real log_field(const real2 distance, global const real *terms) {
 }
 #endif
 
+#if WIDE
+// End points of one beam of LANES particles: nearest cells, as indices of the padded table. Lanes next to a cell's edge are
+// found again one by one with twice the digits.
+ilanes wide_cells(global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low, const int *lane,
+                 const ilanes col, const ilanes row, const lanes frac_x, const lanes frac_y, const lanes cos,
+                 const lanes sin, const real2 point, const real2 point_low, const int rows, const int cols,
+                 const real guard) {
+    const lanes x = frac_x + (cos * point.x - sin * point.y);
+    const lanes y = frac_y + (sin * point.x + cos * point.y);
+    ilanes whole_x = to_ilanes(x), whole_y = to_ilanes(y);
+    whole_x += to_lanes(whole_x) > x;
+    whole_y += to_lanes(whole_y) > y;
+    const lanes left_x = x - to_lanes(whole_x), left_y = y - to_lanes(whole_y);
+    const ilanes doubtful = fabs(left_x - 0.5f) > 0.5f - guard || fabs(left_y - 0.5f) > 0.5f - guard;
+    ilanes c = col + whole_x, r = row + whole_y;
+    if (any(doubtful)) {
+        int at_c[LANES], at_r[LANES], again[LANES];
+        store_lanes(c, 0, at_c);
+        store_lanes(r, 0, at_r);
+        store_lanes(doubtful, 0, again);
+        for (int i = 0; i < LANES; ++i) {
+            if (!again[i]) continue;
+            const int n = lane[i];
+            const EndPoint end = end_point(pose[n], pose_low[n], point, point_low, 0, guard);
+            at_c[i] = pose_cell[n].x + end.cell.x;
+            at_r[i] = pose_cell[n].y + end.cell.y;
+        }
+        c = load_lanes(0, at_c);
+        r = load_lanes(0, at_r);
+    }
+    const int last_c = cols + 2 * FIELD_RING - 1, last_r = rows + 2 * FIELD_RING - 1;
+    c += FIELD_RING;
+    r += FIELD_RING;
+    c = c < 0 ? 0 : c > last_c ? last_c : c;
+    r = r < 0 ? 0 : r > last_r ? last_r : r;
+    return r * (cols + 2 * FIELD_RING) + c;
+}
+
+// One work-item LANES particles, beam by beam.
+kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
+                        global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
+                        global const real *terms, global real *log_p, global real *parts, const int rows,
+                        const int cols, const int particles, const int readings, const real guard,
+                        const real fixed, const real temperature) {
+    const int first = LANES * get_global_id(0);
+    if (first >= particles) return;
+    int lane[LANES], cols_of[LANES], rows_of[LANES];
+    float x[LANES], y[LANES], c[LANES], s[LANES];
+    for (int i = 0; i < LANES; ++i) {
+        const int n = min(first + i, particles - 1);
+        lane[i] = n;
+        cols_of[i] = pose_cell[n].x, rows_of[i] = pose_cell[n].y;
+        x[i] = pose[n].x, y[i] = pose[n].y, c[i] = pose[n].z, s[i] = pose[n].w;
+    }
+    const ilanes col = load_lanes(0, cols_of), row = load_lanes(0, rows_of);
+    const lanes frac_x = load_lanes(0, x), frac_y = load_lanes(0, y), cos = load_lanes(0, c), sin = load_lanes(0, s);
+    lanes head = fixed, lost = 0, block = 0;
+    for (int k = 0; k < readings; ++k) {
+        const ilanes at = wide_cells(pose_cell, pose, pose_low, lane, col, row, frac_x, frac_y, cos, sin, point[k],
+                                     point_low[k], rows, cols, guard);
+        const lanes term = GATHER(lanes, table, at);
+#if PER_BEAM
+        store_lanes(term, 0, x);
+        for (int i = 0; i < LANES; ++i) parts[(long)lane[i] * readings + k] = x[i];
+#endif
+        block += term;
+        if ((k + 1) % BLOCK_TERMS == 0 || k + 1 == readings) {
+            const lanes sum = head + block, shift = sum - head;
+            lost += (head - (sum - shift)) + (block - shift);
+            head = sum;
+            block = 0;
+        }
+    }
+    store_lanes(isinf(head) ? head : temperature * (head + lost), 0, x);
+    for (int i = 0; i < LANES; ++i) log_p[lane[i]] = x[i];
+}
+#else
 // One work-item a particle. The table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
 // capped distances in metres where it is interpolated.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
@@ -195,3 +272,4 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
 #endif
 }
+#endif

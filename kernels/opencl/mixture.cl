@@ -2,22 +2,32 @@
 // terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding
 // took from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
 // z_rand / range_max; in the log domain their logarithms.
-// requires: error_free
+// requires: lanes error_free
 
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keeps 1 / z* finite.
 #define SMALLEST_RANGE ((real)1e-37)
 
+// One number, or one for each lane; what is written for both takes vectors and scalars alike.
+#if WIDE
+typedef lanes number;
+#define ALL(condition) all(condition)
+#else
+typedef real number;
+#define ALL(condition) (condition)
+#endif
+
 #if HIT
 // Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
-real hit_mass(const real expected, const real erf_scale, const real range_max) {
-    const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
-    if (below > ERF_ONE && above > ERF_ONE) return (real)1;
+number hit_mass(const number expected, const real erf_scale, const real range_max) {
+    const number below = expected * erf_scale, above = (range_max - expected) * erf_scale;
+    if (ALL(below > ERF_ONE && above > ERF_ONE)) return (number)1;
     return (real)0.5 * (erf(below) + erf(above));
 }
 #endif
 
+#if !WIDE
 #if HIT
 // (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large and
 // nearly cancel, and the second part keeps the digits that are left.
@@ -32,15 +42,32 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
 #endif
 }
 #endif
+#endif
 
 #if SHORT
 // x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
-real short_factor(const real x) {
-    const real h = (real)0.5 * x;
-    return h > TINY ? h / tanh(h) + h : (real)1;
+number short_factor(const number x) {
+    const number h = (real)0.5 * x;
+    return h > TINY ? h / tanh(h) + h : (number)1;
 }
 #endif
 
+#if WIDE
+// p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+lanes log_density(const lanes z, const lanes expected, global const real *terms) {
+    lanes p = 0;
+#if HIT
+    const lanes off = z - expected;
+    p += terms[0] * exp(-(off * (off * terms[1]))) / hit_mass(expected, terms[2], terms[6]);
+#endif
+#if SHORT
+    const lanes factor = terms[3] * short_factor(terms[4] * expected);
+    const lanes within = factor * exp(-terms[4] * z) / (expected > SMALLEST_RANGE ? expected : (lanes)SMALLEST_RANGE);
+    p += z <= expected && expected > 0 ? within : (lanes)0;
+#endif
+    return log(p + terms[5]);
+}
+#else
 #if LINEAR
 // p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
 real log_density(const real z, const real expected, global const real *terms) {
@@ -92,4 +119,5 @@ real log_density(const real z, const real expected, global const real *terms) {
     return largest + log(p);
 #endif
 }
+#endif
 #endif

@@ -26,7 +26,6 @@ from gpusense.models.scan_model import (
 )
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
-from gpusense.reference.densities import log_mixture
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
@@ -106,6 +105,20 @@ class BeamModel(ScanModel):
         self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
         self._sensor, self._cells = self._tabulate(sensor_table)
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of the map's table on the device; 0 before the first call."""
+        return self._caster.table_bytes
+
+    def prepare(self, poses: object) -> None:
+        """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
+
+        Raises:
+            TypeError, ValueError: poses that are not (N, 3) finite numbers.
+            MemoryError: the device cannot hold the table.
+        """
+        self._caster.prepare(check_poses(poses))
 
     def expected_ranges(self, poses: object) -> np.ndarray:
         """z* of every beam of the scanner at each pose.
@@ -208,6 +221,8 @@ class BeamModel(ScanModel):
         """The sensor's table on the device, and its number of bins; no table and 0 where the mixture is evaluated."""
         if width is None:
             return self._backend.upload(np.zeros(1, self._real)), 0
+        from gpusense.reference.densities import log_mixture  # loads SciPy
+
         range_max = self.scanner.range_max
         width = _checks.real("sensor_table", width, low=range_max / _MOST_BINS, high=range_max)
         cells = max(round(range_max / width), 1)

@@ -15,7 +15,15 @@ from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import HIGH_PEAK, ScanModel, log_weight, place_in, rounded_terms, sums_linearly
+from gpusense.models.scan_model import (
+    HIGH_PEAK,
+    ScanModel,
+    check_poses,
+    log_weight,
+    place_in,
+    rounded_terms,
+    sums_linearly,
+)
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
 from gpusense.prepare import check_size, squared_distances
@@ -89,6 +97,24 @@ class LikelihoodFieldModel(ScanModel):
         self._map = ReachableMap(
             self._backend, grid, self.unknown, scanner.mount, reach, self._prepare_table, crop=specialize
         )
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of the map's table on the device; 0 before the first call."""
+        region = self._map.region
+        return 0 if region is None else self._real.itemsize * (region.rows + 2 * _RING) * (region.cols + 2 * _RING)
+
+    def prepare(self, poses: object) -> None:
+        """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
+
+        Raises:
+            TypeError, ValueError: poses that are not (N, 3) finite numbers.
+            MemoryError: the device cannot hold the table.
+        """
+        checked = check_poses(poses)
+        if len(checked):
+            with self._lock:
+                self._map.ensure(checked)
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""

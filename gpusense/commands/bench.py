@@ -1,0 +1,265 @@
+"""``gpusense bench``: error against run time of every caster and model, on every device, in one report."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpusense._files import check_writable, write_whole
+from gpusense.commands._common import (
+    BACKEND_HELP,
+    add_json,
+    machine,
+    machine_line,
+    open_backends,
+    positive_number,
+    print_json,
+    print_table,
+    progress,
+    whole_number,
+)
+
+if TYPE_CHECKING:
+    from gpusense.benchmark.candidates import Candidate
+    from gpusense.benchmark.runner import Plan
+
+NAME = "bench"
+HELP = "Measure error against run time of every caster and model, and write a report."
+
+LESS_EXACT = 1
+PROBLEMS = ("ranges", "beam", "field")
+PRECISIONS = ("float32", "float64")
+DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
+QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 20, "seed": 0}
+# Seconds after which a quick run begins nothing more, and the longest that it builds a table.
+_QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
+
+_EPILOG = """\
+Every method with every value of its knob computes the same ranges and scores the same scan, for particles all over the
+map ('global') and around the true pose ('tracking'). Errors are against the exact caster and the models in float64.
+
+Scenes: 'building' and 'clutter' are generated. With GPUSENSE_DATA naming the folder of recorded data there are also
+'basement', 'spielberg', 'willow' and 'intel'; --map adds others. Outside candidates, such as numba's, come from
+bench/baselines.py of a checkout or from the file that --peers names, which is then executed.
+
+--output DIR gets report.json, report.md and the diagrams: time over error, a curve for each method traced by its knob,
+exact ones in the strip on the left, failed ones in that on the right. Failures are listed with their reasons.
+
+--compare OLD measures what the old report measured, with its numbers of particles and beams and its seed unless others
+are given, and says what got slower or less exact; --compare OLD NEW compares two reports and measures nothing.
+
+Exit codes: 0 success, 1 something is less exact than in the old report, 2 bad input.
+
+example:
+  gpusense bench --quick
+  gpusense bench --output results --backend opencl --backend warp:cpu
+  gpusense bench --scene basement --method exact --method lookup --problem ranges
+  gpusense bench --compare results/report.json"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add("--output", type=Path, metavar="DIR", help="write report and diagrams there; the folder is made if absent")
+    add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
+    add("--slower", type=positive_number, default=1.3, metavar="F",
+        help="with --compare, slower is more than F times the old times (default: %(default)s)")  # fmt: skip
+    add("--quick", action="store_true", help="small maps, few values of the knobs, float32, at most a minute")
+    add("--scene", action="append", metavar="NAME", help="a scene; may be given several times (default: all)")
+    add("--map", action="append", default=[], type=Path, metavar="YAML",
+        help="a map_server map as a further scene; may be given several times")  # fmt: skip
+    add("--backend", action="append", metavar="DEVICE",
+        help=f"{BACKEND_HELP}; may be given several times (default: all present except simulators)")  # fmt: skip
+    add("--problem", action="append", choices=PROBLEMS, help="what is computed (default: all)")
+    add("--method", action="append", metavar="NAME",
+        help="a method, such as exact, march or field; may be given several times (default: all)")  # fmt: skip
+    add("--precision", action="append", choices=PRECISIONS, help="(default: both; with --quick float32)")
+    add("--particles", type=whole_number(low=1), metavar="N",
+        help="of a timed call; NumPy gets an eighth (default: 4096 on a GPU, 1024 on a processor)")  # fmt: skip
+    add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are taken (default: 512)")
+    add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="of the scanner (default: 360)")
+    add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls of a point (default: 20)")
+    add("--build-limit", type=positive_number, metavar="S",
+        help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
+    add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
+    add("--no-peers", action="store_true", help="no outside candidates")
+    add("--time", choices=("call", "launch"), default="call", help="the time of diagrams (default: %(default)s)")
+    add("--seed", type=whole_number(low=0), metavar="N", help="of maps, scans and particles (default: 0)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, write the report and compare."""
+    from gpusense.benchmark import compare as comparing
+    from gpusense.benchmark.report import document, to_json
+    from gpusense.benchmark.runner import run as run_plan
+    from gpusense.benchmark.runner import steps
+
+    old, new = _reports(args)
+    measured = new is None
+    if new is None:
+        if args.output is not None:
+            _check_folder(args.output)
+        plan, absent = make_plan(args, old)
+        with progress(steps(plan)) as step:
+            outcome = run_plan(plan, step)
+        new = document(plan, outcome, _arguments(args, plan), machine(), absent)
+        if args.output is not None:
+            write_report(args.output, new, to_json(new), args.time)
+    found = None if old is None else comparing.compare(old, new, args.slower)
+    if args.json:
+        print_json(new if found is None else {"comparison": vars(found), "report": new if measured else None})
+    else:
+        if measured:
+            _print(new, args.output)
+        if found is not None:
+            print("\n".join(["", *comparing.lines_of(found, args.slower)]))
+    return LESS_EXACT if found is not None and found.less_exact else 0
+
+
+def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """The old report, and the new one where two are given."""
+    from gpusense.benchmark.compare import read_report
+
+    if not args.compare:
+        return None, None
+    if len(args.compare) > 2:
+        raise ValueError(f"--compare: must be one or two reports, got {len(args.compare)}")
+    if args.slower <= 1:
+        raise ValueError(f"--slower: must be > 1, got {args.slower:g}")
+    reports = [read_report(path) for path in args.compare]
+    return reports[0], reports[1] if len(reports) == 2 else None
+
+
+def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[Plan, list[str]]:
+    """What is run, and what is absent.
+
+    Raises:
+        ValueError: an option names what is not here.
+    """
+    from gpusense.benchmark.candidates import candidates
+    from gpusense.benchmark.runner import Plan
+    from gpusense.benchmark.scenes import sources
+
+    before = old["arguments"] if old is not None else {}
+    quick = args.quick or bool(before.get("quick"))
+    numbers = {
+        name: getattr(args, name) if getattr(args, name) is not None else before.get(name, default)
+        for name, default in (QUICK if quick else DEFAULTS).items()
+    }
+    problems = args.problem or PROBLEMS
+    own = candidates(problems, quick=quick)
+    outside, absent = _outside(args, problems)
+    chosen = own + outside
+    if args.method:
+        names = list(dict.fromkeys(candidate.method for candidate in chosen))
+        for method in args.method:
+            if method not in names:
+                raise ValueError(f"--method: must be one of {', '.join(names)}, got {method!r}")
+        chosen = [candidate for candidate in chosen if candidate.method in args.method]
+    backends, failures = open_backends(args.backend)
+    if quick and args.backend is None and len(backends) > 1:
+        backends = [backend for backend in backends if backend.info.backend != "numpy"]
+    plan = Plan(
+        sources(args.scene or _names(old, args), args.map, quick=quick), backends, chosen,
+        args.precision or (PRECISIONS[:1] if quick else PRECISIONS),
+        build_limit=args.build_limit or (_QUICK_BUILD if quick else 60.0),
+        deadline=_QUICK_DEADLINE if quick else float("inf"), **numbers,
+    )  # fmt: skip
+    return plan, [*_absent_devices(args.backend), *failures, *absent]
+
+
+def _names(old: Mapping[str, Any] | None, args: argparse.Namespace) -> list[str] | None:
+    """The scenes of an old report that this run can make too."""
+    from gpusense.benchmark.scenes import sources
+
+    if old is None or args.map:
+        return None
+    here = [source.name for source in sources(quick=bool(old["arguments"].get("quick")))]
+    return [scene["name"] for scene in old["scenes"] if scene["name"] in here] or None
+
+
+def _outside(args: argparse.Namespace, problems: Sequence[str]) -> tuple[list[Candidate], list[str]]:
+    """Outside candidates that can run, and why others cannot."""
+    from gpusense.benchmark import peers
+
+    if args.no_peers and args.peers is not None:
+        raise ValueError("--no-peers: must not be given together with --peers")
+    file = None if args.no_peers else args.peers or peers.default_file()
+    found = [] if file is None else peers.load(file, problems)
+    reasons = dict.fromkeys(f"{candidate.outside}: {candidate.missing}" for candidate in found if candidate.missing)
+    return [candidate for candidate in found if not candidate.missing], list(reasons)
+
+
+def _absent_devices(asked: Sequence[str] | None) -> list[str]:
+    from gpusense.backends import devices
+
+    return [] if asked else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
+
+
+def _arguments(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
+    """The arguments that shape the figures; of files only their names."""
+    return {
+        "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],
+        "particles": plan.particles, "checked": plan.checked, "beams": plan.beams, "repeats": plan.repeats,
+        "seed": plan.seed, "precisions": list(plan.precisions), "build_limit": plan.build_limit,
+        "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
+        "peers": args.peers.name if args.peers else "",
+    }  # fmt: skip
+
+
+def _check_folder(folder: Path) -> None:
+    """See that the report can be written, leaving no trace."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--output: must be a folder, got a file: {folder}")
+    check_writable((folder if folder.exists() else folder.parent) / "report.json")
+
+
+def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str) -> None:
+    """Write the diagrams, then the report as Markdown and as JSON, each file whole or not at all."""
+    from gpusense.benchmark.diagrams import MEASURES, Style, profile_figure, work_precision
+    from gpusense.benchmark.profiles import profiles_of
+    from gpusense.benchmark.report import markdown
+    from gpusense.plots import save
+
+    folder.mkdir(exist_ok=True)
+    points, images = report["points"], []
+    style = Style.of(points)
+    for problem, cloud in dict.fromkeys((point["problem"], point["cloud"]) for point in points):
+        own = [point for point in points if (point["problem"], point["cloud"]) == (problem, cloud)]
+        for measure in MEASURES[problem]:
+            name = f"{problem}-{measure[0]}-{cloud}.png"
+            save(work_precision(own, style, measure, timing), folder / name)
+            images.append((f"{problem}, {cloud} cloud: time over {measure[3]}", name))
+    profiles = profiles_of(points, timing)
+    if profiles:
+        save(profile_figure(profiles, points, style), folder / "profiles.png")
+        images.append(("Performance profiles", "profiles.png"))
+    write_whole(folder / "report.md", lambda stream: stream.write((markdown(report, images) + "\n").encode()))
+    write_whole(folder / "report.json", lambda stream: stream.write(text.encode()))
+
+
+def _print(report: Mapping[str, Any], folder: Path | None) -> None:
+    from gpusense.benchmark.report import COLUMNS, RANGE_COLUMNS, row
+
+    columns = ("scene", "cloud", "problem", *COLUMNS[:11], *RANGE_COLUMNS, *COLUMNS[11:])
+    kept = [columns.index(name) for name in (
+        "scene", "cloud", "problem", "backend", "method", "knob", "precision", "call ns", "launch ns", "build s", "p99",
+        "> 1 cell", "log p rms", "tempered KL",
+    )]  # fmt: skip
+    rows = [[point["scene"], point["cloud"], point["problem"], *row(point, extra=True)] for point in report["points"]]
+    named = [columns[i] for i in kept]
+    print_table(named, [[cells[i].replace("**", "") for i in kept] for cells in rows], right=named[7:])
+    print()
+    for point in report["points"]:
+        if point["status"] in ("failed", "unstable"):
+            print(f"{point['status']}: {point['scene']}, {point['cloud']}, {point['backend']}, {point['method']}: "
+                  f"{point['reason']}")  # fmt: skip
+    left = sum(point["status"] == "left out" for point in report["points"])
+    print(f"{len(report['points'])} points, {left} left out; truth: {report['truth']['device']}, float64")
+    print(machine_line())
+    if folder is not None:
+        print(f"written: {folder}")

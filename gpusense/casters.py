@@ -61,6 +61,7 @@ class Caster(ABC):
         knobs: What its error and its time depend on.
         flag: The kernels' flag; empty for the exact caster.
         whole: Whether the table is made of the whole map at once.
+        ring: Whether a ring of cells stands for what is outside the grid.
     """
 
     name: ClassVar[str]
@@ -71,6 +72,7 @@ class Caster(ABC):
     knobs: ClassVar[str] = "none"
     flag: ClassVar[str] = ""
     whole: ClassVar[bool] = False
+    ring: ClassVar[bool] = True
 
     @abstractmethod
     def prepare(self, backend: Backend, window: Window) -> Table:
@@ -151,6 +153,7 @@ class March(Caster):
     precomputation = "exact distance transform"
     knobs = "tolerance [cells], rule"
     flag = "MARCH"
+    ring = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tolerance", _checks.real("tolerance", self.tolerance, low=1e-3, high=10))
@@ -177,14 +180,15 @@ class Cddt(Caster):
 
     Args:
         bins: Angle bins of a full turn, 4 to 4096: more are more exact, and take memory.
-        pruned: Leave out what cannot be seen from a free cell of the same line.
+        pruned: Leave out obstacles that begin within another one of their line: less memory, and origins that lie free
+            beside that other one may see through walls of a cell's thickness.
 
     Raises:
         TypeError, ValueError: a knob of the wrong kind, or out of range.
     """
 
     bins: int = 216
-    pruned: bool = True
+    pruned: bool = False
 
     name = "cddt"
     error = "across the ray, range * pi / bins + 1 cell; walls within that may be missed or hit"
@@ -193,11 +197,12 @@ class Cddt(Caster):
     knobs = "bins, pruned"
     flag = "CDDT"
     whole = True
+    ring = False
 
     def __post_init__(self) -> None:
-        _checks.integer("bins", self.bins, low=4, high=4096)
+        object.__setattr__(self, "bins", _checks.integer("bins", self.bins, low=4, high=4096))
         if not isinstance(self.pruned, bool):
-            raise TypeError(f"pruned: must be a bool, got {_checks.show(self.pruned)}")
+            raise TypeError(f"pruned: must be True or False, got {_checks.show(self.pruned)}")
 
     def prepare(self, backend: Backend, window: Window) -> Table:
         """See Caster.prepare."""
@@ -232,11 +237,12 @@ class Lookup(Caster):
     knobs = "bins"
     flag = "LOOKUP"
     whole = True
+    ring = False
 
     def __post_init__(self) -> None:
-        _checks.integer("bins", self.bins, low=4, high=4096)
-        if self.file is not None and not isinstance(self.file, (str, Path)):
-            raise TypeError(f"file: must be a path, got {_checks.show(self.file)}")
+        object.__setattr__(self, "bins", _checks.integer("bins", self.bins, low=4, high=4096))
+        if self.file is not None:
+            object.__setattr__(self, "file", _checks.path("file", self.file))
 
     def prepare(self, backend: Backend, window: Window) -> Table:
         """See Caster.prepare."""

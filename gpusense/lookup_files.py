@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gpusense._checks import show
 from gpusense._files import write_whole
 
 _LONGEST_HEAD = 4096
@@ -56,13 +57,15 @@ def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, b
         head = stream.readline(_LONGEST_HEAD)
         try:
             found = json.loads(head)
-        except ValueError:
+        except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict) or found.get("format") != wanted["format"]:
             raise ValueError(f"file: must be a look-up table that gpusense wrote, got {path}")
         for key, value in wanted.items():
             if found.get(key) != value:
-                raise ValueError(f"file: must be a table of the same {key}, {value}, got {found.get(key)} in {path}")
+                raise ValueError(
+                    f"file: must be a table of the same {key}, {value}, got {show(found.get(key))} in {path}"
+                )
         size = path.stat().st_size - len(head)
         if size != count * _KIND.itemsize:
             raise ValueError(f"file: must hold {count * _KIND.itemsize} bytes of ranges, got {size} in {path}")

@@ -54,6 +54,7 @@ def scene_omissions(
     unknown: str,
     outside: str,
     precision: str,
+    ring: bool = True,
 ) -> list[Omission]:
     """What parameters, scanner and map make unnecessary, before any scan is seen.
 
@@ -63,6 +64,7 @@ def scene_omissions(
         unknown: Policy for unknown cells.
         outside: Policy for what lies outside the grid.
         precision: ``"float32"`` or ``"float64"``.
+        ring: Whether a ring of cells stands for what is outside.
     """
     found = [Omission(f"{name[2:]} component", f"{name} = 0", cost) for name, weight, cost in components if not weight]
     if mount[:2] == (0.0, 0.0):
@@ -74,9 +76,9 @@ def scene_omissions(
             "a test per cell step",
         )
     )
-    found.append(
-        Omission("bounds tests", f"a sentinel ring stands for what is outside ({outside})", "four comparisons per step")
-    )
+    if ring:
+        why = f"a sentinel ring stands for what is outside ({outside})"
+        found.append(Omission("bounds tests", why, "four comparisons per step"))
     if precision == "float32":
         found.append(
             Omission(

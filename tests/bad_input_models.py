@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
+from gpusense import casters
 
 Action = Callable[[], object]
 Message = str | Callable[[], str]
@@ -80,6 +81,10 @@ NO_BEAMS = "beams: must be a number of beams or a list of beam indices, got {}".
 FLOATS = "precision: must be one of 'float32', 'float64', got {}".format
 UNKNOWN = "unknown: must be one of 'free', 'occupied', got {}".format
 OUTSIDE = "outside: must be one of 'free', 'occupied', got {}".format
+TOLERANCE = "tolerance: must be finite and >= 0.001 and <= 10, got {}".format
+BINS = "bins: must be >= 4 and <= 4096, got {}".format
+RULE = "rule: must be one of 'safe', 'centre', got {}".format
+TABLE = "sensor_table: must be finite and >= 0.0006103515625 and <= 5.0, got {}".format
 TEMPERATURE = "temperature: must be finite and > 0 and <= 1, got {}".format
 
 MODEL_CASES = [
@@ -108,6 +113,18 @@ MODEL_CASES = [
     ),
     ("beam-caster-magic", beam(caster="magic"), ValueError, f"caster: must be one of {CASTERS}, got 'magic'"),
     ("beam-caster-number", beam(caster=3), TypeError, f"caster: must be one of {CASTERS}, got 3"),
+    ("beam-table-0", beam(sensor_table=0), ValueError, TABLE("0")),
+    ("beam-table-negative", beam(sensor_table=-0.1), ValueError, TABLE("-0.1")),
+    ("beam-table-wider-than-the-range", beam(sensor_table=5.5), ValueError, TABLE("5.5")),
+    ("beam-table-of-too-many-bins", beam(sensor_table=6.1e-4), ValueError, TABLE("0.00061")),
+    ("beam-table-nan", beam(sensor_table=NAN), ValueError, TABLE("nan")),
+    ("beam-table-bool", beam(sensor_table=True), TypeError, "sensor_table: must be a real number, got True"),
+    (
+        "beam-table-and-compat",
+        beam(sensor_table=0.5, compat="amcl"),
+        ValueError,
+        "sensor_table: must be None with compat, got 0.5",
+    ),
     ("beam-precision-float16", beam(precision="float16"), ValueError, FLOATS("'float16'")),
     ("field-precision-dtype", field(precision=np.float32), TypeError, FLOATS("<class 'numpy.float32'>")),
     ("beam-unknown-maybe", beam(unknown="maybe"), ValueError, UNKNOWN("'maybe'")),
@@ -228,6 +245,32 @@ CASTER_CASES = [
         "range_max: must be at most 4194304 cells of the grid, got 10000000",
     ),
     ("caster-method", caster(method="embree"), ValueError, f"method: must be one of {CASTERS}, got 'embree'"),
+    ("caster-method-number", caster(method=3), TypeError, f"method: must be one of {CASTERS}, got 3"),
+    (
+        "caster-method-class",
+        caster(method=casters.March),
+        TypeError,
+        f"method: must be one of {CASTERS}, got <class 'gpusense.casters.March'>",
+    ),
+    (
+        "caster-save",
+        lambda: CASTER.save_table("table"),
+        ValueError,
+        "method: must be 'lookup' for a table to be saved, got 'exact'",
+    ),
+    ("march-tolerance-0", lambda: casters.March(0), ValueError, TOLERANCE("0")),
+    ("march-tolerance-11", lambda: casters.March(11), ValueError, TOLERANCE("11")),
+    ("march-tolerance-nan", lambda: casters.March(NAN), ValueError, TOLERANCE("nan")),
+    ("march-tolerance-string", lambda: casters.March("x"), TypeError, "tolerance: must be a real number, got 'x'"),
+    ("march-rule", lambda: casters.March(rule="fast"), ValueError, RULE("'fast'")),
+    ("march-rule-none", lambda: casters.March(rule=None), TypeError, RULE("None")),
+    ("cddt-bins-3", lambda: casters.Cddt(3), ValueError, BINS("3")),
+    ("cddt-bins-4097", lambda: casters.Cddt(4097), ValueError, BINS("4097")),
+    ("cddt-bins-fraction", lambda: casters.Cddt(2.5), TypeError, "bins: must be an integer, got 2.5"),
+    ("cddt-pruned", lambda: casters.Cddt(pruned="yes"), TypeError, "pruned: must be True or False, got 'yes'"),
+    ("lookup-bins-0", lambda: casters.Lookup(0), ValueError, BINS("0")),
+    ("lookup-bins-bool", lambda: casters.Lookup(True), TypeError, "bins: must be an integer, got True"),
+    ("lookup-file", lambda: casters.Lookup(file=7), TypeError, "file: must be a path, got 7"),
     ("caster-precision", caster(precision="double"), ValueError, FLOATS("'double'")),
     ("caster-unknown", caster(unknown=True), TypeError, UNKNOWN("True")),
     ("caster-outside", caster(outside="clip"), ValueError, OUTSIDE("'clip'")),

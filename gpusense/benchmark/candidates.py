@@ -75,7 +75,7 @@ class Curve:
         knob: The field of the caster that is turned; empty for none.
         values: The knob's values, from rough to fine.
         options: The caster's other fields.
-        quick: Positions in ``values`` of those that a quick run measures.
+        quick: Positions in ``values`` of those that a quick run measures, and that the beam model is measured with.
     """
 
     method: str
@@ -93,9 +93,9 @@ CURVES = (
     # Below a cell nothing changes: the distance between the centres of two cells is at least 1.
     Curve("march", "centre", "tolerance", (4.0, 2.0, 1.0), {"rule": "centre"}, (2,)),
     Curve("bresenham"),
-    Curve("cddt", "all", "bins", (54, 108, 216, 720), {"pruned": False}, ()),
-    Curve("cddt", "pruned", "bins", (54, 108, 216, 720), {"pruned": True}, (0,)),
-    Curve("lookup", "", "bins", (27, 54, 108, 216), {}, (0,)),
+    Curve("cddt", "", "bins", (54, 108, 216, 720), {"pruned": False}, (1,)),
+    Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, ()),
+    Curve("lookup", "", "bins", (27, 54, 108), {}, (1,)),
 )
 """The casters, for ranges and for the beam model."""
 
@@ -112,9 +112,8 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
     found = []
     for curve in CURVES:
         values: tuple[float | None, ...] = curve.values or (None,)
-        if quick and curve.values:
-            values = tuple(curve.values[i] for i in curve.quick)
-        for value in values:
+        few = tuple(curve.values[i] for i in curve.quick) if curve.values else values
+        for value in few if quick else values:
             caster = caster_of(curve, value)
             rays = _table_rays(value) if curve.method == "lookup" and value else None
             found += [
@@ -123,6 +122,8 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
                     table_rays=rays,
                 )
                 for problem, make in (("ranges", _ranges), ("beam", _beam))
+                # What a caster costs and gives up shows in its ranges; the model is measured with some of them.
+                if problem == "ranges" or value in few
             ]  # fmt: skip
     exact = CASTERS["exact"]()
     found.append(Candidate("field", "field", _field(), exact=True))

@@ -16,7 +16,7 @@ from gpusense.backends.base import Buffer, Launcher
 
 LONG = 2.0
 """A single call of more seconds is not repeated."""
-SLOW_TO_MAKE = 5.0
+SLOW_TO_MAKE = 2.0
 """What takes more seconds to make is made once: its compiling and building are then told apart by no second one."""
 # Launches alone are repeated until so many seconds are over: on a processor they take as long as calls.
 _LAUNCH_SECONDS, _FEWEST_LAUNCHES = {"gpu": 1.0, "cpu": 0.1}, 3

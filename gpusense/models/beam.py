@@ -88,7 +88,8 @@ class BeamModel(ScanModel):
         compat_module.check_weights(self.parameters, compat)
         if peer is not None:
             caster = "bresenham" if caster is None else caster
-            unknown, outside = unknown or "occupied", outside or peer.outside
+            unknown = "occupied" if unknown is None else unknown
+            outside = peer.outside if outside is None else outside
             if sensor_table is not None:
                 raise ValueError(f"sensor_table: must be None with compat, got {_checks.show(sensor_table)}")
         method = casters.choose("caster", "exact" if caster is None else caster)
@@ -147,7 +148,7 @@ class BeamModel(ScanModel):
         ]
         omissions = scene_omissions(
             components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
-            precision=self.precision,
+            precision=self.precision, ring=self._caster.method.ring,
         )  # fmt: skip
         scan = self._last_scan
         if scan is not None and scan.shared:
@@ -178,7 +179,9 @@ class BeamModel(ScanModel):
             )
         if (far := self._caster.omission()) is not None:
             omissions.append(far)
-        title = f"beam model{self._peer_note()}, {self.precision}, {self.device.selection} ({self.device.name})"
+        caster = self._caster.method
+        how = "" if caster.name == "exact" else f", ranges by {caster}"
+        title = f"beam model{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
 
     def _peer_mixture(self) -> tuple[frozenset[str], np.ndarray]:
@@ -228,8 +231,13 @@ class BeamModel(ScanModel):
         cells = max(round(range_max / width), 1)
         middle = (np.arange(cells) + 0.5) * (range_max / cells)
         expected = np.append(middle, range_max)
-        table = log_mixture(middle[:, None], expected, range_max=range_max, **self.parameters.to_dict())
-        return self._backend.upload(table.astype(self._real)), cells
+        table = np.empty((cells, cells + 1), self._real)
+        # In blocks of rows: the densities need some forty numbers for each of theirs.
+        for first in range(0, cells, 64):
+            rows = slice(first, first + 64)
+            own = self.parameters.to_dict()
+            table[rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
+        return self._backend.upload(table), cells
 
     def _impossible(self) -> bool:
         p = self.parameters

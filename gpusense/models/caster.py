@@ -128,7 +128,7 @@ class RayCaster:
         """
         if not isinstance(self.method, casters.Lookup):
             raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.method.name!r}")
-        self._caster.save(Path(path), self.method.bins)
+        self._caster.save(_checks.path("path", path), self.method.bins)
 
     def cast(self, poses: object, bearings: object) -> np.ndarray:
         """Expected ranges.

@@ -16,6 +16,7 @@ from gpusense.reference.ray import angle_bin, off_grid, ray_direction
 
 ENTRY_UNIT = 1024.0
 COSINE_UNIT = 2.0**-30
+FARTHEST = 1048576.0
 
 
 def cast_ray(
@@ -60,10 +61,11 @@ def cast_ray(
     s = map_table[2 + 3 * bin].astype(pose.dtype) * real(COSINE_UNIT)
     x, y = origin.astype(pose.dtype) + pose[:, :2].T
     along, across = c * x + s * y, c * y - s * x
-    line = np.floor(across).astype(np.int64) - map_table[3 + 3 * bin]
-    known = (line >= 0) & (line < lines)
+    near = np.abs(across) <= real(FARTHEST)
+    line = np.floor(np.where(near, across, 0)).astype(np.int64) - map_table[3 + 3 * bin]
+    known = near & (line >= 0) & (line < lines)
     place = first + bin * lines + np.where(known, line, 0)
-    start = np.trunc(along * real(ENTRY_UNIT)).astype(np.int64)
+    start = np.trunc(np.clip(along, real(-FARTHEST), real(FARTHEST)) * real(ENTRY_UNIT)).astype(np.int64)
     low, end = map_table[place].astype(np.int64), map_table[place + 1].astype(np.int64)
     high = end.copy()
     while (open_ := low < high).any():

@@ -9,6 +9,8 @@
 typedef int entry;
 
 #define ENTRY_UNIT ((real)1024)
+// Beyond this many cells, more than any map has, one place is like another and counts still fit.
+#define FARTHEST ((real)1048576)
 
 // Distance in cells to the first obstacle of the line, or limit where there is none nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
@@ -28,9 +30,11 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const real s = (real)map_table[2 + 3 * bin] * (real)9.31322574615478515625e-10;
     const real x = (real)cell.x + pose.x, y = (real)cell.y + pose.y;
     const real along = c * x + s * y, across = c * y - s * x;
+    if (fabs(across) > FARTHEST) return limit;
     const int whole = (int)across, line = whole - ((real)whole > across) - map_table[3 + 3 * bin];
     if (line < 0 || line >= lines) return limit;
-    const int from = (int)(along * ENTRY_UNIT);
+    const int from = (int)(along > FARTHEST ? FARTHEST * ENTRY_UNIT : along < -FARTHEST ? -FARTHEST * ENTRY_UNIT
+                                                                                       : along * ENTRY_UNIT);
     int low = first[bin * lines + line], high = first[bin * lines + line + 1];
     const int end = high;
     while (low < high) {

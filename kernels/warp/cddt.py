@@ -29,6 +29,8 @@ def functions(flags):
     ZERO = real(0.0)
     ENTRY_UNIT = real(1024.0)
     COSINE_UNIT = real(2.0**-30)
+    # Beyond this many cells, more than any map has, one place is like another and counts still fit.
+    FARTHEST, NOWHERE = real(1048576.0), real(-1048576.0)
 
     # Distance in cells to the first obstacle of the line, or limit where there is none nearer.
     @wp.func
@@ -61,10 +63,12 @@ def functions(flags):
         y = real(cell.y) + pose.y
         along = c * x + s * y
         across = c * y - s * x
+        if wp.abs(across) > FARTHEST:
+            return limit
         line = int(wp.floor(across)) - map_table[3 + 3 * bin]
         if line < 0 or line >= lines:
             return limit
-        start = int(along * ENTRY_UNIT)
+        start = int(wp.clamp(along, NOWHERE, FARTHEST) * ENTRY_UNIT)
         low = int(map_table[first + bin * lines + line])
         high = int(map_table[first + bin * lines + line + 1])
         end = high

@@ -1,7 +1,11 @@
-"""What is made of a map on the device before any particle is scored: distances and quadrant squares."""
+"""What is made of a map on the device before any particle is scored: distances and quadrant squares.
+
+Processors get few long work-items, GPUs one per cell, from a map of bits that the host packs: an eighth of the bytes.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,12 +13,18 @@ import numpy as np
 from gpusense import _checks
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.base import Buffer
-from gpusense.region import LONGEST_SIDE
+from gpusense.region import LONGEST_SIDE, Region
 
 _INT = np.dtype(np.int32)
 _BYTE = np.dtype(np.uint8)
+_SHORT = np.dtype(np.uint16)
+_NOTHING: frozenset[str] = frozenset()
 # Kernels count cells of four padded planes in 32 bits.
 _MOST_CELLS = (1 << 31) // 4 - 1
+# The kernel files ``distance`` and ``squares`` have the same numbers.
+NO_OBSTACLE = (1 << 31) - 1
+_BLOCK_ROWS = 32
+SQUARE_REACH = 254
 
 
 def check_size(rows: int, cols: int) -> None:
@@ -27,10 +37,24 @@ def check_size(rows: int, cols: int) -> None:
         raise ValueError(f"grid: the part in use must have at most {_MOST_CELLS} cells, got {rows} x {cols}")
 
 
-def squared_distances(backend: Backend, obstacles: np.ndarray) -> Buffer:
+def packed(obstacles: np.ndarray) -> np.ndarray:
+    """(rows, words) int32 bits of a (rows, cols) map; the kernel file ``bits`` says how."""
+    rows, cols = obstacles.shape
+    if cols % 32 == 0:
+        bits = np.packbits(np.ascontiguousarray(obstacles), bitorder="little").reshape(rows, cols // 8)
+    else:
+        bits = np.zeros((rows, -(-cols // 32) * 4), _BYTE)
+        bits[:, : -(-cols // 8)] = np.packbits(obstacles, axis=1, bitorder="little")
+    return bits.view("<i4").astype(_INT, copy=False)
+
+
+def squared_distances(backend: Backend, obstacles: np.ndarray, most: int = NO_OBSTACLE) -> Buffer:
     """Squared cell distance from each cell's centre to the nearest obstacle's, exactly; 2^31 - 1 without obstacles.
 
-    Processors walk rows last, which is how memory runs; on a GPU neighbouring work-items take neighbouring columns.
+    Args:
+        backend: The device.
+        obstacles: (rows, cols) bool.
+        most: Larger squared distances may be anything above this, which spares GPUs the search for them.
 
     Raises:
         ValueError: more cells or longer sides than the kernels can count.
@@ -41,31 +65,72 @@ def squared_distances(backend: Backend, obstacles: np.ndarray) -> Buffer:
         raise ValueError(
             f"grid: the part in use must have at most {LONGEST_SIDE} rows and columns, got {rows} x {cols}"
         )
-    count = rows * cols
-    occupied = backend.upload(np.ascontiguousarray(obstacles, dtype=_BYTE))
-    along, starts, squared = (backend.empty(count, _INT) for _ in range(3))
-    by_column, by_row = (cols, rows, 1, cols), (rows, cols, cols, 1)
-    first, second = (by_column, by_row) if backend.info.kind == "cpu" else (by_row, by_column)
-    backend.compile("distance_lines", frozenset())((first[0],), occupied, along, *first)
-    backend.compile("distance_envelope", frozenset())((second[0],), along, starts, squared, *second)
+    squared = backend.empty(rows * cols, _INT)
+    (_by_lines if backend.info.kind == "cpu" else _by_cells)(backend, obstacles, squared, most)
     backend.synchronize()
     return squared
 
 
-def quadrant_squares(backend: Backend, obstacles: np.ndarray) -> Buffer:
-    """Padded planes of quadrant empty squares; see the kernel file ``squares``."""
+def _by_lines(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: int) -> None:
+    """A work-item a line. Rows come last, which is how memory runs."""
+    rows, cols = obstacles.shape
+    occupied = backend.upload(_bytes(obstacles))
+    along, starts = (backend.empty(rows * cols, _INT) for _ in range(2))
+    backend.compile("distance_lines", _NOTHING)((cols,), occupied, along, cols, rows, 1, cols)
+    backend.compile("distance_envelope", _NOTHING)((rows,), along, starts, squared, rows, cols, cols, 1)
+
+
+def _by_cells(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: int) -> None:
+    """A work-item a cell."""
+    rows, cols = obstacles.shape
+    words, blocks = -(-cols // 32), -(-rows // _BLOCK_ROWS)
+    bits = backend.upload(packed(obstacles))
+    nearest, least = backend.empty(rows * cols, _SHORT), backend.empty(blocks * cols, _SHORT)
+    reach = min(math.isqrt(most), LONGEST_SIDE)
+    backend.compile("distance_bits", _NOTHING)((cols, rows), bits, nearest, rows, cols, words, reach)
+    backend.compile("distance_blocks", _NOTHING)((cols, blocks), nearest, least, rows, cols, blocks)
+    search = backend.compile("distance_search", _NOTHING)
+    search((cols, rows), nearest, least, squared, rows, cols, blocks, most)
+
+
+def quadrant_squares(
+    backend: Backend, obstacles: np.ndarray, squares: Buffer | None = None, changed: Region | None = None
+) -> Buffer:
+    """Padded planes of quadrant empty squares; see the kernel file ``squares``.
+
+    Args:
+        backend: The device.
+        obstacles: (rows, cols) bool.
+        squares: The planes as they were; they are mended in place. None makes them.
+        changed: Where obstacles are not what they were.
+    """
     rows, cols = obstacles.shape
     check_size(rows, cols)
-    occupied = backend.upload(np.ascontiguousarray(obstacles, dtype=_BYTE))
-    runs = backend.empty(2 * rows * cols, _BYTE)
-    squares = backend.empty(4 * (rows + 2) * (cols + 2), _BYTE, zero=True)
-    backend.compile("square_runs", frozenset())((rows, 2), occupied, runs, rows, cols)
+    if squares is None or changed is None:
+        squares = backend.empty(4 * (rows + 2) * (cols + 2), _BYTE, zero=True)
+        changed = Region(0, 0, rows, cols)
+    top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
+    first, begin = max(top - SQUARE_REACH, 0), max(left - SQUARE_REACH, 0)
+    end = min(right + SQUARE_REACH, cols)
+    near = obstacles[first : bottom + SQUARE_REACH]
+    band = len(near)
+    runs = backend.empty(2 * band * cols, _BYTE)
+    place = (rows, cols, first, band, top, left, bottom, right)
     if backend.info.kind == "cpu":
-        backend.compile("squares_rows", frozenset())((4,), runs, squares, rows, cols)
+        backend.compile("square_runs", _NOTHING)((band, 2), backend.upload(_bytes(near)), runs, band, cols, begin, end)
+        backend.compile("squares_rows", _NOTHING)((4,), runs, squares, *place)
     else:
-        backend.compile("squares_scan", frozenset())((rows * cols, 4), runs, squares, rows, cols)
+        words, bits = -(-cols // 32), backend.upload(packed(near))
+        backend.compile("square_bits", _NOTHING)((end - begin, band), bits, runs, band, cols, words, begin, end)
+        size = (min(changed.cols + SQUARE_REACH, cols), min(changed.rows + SQUARE_REACH, rows), 4)
+        backend.compile("squares_scan", _NOTHING)(size, runs, squares, *place)
     backend.synchronize()
     return squares
+
+
+def _bytes(obstacles: np.ndarray) -> np.ndarray:
+    """1 for an obstacle, contiguous; bool is copied only where it must be."""
+    return np.ascontiguousarray(obstacles, dtype=bool).view(_BYTE)
 
 
 def distance_transform(obstacles: Any, *, backend: str | Backend = "auto") -> np.ndarray:

@@ -126,6 +126,10 @@ _POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
 # A map as a caster has it: what an entry is, and how many there are, is the caster's.
 _CAST = ("entry map_table [map]",)
 _CASTER = ("int bins", "real slack", "real tolerance")
+_SQUARES = (
+    "uchar runs [2 * band * cols]", "out uchar squares [4 * (rows + 2) * (cols + 2)]", *_MAP, "int first", "int band",
+    "int top", "int left", "int bottom", "int right",
+)  # fmt: skip
 _RANGE = ("real limit", "real resolution", "real range_max")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 
@@ -138,18 +142,27 @@ KERNELS: dict[str, Kernel] = {
         "distance", "line", "int along [rows * cols]", "out int starts [rows * cols]", "out int squared [rows * cols]",
         "int lines", "int length", "int line_stride", "int step", group=16,
     ),
+    "distance_bits": _kernel(
+        "distance", "col row", "int bits [rows * words]", "out ushort nearest [rows * cols]", *_MAP, "int words",
+        "int reach",
+    ),
+    "distance_blocks": _kernel(
+        "distance", "col block", "ushort nearest [rows * cols]", "out ushort blocks [count * cols]", *_MAP, "int count",
+    ),
+    "distance_search": _kernel(
+        "distance", "col row", "ushort nearest [rows * cols]", "ushort blocks [count * cols]",
+        "out int squared [rows * cols]", *_MAP, "int count", "int most",
+    ),
     "square_runs": _kernel(
-        "squares", "row direction", "uchar occupied [rows * cols]", "out uchar runs [2 * rows * cols]", *_MAP,
-        group=16,
+        "squares", "row direction", "uchar occupied [band * cols]", "out uchar runs [2 * band * cols]", "int band",
+        "int cols", "int begin", "int end", group=16,
     ),
-    "squares_rows": _kernel(
-        "squares", "plane", "uchar runs [2 * rows * cols]", "out uchar squares [4 * (rows + 2) * (cols + 2)]", *_MAP,
-        group=1,
+    "square_bits": _kernel(
+        "squares", "col row", "int bits [band * words]", "out uchar runs [2 * band * cols]", "int band", "int cols",
+        "int words", "int begin", "int end",
     ),
-    "squares_scan": _kernel(
-        "squares", "cell plane", "uchar runs [2 * rows * cols]", "out uchar squares [4 * (rows + 2) * (cols + 2)]",
-        *_MAP,
-    ),
+    "squares_rows": _kernel("squares", "plane", *_SQUARES, group=1),
+    "squares_scan": _kernel("squares", "col row plane", *_SQUARES),
     "cast_ranges": _kernel(
         "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,
         "int particles", "int rays", *_CASTER, *_RANGE, wide=True,
@@ -166,7 +179,8 @@ KERNELS: dict[str, Kernel] = {
     ),
     "fill_field": _kernel(
         "field", "col row", "int squared [rows * cols]", "real density [cap + 1]",
-        "out real table [(rows + 4) * (cols + 4)]", *_MAP, "int cap",
+        "out real table [begin + height * stride]", *_MAP, "int cap", "real beyond", "int from_col", "int from_row",
+        "int width", "int height", "int begin", "int stride",
     ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",

@@ -8,11 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.reference.bits import cells_left, cells_right, unpacked
+
 NO_OBSTACLE = -1
 UNREACHABLE = np.iinfo(np.int32).max
 # Above every squared distance; another square added to it still fits into 32 bits.
 FAR = np.uint32(1 << 31)
 BLOCK = 32
+# Beyond all distances, as the first pass of a work-item a cell writes it, and its rows a block.
+FAR_CELLS = 46341
+BLOCK_ROWS = 32
 
 
 def _lines(array: np.ndarray, lines: int, length: int, line_stride: int, step: int) -> np.ndarray:
@@ -60,12 +65,57 @@ def distance_envelope(
     out = _lines(squared, lines, length, line_stride, step)
     for block in range(0, lines, BLOCK):
         g = across[block : block + BLOCK]
-        start = np.where(g == NO_OBSTACLE, FAR, (g * g).astype(np.uint32))
-        best = start.copy()
-        for offset in range(1, length):
-            square = np.uint32(offset * offset)
-            if square >= best.max():
-                break
-            np.minimum(best[:, offset:], start[:, :-offset] + square, out=best[:, offset:])
-            np.minimum(best[:, :-offset], start[:, offset:] + square, out=best[:, :-offset])
-        out[block : block + BLOCK] = np.minimum(best, np.uint32(UNREACHABLE)).astype(np.int32)
+        out[block : block + BLOCK] = _lowest(np.where(g == NO_OBSTACLE, FAR, (g * g).astype(np.uint32)))
+
+
+def _lowest(start: np.ndarray) -> np.ndarray:
+    """Least ``start[:, j] + (i - j)^2`` at each i; UNREACHABLE where all are beyond."""
+    best = start.copy()
+    for offset in range(1, start.shape[1]):
+        square = np.uint32(offset * offset)
+        if square >= best.max():
+            break
+        np.minimum(best[:, offset:], start[:, :-offset] + square, out=best[:, offset:])
+        np.minimum(best[:, :-offset], start[:, offset:] + square, out=best[:, :-offset])
+    return np.minimum(best, np.uint32(UNREACHABLE)).astype(np.int32)
+
+
+def distance_bits(
+    flags: frozenset[str], bits: np.ndarray, nearest: np.ndarray, rows: int, cols: int, words: int, reach: int
+) -> None:
+    """First pass: cells to the nearest occupied cell of the same row, FAR_CELLS if it is over reach."""
+    cells = unpacked(bits, rows, cols, words)
+    found = np.minimum(cells_left(cells), cells_right(cells))
+    nearest[: rows * cols] = np.where(found > reach, FAR_CELLS, found).ravel()
+
+
+def distance_blocks(
+    flags: frozenset[str], nearest: np.ndarray, blocks: np.ndarray, rows: int, cols: int, count: int
+) -> None:
+    """The least number of each column of a block of rows."""
+    least = np.minimum.reduceat(nearest[: rows * cols].reshape(rows, cols), np.arange(count) * BLOCK_ROWS, axis=0)
+    blocks[: count * cols] = least.ravel()
+
+
+def squares_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Sum of two squares."""
+    return a * a + b * b
+
+
+def distance_search(
+    flags: frozenset[str],
+    nearest: np.ndarray,
+    blocks: np.ndarray,
+    squared: np.ndarray,
+    rows: int,
+    cols: int,
+    count: int,
+    most: int,
+) -> None:
+    """Second pass: the least sum of squares along each column, UNREACHABLE if it is over most."""
+    columns = nearest[: rows * cols].reshape(rows, cols).astype(np.uint32).T
+    out = squared[: rows * cols].reshape(rows, cols)
+    for begin in range(0, cols, BLOCK):
+        column = columns[begin : begin + BLOCK]
+        lowest = _lowest(np.where(column == FAR_CELLS, FAR, squares_sum(column, np.zeros_like(column))))
+        out[:, begin : begin + BLOCK] = np.where(lowest > most, UNREACHABLE, lowest).T

@@ -18,12 +18,33 @@ EDGE = 2.0**-33
 
 
 def fill_field(
-    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, table: np.ndarray, rows: int, cols: int, cap: int
+    flags: frozenset[str],
+    squared: np.ndarray,
+    density: np.ndarray,
+    table: np.ndarray,
+    rows: int,
+    cols: int,
+    cap: int,
+    beyond: np.floating,
+    from_col: int,
+    from_row: int,
+    width: int,
+    height: int,
+    begin: int,
+    stride: int,
 ) -> None:
-    """Log density of each cell from its squared distance by a table of all squared distances up to the cap."""
-    ring = FIELD_RING
-    padded = table[: (rows + 2 * ring) * (cols + 2 * ring)].reshape(rows + 2 * ring, cols + 2 * ring)
-    padded[ring:-ring, ring:-ring] = density[np.minimum(squared[: rows * cols].reshape(rows, cols), cap)]
+    """Values of cells of the table, from squared distances by a table of all squared distances up to the cap.
+
+    They are height x width cells, the first of them at begin, for squared distances from (from_row, from_col) on; what
+    lies beyond these is beyond.
+    """
+    size = table.itemsize
+    out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
+    top, bottom = (min(max(row, 0), rows) for row in (from_row, from_row + height))
+    left, right = (min(max(col, 0), cols) for col in (from_col, from_col + width))
+    known = squared[: rows * cols].reshape(rows, cols)[top:bottom, left:right]
+    out[...] = beyond
+    out[top - from_row : bottom - from_row, left - from_col : right - from_col] = density[np.minimum(known, cap)]
 
 
 def field_cell(col: np.ndarray, row: np.ndarray, rows: int, cols: int) -> np.ndarray:

@@ -1,6 +1,8 @@
 // Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000): all integers.
-// A pass works on parallel lines of a grid. Line i starts at i * line_stride; its cells are step apart. The host
-// decides which axis goes first, so that neighbouring work-items read neighbouring cells where that pays.
+// Processors take a work-item a line, whose work grows with its length alone. A pass works on parallel lines of a grid:
+// line i starts at i * line_stride, its cells are step apart. GPUs, which want more work-items than a map has lines, take
+// one a cell: it looks around itself only as far as something nearer may be.
+// requires: bits
 
 #define NO_OBSTACLE (-1)
 #define UNREACHABLE 0x7fffffff
@@ -65,4 +67,68 @@ kernel void distance_envelope(global const int *along, global int *starts, globa
         vertex[(long)i * step] = parabola(i, v, across[(long)v * step]);
         if (s == i) --top;
     }
+}
+
+// ---- a work-item a cell
+
+// Beyond all distances: the sum of its square and a distance's fits into 32 bits, without a sign.
+#define FAR 46341
+#define BLOCK_BITS 5
+#define BLOCK_ROWS (1 << BLOCK_BITS)
+
+// First pass, one work-item a cell: cells to the nearest occupied cell of the same row, FAR if it is over reach.
+kernel void distance_bits(global const int *bits, global ushort *nearest, const int rows, const int cols,
+                          const int words, const int reach) {
+    const int col = get_global_id(0), row = get_global_id(1);
+    if (row >= rows || col >= cols) return;
+    global const int *line = bits + (long)row * words;
+    const int left = cells_left(line, col, reach);
+    const int cells = min(left, cells_right(line, words, col, min(left, reach)));
+    nearest[(long)row * cols + col] = (ushort)(cells > reach ? FAR : cells);
+}
+
+// One work-item a column of a block of rows: the least of its numbers.
+kernel void distance_blocks(global const ushort *nearest, global ushort *blocks, const int rows, const int cols,
+                            const int count) {
+    const int col = get_global_id(0), block = get_global_id(1);
+    if (block >= count || col >= cols) return;
+    const int last = min((block + 1) * BLOCK_ROWS, rows);
+    int least = FAR;
+    for (int row = block * BLOCK_ROWS; row < last; ++row) least = min(least, (int)nearest[(long)row * cols + col]);
+    blocks[(long)block * cols + col] = (ushort)least;
+}
+
+// Sum of two squares.
+uint squares_sum(const uint a, const uint b) { return a * a + b * b; }
+
+// Second pass, one work-item a cell: the least sum of squares along its column, UNREACHABLE if it is over most. Near
+// rows are looked at one by one. Of farther ones the blocks' least numbers give first a bound from above, and then which
+// blocks may hold less.
+kernel void distance_search(global const ushort *nearest, global const ushort *blocks, global int *squared,
+                            const int rows, const int cols, const int count, const int most) {
+    const int col = get_global_id(0), row = get_global_id(1);
+    if (row >= rows || col >= cols) return;
+    global const ushort *column = nearest + col, *block = blocks + col;
+    // One more than may be found.
+    uint best = min(squares_sum(0, column[(long)row * cols]), (uint)most + 1);
+    int i = 1;
+    for (; i <= BLOCK_ROWS && (uint)(i * i) < best; ++i) {
+        if (i <= row) best = min(best, squares_sum(i, column[(long)(row - i) * cols]));
+        if (row + i < rows) best = min(best, squares_sum(i, column[(long)(row + i) * cols]));
+    }
+    // Blocks begin beyond what has been seen, so all rows of a block lie on one side.
+    for (int pass = (uint)(i * i) < best ? 0 : 2; pass < 2; ++pass) {
+        for (int way = -1; way <= 1; way += 2) {
+            for (int b = (row + way * i) >> BLOCK_BITS; b >= 0 && b < count; b += way) {
+                const int begin = b * BLOCK_ROWS, end = min(begin + BLOCK_ROWS, rows) - 1;
+                const int near = max(way > 0 ? begin - row : row - end, i), far = way > 0 ? end - row : row - begin;
+                if ((uint)(near * near) >= best) break;
+                const uint least = block[(long)b * cols];
+                if (pass == 0) best = min(best, squares_sum(far, least) + 1);
+                if (pass == 0 || squares_sum(near, least) >= best) continue;
+                for (int j = near; j <= far; ++j) best = min(best, squares_sum(j, column[(long)(row + way * j) * cols]));
+            }
+        }
+    }
+    squared[(long)row * cols + col] = best > (uint)most ? UNREACHABLE : (int)best;
 }

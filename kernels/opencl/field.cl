@@ -4,13 +4,15 @@
 
 #define FIELD_RING 2
 
-// Log density of each cell from its squared distance by a table of all squared distances up to the cap.
+// Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
+// squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is beyond.
 kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
-                       const int cols, const int cap) {
-    const int col = get_global_id(0), row = get_global_id(1);
-    if (row >= rows || col >= cols) return;
-    const long cell = (long)(row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING;
-    table[cell] = density[min(squared[(long)row * cols + col], cap)];
+                       const int cols, const int cap, const real beyond, const int from_col, const int from_row,
+                       const int width, const int height, const int begin, const int stride) {
+    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
+    if (i >= width || j >= height) return;
+    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
+    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
 }
 
 // i held to [0, last]; some drivers call clamp as a function.

@@ -186,7 +186,9 @@ def make(name, flags):
     ZERO = real(0.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
 
-    # Log density of each cell from its squared distance by a table of all squared distances up to the cap.
+    # Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
+    # squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is
+    # beyond.
     @kernel
     def fill_field(
         squared: wp.array(dtype=wp.int32),
@@ -195,12 +197,23 @@ def make(name, flags):
         rows: wp.int32,
         cols: wp.int32,
         cap: wp.int32,
+        beyond: real,
+        from_col: wp.int32,
+        from_row: wp.int32,
+        width: wp.int32,
+        height: wp.int32,
+        begin: wp.int32,
+        stride: wp.int32,
     ):
-        row, col = wp.tid()
-        if row >= rows or col >= cols:
+        j, i = wp.tid()
+        if i >= width or j >= height:
             return
-        cell = (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
-        table[cell] = density[wp.min(squared[row * cols + col], cap)]
+        col = from_col + i
+        row = from_row + j
+        value = beyond
+        if col >= 0 and col < cols and row >= 0 and row < rows:
+            value = density[wp.min(squared[row * cols + col], cap)]
+        table[begin + j * stride + i] = value
 
     # One work-item a particle. The table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
     # capped distances in metres where it is interpolated.

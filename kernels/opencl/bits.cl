@@ -1,0 +1,27 @@
+// Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit; what a row lacks
+// to a whole word is 0. A look at a word is a look at 32 cells.
+
+#define NONE 0x7fffffff
+
+// Places of the lowest and highest 1 of a word that is not 0.
+int lowest_bit(const uint word) { return 31 - (int)clz(word & (~word + 1)); }
+int highest_bit(const uint word) { return 31 - (int)clz(word); }
+
+// Cells from a cell to the first occupied one to its right, itself included; NONE if none is within most cells. What is
+// farther may be found, too.
+int cells_right(global const int *row, const int words, const int col, const int most) {
+    const int last = min((col + most) >> 5, words - 1);
+    int i = col >> 5;
+    uint word = (uint)row[i] & (0xffffffffu << (col & 31));
+    while (word == 0 && i < last) word = (uint)row[++i];
+    return word == 0 ? NONE : 32 * i + lowest_bit(word) - col;
+}
+
+// The same to its left.
+int cells_left(global const int *row, const int col, const int most) {
+    const int last = max(col - most, 0) >> 5;
+    int i = col >> 5;
+    uint word = (uint)row[i] & (0xffffffffu >> (31 - (col & 31)));
+    while (word == 0 && i > last) word = (uint)row[--i];
+    return word == 0 ? NONE : col - 32 * i - highest_bit(word);
+}

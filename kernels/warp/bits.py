@@ -1,0 +1,89 @@
+"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit; what a row lacks
+to a whole word is 0. A look at a word is a look at 32 cells.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+NONE = wp.constant(0x7FFFFFFF)
+ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
+
+
+# Places of the lowest and highest 1 of a word that is not 0.
+@wp.func
+def lowest_bit(word: wp.uint32):
+    rest = word
+    place = int(0)
+    if rest & wp.uint32(0xFFFF) == wp.uint32(0):
+        rest = rest >> wp.uint32(16)
+        place += 16
+    if rest & wp.uint32(0xFF) == wp.uint32(0):
+        rest = rest >> wp.uint32(8)
+        place += 8
+    if rest & wp.uint32(0xF) == wp.uint32(0):
+        rest = rest >> wp.uint32(4)
+        place += 4
+    if rest & wp.uint32(0x3) == wp.uint32(0):
+        rest = rest >> wp.uint32(2)
+        place += 2
+    if rest & wp.uint32(0x1) == wp.uint32(0):
+        place += 1
+    return place
+
+
+@wp.func
+def highest_bit(word: wp.uint32):
+    rest = word
+    place = int(0)
+    if rest >> wp.uint32(16) != wp.uint32(0):
+        rest = rest >> wp.uint32(16)
+        place += 16
+    if rest >> wp.uint32(8) != wp.uint32(0):
+        rest = rest >> wp.uint32(8)
+        place += 8
+    if rest >> wp.uint32(4) != wp.uint32(0):
+        rest = rest >> wp.uint32(4)
+        place += 4
+    if rest >> wp.uint32(2) != wp.uint32(0):
+        rest = rest >> wp.uint32(2)
+        place += 2
+    if rest >> wp.uint32(1) != wp.uint32(0):
+        place += 1
+    return place
+
+
+# Cells from a cell to the first occupied one to its right, itself included; NONE if none is within most cells. What is
+# farther may be found, too. The row begins at begin.
+@wp.func
+def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32, col: wp.int32, most: wp.int32):
+    last = wp.min((col + most) >> 5, words - 1)
+    i = col >> 5
+    word = wp.uint32(bits[begin + i]) & (ALL_BITS << wp.uint32(col & 31))
+    while word == wp.uint32(0) and i < last:
+        i += 1
+        word = wp.uint32(bits[begin + i])
+    cells = int(NONE)
+    if word != wp.uint32(0):
+        cells = 32 * i + lowest_bit(word) - col
+    return cells
+
+
+# The same to its left.
+@wp.func
+def cells_left(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32, most: wp.int32):
+    last = wp.max(col - most, 0) >> 5
+    i = col >> 5
+    word = wp.uint32(bits[begin + i]) & (ALL_BITS >> wp.uint32(31 - (col & 31)))
+    while word == wp.uint32(0) and i > last:
+        i -= 1
+        word = wp.uint32(bits[begin + i])
+    cells = int(NONE)
+    if word != wp.uint32(0):
+        cells = col - 32 * i - highest_bit(word)
+    return cells
+
+
+def functions(flags):
+    """cells_right and cells_left; no flag changes them."""
+    return SimpleNamespace(cells_right=cells_right, cells_left=cells_left)

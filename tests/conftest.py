@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from gpusense.backends import Backend, get_backend
+
 # Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
 
@@ -26,8 +28,6 @@ def skip_or_fail(feature: str, reason: str) -> None:
 
 def present(selection: str) -> str:
     """The tested selection string of a backend's name or selection; the test is skipped where it is absent."""
-    from gpusense.backends import get_backend
-
     chosen = next((name for name in BACKENDS if name.split(":")[0] == selection), selection)
     try:
         get_backend(chosen)
@@ -46,6 +46,12 @@ def needs() -> Callable[[str], str]:
 def backend(request: pytest.FixtureRequest) -> str:
     """The selection string of each tested backend in turn."""
     return present(request.param)
+
+
+@pytest.fixture(params=["opencl", "warp"])
+def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backend:
+    """The backend of each kernel language in turn."""
+    return get_backend(needs(request.param))
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,8 @@
 """What bad input to the map, the scanner, the parameters and the logs is made with.
 
 Each case is (id, action, exception type, message). The action takes an empty folder; the files that it reads it first
-writes to ``input`` in there, so anything outside ``input`` was left behind by the library. ``{tmp}`` in a message stands
-for the folder.
+writes to ``input`` in there, so anything outside ``input`` was left behind by the library. ``{tmp}`` in a message
+stands for the folder.
 """
 
 from __future__ import annotations

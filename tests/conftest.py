@@ -65,3 +65,9 @@ def data_dir() -> Path:
         pytest.fail(reason)
     skip_or_fail("data", reason)
     raise AssertionError(reason)
+
+
+@pytest.fixture
+def no_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without recorded data, whatever the environment names."""
+    monkeypatch.delenv("GPUSENSE_DATA", raising=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,16 @@ def needs() -> Callable[[str], str]:
 def backend(request: pytest.FixtureRequest) -> str:
     """The selection string of each tested backend in turn."""
     return present(request.param)
+
+
+def on_every_backend(*, on_warp: Callable[..., bool], **cases: Iterable[object]) -> pytest.MarkDecorator:
+    """Parametrizes a test over backends and cases, on Warp only over some: it compiles each set of flags anew."""
+    chosen = [
+        (selection, *case)
+        for selection, case in itertools.product(BACKENDS, itertools.product(*cases.values()))
+        if not selection.startswith("warp") or on_warp(**dict(zip(cases, case, strict=True)))
+    ]
+    return pytest.mark.parametrize(("backend", *cases), chosen, indirect=["backend"])
 
 
 @pytest.fixture(params=["opencl", "warp"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -133,6 +134,19 @@ def test_tables_that_take_too_long_and_late_points_are_left_out():
     assert "building its table has taken" in slow.points[1]["reason"]
     late = runner.run(plan_of(*own, deadline=-1.0))
     assert {p["reason"] for p in late.points} == {"the -1 s of this run were over"}
+
+
+def test_compiling_does_not_use_up_the_time_of_a_run():
+    compiled = []
+
+    def compile_once(scene, backend, precision):
+        if not compiled:
+            compiled.append(time.sleep(1.2))
+        return candidate(free_ranges).make(scene, backend, precision)
+
+    outcome = runner.run(plan_of(replace(candidate(free_ranges, outside="somewhere"), make=compile_once), deadline=1.0))
+    assert [p["status"] for p in outcome.points] == ["ok", "ok"]
+    assert outcome.points[0]["time"]["compile_s"] > 1.0
 
 
 # Outside candidates

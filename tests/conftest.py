@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
+
+from gpusense.backends import Backend, get_backend
 
 # Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
@@ -26,8 +29,6 @@ def skip_or_fail(feature: str, reason: str) -> None:
 
 def present(selection: str) -> str:
     """The tested selection string of a backend's name or selection; the test is skipped where it is absent."""
-    from gpusense.backends import get_backend
-
     chosen = next((name for name in BACKENDS if name.split(":")[0] == selection), selection)
     try:
         get_backend(chosen)
@@ -48,6 +49,22 @@ def backend(request: pytest.FixtureRequest) -> str:
     return present(request.param)
 
 
+def on_every_backend(*, on_warp: Callable[..., bool], **cases: Iterable[object]) -> pytest.MarkDecorator:
+    """Parametrizes a test over backends and cases, on Warp only over some: it compiles each set of flags anew."""
+    chosen = [
+        (selection, *case)
+        for selection, case in itertools.product(BACKENDS, itertools.product(*cases.values()))
+        if not selection.startswith("warp") or on_warp(**dict(zip(cases, case, strict=True)))
+    ]
+    return pytest.mark.parametrize(("backend", *cases), chosen, indirect=["backend"])
+
+
+@pytest.fixture(params=["opencl", "warp"])
+def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backend:
+    """The backend of each kernel language in turn."""
+    return get_backend(needs(request.param))
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of recorded data that GPUSENSE_DATA names; the test is skipped without it."""
@@ -59,3 +76,9 @@ def data_dir() -> Path:
         pytest.fail(reason)
     skip_or_fail("data", reason)
     raise AssertionError(reason)
+
+
+@pytest.fixture
+def no_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without recorded data, whatever the environment names."""
+    monkeypatch.delenv("GPUSENSE_DATA", raising=False)

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from bad_input_world import CASES
+from bad_input_grid import GRID_CASES
+from bad_input_logs import LOG_CASES
+from bad_input_maps import MAP_CASES
+from bad_input_scanner import PARAMETER_CASES, SCANNER_CASES
+
+CASES = [*GRID_CASES, *MAP_CASES, *SCANNER_CASES, *PARAMETER_CASES, *LOG_CASES]
 
 
 @pytest.mark.parametrize(("action", "kind", "message"), [case[1:] for case in CASES], ids=[c[0] for c in CASES])

@@ -9,6 +9,7 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
+from conftest import on_every_backend
 from oracles import Mixture, classify, informative, walk, world_ray
 
 import gpusense as gs
@@ -66,12 +67,11 @@ def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps:
     return float(abs(mp.mpf(float(found)) - truth) / (1 + abs(truth))) / eps
 
 
-@pytest.mark.parametrize("weights", WEIGHTS)
+# Three sets of weights reach all of Warp's mixture code.
+@on_every_backend(weights=WEIGHTS, on_warp=lambda weights: weights in ("all", "hit and short", "hardly any rand"))
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_mixture_on_a_stiff_grid(weights, precision, backend):
     """Through the model: a corridor with poses at chosen distances from its wall, all rays along it."""
-    if backend.startswith("warp") and weights not in ("all", "hit and short", "hardly any rand"):
-        pytest.skip("three sets of weights reach all of Warp's mixture code, and each is compiled anew")
     real = np.dtype(precision)
     cells = np.zeros((1, 64), int)
     cells[0, -1] = 100
@@ -230,10 +230,9 @@ def model_of(backend: str, precision: str = "float64", specialize: bool = True, 
 
 
 @pytest.mark.parametrize("specialize", [True, False])
-@pytest.mark.parametrize("options", OPTIONS)
+# The other options are host code.
+@on_every_backend(options=OPTIONS, on_warp=lambda options: options in ("plain", "range_min", "three beams", "mount"))
 def test_whole_scans(options, specialize, backend):
-    if backend.startswith("warp") and options not in ("plain", "range_min", "three beams", "mount"):
-        pytest.skip("host code again, and each set of flags is compiled anew")
     chosen = dict(OPTIONS[options])
     model = model_of(backend, specialize=specialize, **chosen)
     _, poses = room()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from gpusense.signatures import lanes_of
 from gpusense.tolerances import beam_tolerance, differing
 
 RANGE = 9.0
+KERNELS = ("cast_ranges", "score_beams", "score_field")
 
 
 @pytest.fixture
@@ -55,23 +57,38 @@ def results(device, particles: int, beams: int, outside: str):
     for name, model in (("beam", beam), ("field", field)):
         found[f"{name} log p"], found[f"{name} parts"] = model.log_likelihood(poses, z, per_beam=True)
         assert differing(model.log_likelihood(poses, z), found[f"{name} log p"]) == 0
-    return found, beam, field
+    return found
+
+
+@pytest.fixture
+def compiled(device, monkeypatch):
+    """The lanes of every kernel that was asked for, by its name."""
+    backend, found = device(1), defaultdict(set)
+    compile_ = backend.compile
+
+    def record(kernel, flags):
+        found[kernel].add(lanes_of(flags))
+        return compile_(kernel, flags)
+
+    monkeypatch.setattr(backend, "compile", record)
+    return found
 
 
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 @pytest.mark.parametrize(("particles", "beams"), [(1, 1), (7, 15), (8, 16), (17, 33), (40, 200)])
 @pytest.mark.parametrize("lanes", [8, 16])
-def test_lanes_have_the_bits_of_one(lanes, particles, beams, outside, device):
-    one, *_ = results(device(1), particles, beams, outside)
-    found, beam, field = results(device(lanes), particles, beams, outside)
+def test_lanes_have_the_bits_of_one(lanes, particles, beams, outside, device, compiled):
+    one = results(device(1), particles, beams, outside)
+    assert all(compiled[kernel] == {1} for kernel in KERNELS)
+    compiled.clear()
+    found = results(device(lanes), particles, beams, outside)
+    assert all(compiled[kernel] == {lanes} for kernel in KERNELS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
     # Drivers have elementary functions of their own for vectors.
     allowed = beam_tolerance(np.float32).twice()
     for name in ("beam parts", "beam log p"):
         assert allowed.difference(found[name], one[name]) <= allowed.value, name
-    if beam._last_code:
-        assert lanes_of(beam._last_code) == lanes_of(field._last_code) == lanes
 
 
 @pytest.mark.parametrize("lanes", [8, 16])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import on_every_backend
 
 import gpusense as gs
 from gpusense import region
@@ -209,11 +210,9 @@ def assert_same_numbers(kind: str, backend: str, precision: str, scene: dict[str
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@on_every_backend(precision=["float32", "float64"], on_warp=lambda precision: precision == "float32")
 @pytest.mark.parametrize("scene", SCENES)
 def test_leaving_out_changes_no_number(kind, precision, scene, backend):
-    if backend.startswith("warp") and precision == "float64":
-        pytest.skip("host code again, and each set of flags is compiled anew")
     assert_same_numbers(kind, backend, precision, SCENES[scene], None)
 
 

@@ -33,7 +33,7 @@ PROBLEMS = ("ranges", "beam", "field")
 PRECISIONS = ("float32", "float64")
 DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
 QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 20, "seed": 0}
-# Seconds after which a quick run begins nothing more, and the longest that it builds a table.
+# Seconds of measuring after which a quick run begins nothing more, and the longest that it builds a table.
 _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
 
 _EPILOG = """\
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
     add("--slower", type=positive_number, default=1.3, metavar="F",
         help="with --compare, slower is more than F times the old times (default: %(default)s)")  # fmt: skip
-    add("--quick", action="store_true", help="small maps, few values of the knobs, float32, at most a minute")
+    add("--quick", action="store_true", help="small maps, few values of the knobs, float32: a minute, and compiling")
     add("--scene", action="append", metavar="NAME", help="a scene; may be given several times (default: all)")
     add("--map", action="append", default=[], type=Path, metavar="YAML",
         help="a map_server map as a further scene; may be given several times")  # fmt: skip

@@ -97,6 +97,26 @@ def start_walk(
     return k, t
 
 
+def start_casts(
+    flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where all rays' walks start, and what is known of their ranges before a cell is read.
+
+    Returns:
+        Cells of the origins (2, M); boundaries crossed (2, M) and distances (M,) as of ``start_walk``; ranges found so
+        far (M,), which are limit, or 0 for origins outside the grid where that is occupied; and the indices of the rays
+        that are still to be walked.
+    """
+    origin = cell.T.astype(np.int64)
+    k, t = start_walk(flags, r, cell, rows, cols, limit)
+    found = np.full(len(cell), limit, t.dtype)
+    if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
+        outside = off_grid(origin, rows, cols)
+        found[outside] = 0
+        return origin, k, t, found, np.flatnonzero(~outside)
+    return origin, k, t, found, np.flatnonzero(t < limit)
+
+
 def turn_of(direction: np.ndarray) -> np.ndarray:
     """(2, M) directions as parts of a full turn in [0, 1], to 2e-6."""
     real = direction.dtype.type

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.ray import crossed_before, crossed_until, make_ray, off_grid, start_walk
+from gpusense.reference.ray import crossed_before, crossed_until, make_ray, off_grid, start_casts
 
 
 def cast_ray(
@@ -40,14 +40,7 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin = cell.T.astype(np.int64)
-    k, t = start_walk(flags, r, cell, rows, cols, limit)
-    found = np.full(len(cell), limit, pose.dtype)
-    active = np.flatnonzero(t < limit)
-    if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
-        outside = off_grid(origin, rows, cols)
-        found[outside] = 0
-        active = np.flatnonzero(~outside)
+    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
     plane = (np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)) * ((rows + 2) * (cols + 2)) + (cols + 3)
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)

@@ -1,0 +1,115 @@
+"""Flags that are off leave no trace in the code; what Warp makes rounds each operation and is made once."""
+
+from __future__ import annotations
+
+import functools
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kernel_scenes import PRECISIONS, scene_flags
+
+from gpusense._kernel_files import warp_module
+from gpusense.backends import get_backend
+from gpusense.signatures import FLAGS, KERNELS
+from gpusense.sources import assemble, relevant
+
+# Kernel, the flag, flags beside it, and what only the flag's code has, in OpenCL and in Warp's C++.
+TRACES = [
+    ("cast_ranges", "FLOAT64", (), r"\bdouble\b", r"\bfloat64\b"),
+    ("cast_ranges", "ORIGINS_OUTSIDE", (), r"\benter_x\b", r"\bwp::neg\("),
+    (
+        "cast_ranges",
+        "MARCH",
+        (),
+        r"\btolerance \+",
+        r"\bwp::float32\* *var_map_table|array_t<wp::float32> var_map_table",
+    ),
+    ("score_beams", "SENSOR_TABLE", ("LINEAR",), r"\btabulated_density\(z", r"tabulated_density_\d+\("),
+    ("score_beams", "HIT", ("LINEAR", "RAND"), r"\berf\(", r"\bwp::erf\("),
+    ("score_beams", "SHORT", ("LINEAR", "RAND"), r"\btanh\(", r"\bwp::tanh\("),
+    ("score_beams", "SHORT", ("HIT",), r"\btanh\(", r"\bwp::tanh\("),
+    ("score_beams", "SHARED_RAYS", ("RAND", "LINEAR"), r"\bfirst\[", r"address\(var_first\b"),
+    ("score_beams", "ALL_READINGS", ("RAND", "LINEAR"), r"\bisnan\(", r"\bwp::isnan\("),
+    ("score_beams", "PER_BEAM", ("RAND", "LINEAR"), r"\bparts\[", r"array_store\(var_parts\b"),
+    ("score_field", "HIT", ("LINEAR",), r"\bexp\(", r"\bwp::exp\("),
+    ("score_field", "CAREFUL", ("LOG_TABLE",), r"\bcareful_offset\(", r"careful_offset_\d+\("),
+    ("score_field", "BILINEAR", ("LINEAR",), r"\bbilinear\(", r"bilinear_\d+\("),
+    ("score_field", "ALL_READINGS", ("LOG_TABLE",), r"\bisnan\(", r"\bwp::isnan\("),
+    ("score_field", "PER_BEAM", ("LOG_TABLE",), r"\bparts\[", r"array_store\(var_parts\b"),
+]
+traces = pytest.mark.parametrize(
+    ("kernel", "flag", "beside", "opencl", "warp"),
+    TRACES,
+    ids=[f"{t[0]}-{t[1]}-beside-{'-'.join(t[2])}" for t in TRACES],
+)
+
+
+def without_comments(source: str) -> str:
+    return re.sub(r"//.*", "", source)
+
+
+@traces
+def test_flags_that_are_off_leave_no_trace_in_opencl(
+    kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str
+) -> None:
+    file = KERNELS[kernel].file
+    assert re.search(opencl, without_comments(assemble(file, frozenset({flag, *beside}))))
+    source = assemble(file, frozenset(beside))
+    assert not re.search(opencl, without_comments(source))
+    assert "#if" not in source
+
+
+@traces
+def test_flags_that_are_off_leave_no_trace_in_warp(
+    kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str, needs: Callable[[str], str]
+) -> None:
+    needs("warp")
+    assert re.search(warp, warp_code(kernel, frozenset({flag, *beside})))
+    assert not re.search(warp, warp_code(kernel, frozenset(beside)))
+
+
+@functools.cache
+def warp_code(kernel: str, flags: frozenset[str]) -> str:
+    """The C++ that Warp generates for a kernel, without comments, which quote the Python source."""
+    import warp as wp
+
+    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
+    with tempfile.TemporaryDirectory() as folder:
+        wp.compile_aot_module(made.module, device="cpu", module_dir=folder)
+        (source,) = Path(folder).glob("*.cpp")
+        return without_comments(source.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_cuda_code_rounds_every_operation_by_itself(
+    precision: type, needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    import warp as wp
+
+    architectures = wp.get_cuda_supported_archs()
+    if not architectures:
+        pytest.skip("this build of Warp has no CUDA compiler")
+    made = warp_module("ranges").make("cast_ranges", scene_flags(precision, "ORIGINS_OUTSIDE"))
+    arch = min(architectures, key=lambda number: abs(number - 90))
+    wp.compile_aot_module(made.module, arch=arch, module_dir=tmp_path, use_ptx=True)
+    (code,) = tmp_path.glob("*.ptx")
+    operations = set(
+        re.findall(r"\b(?:fma|mad|mul|add|sub|div|rcp)\.\S*f(?:32|64)\b", code.read_text(encoding="utf-8"))
+    )
+    bits = "f64" if precision is np.float64 else "f32"
+    assert {f"rcp.rn.{bits}"} <= operations <= {f"{name}.rn.{bits}" for name in ("mul", "add", "sub", "div", "rcp")}
+
+
+@pytest.mark.parametrize("kernel", ["cast_ranges", "score_beams", "score_field"])
+def test_a_warp_kernel_is_made_once_for_the_flags_that_matter(kernel: str, needs: Callable[[str], str]) -> None:
+    backend = get_backend(needs("warp"))
+    all_flags = frozenset(FLAGS)
+    file = KERNELS[kernel].file
+    assert backend.compile(kernel, all_flags) is backend.compile(kernel, relevant(file, all_flags))
+    with pytest.raises(ValueError, match="flags: must be among"):
+        backend.compile(kernel, frozenset({"NO_SUCH_FLAG"}))

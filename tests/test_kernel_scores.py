@@ -1,0 +1,244 @@
+"""Kernels of the beam model and the likelihood field agree with the reference on the same inputs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from kernel_scenes import (
+    EXACT,
+    GRIDS,
+    LIMIT,
+    PRECISIONS,
+    RESOLUTION,
+    adversarial_poses,
+    assert_near,
+    directions,
+    on_both,
+    planes_of,
+    ranges_on_both,
+    run,
+    scene_flags,
+    squared_distances,
+    with_low_parts,
+)
+
+from gpusense.backends import Backend, get_backend
+from gpusense.frames import split
+from gpusense.reference.mixture import log_density
+from gpusense.tolerances import differing, per_beam, per_scan
+
+# Weights and shapes of mixtures: z_hit, z_short, z_rand, sigma_hit and lambda_short in metres.
+MIXTURES = {
+    "book": (0.7, 0.1, 0.1, 0.2, 0.1),
+    "hit and rand": (0.9, 0.0, 0.1, 0.05, 0.0),
+    "short and rand": (0.0, 0.5, 0.5, 0.2, 1e-12),
+    "rand": (0.0, 0.0, 1.0, 0.2, 0.0),
+    "steep short": (0.4, 0.4, 0.2, 0.2, 1e6),
+    "hit": (1.0, 0.0, 0.0, 0.2, 0.0),
+    "narrow hit": (1.0, 0.0, 0.0, 1e-8 * LIMIT * RESOLUTION, 0.0),
+    "narrow hit and rand": (0.9, 0.0, 0.1, 1e-6, 0.0),
+    "wide hit": (1.0, 0.0, 0.0, 1e6 * LIMIT * RESOLUTION, 0.0),
+    "short": (0.0, 1.0, 0.0, 0.2, 0.0),
+    "hit and short": (0.5, 0.5, 0.0, 0.2, 3.0),
+    "hardly any rand": (0.5, 0.5, 1e-35, 0.2, 0.3),
+}
+
+
+def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarray]:
+    """Flags and terms of the mixture kernels."""
+    z_hit, z_short, z_rand, sigma, decay = MIXTURES[name]
+    range_max = LIMIT * RESOLUTION
+    flags = {flag for flag, z in (("HIT", z_hit), ("SHORT", z_short), ("RAND", z_rand)) if z > 0}
+    if len(flags) == 1:
+        flags.add("SINGLE")
+    head = np.array([z_hit / (sigma * np.sqrt(2 * np.pi)), z_short, z_rand / range_max])
+    if head[0] > 64:
+        flags.add("SHARP")
+    if head[2] >= (1e-290 if real is np.float64 else 1e-30):
+        flags.add("LINEAR")
+    else:
+        with np.errstate(divide="ignore"):
+            head = np.log(head)
+    terms = [head[0], 0.5 / sigma**2, np.sqrt(0.5) / sigma, head[1], decay, head[2], range_max, np.log(z_max)]
+    return flags, with_low_parts(terms, real)
+
+
+def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
+    """Readings around one pose's expected ranges: equal to them, 0, next to range_max, and noisy."""
+    rng = np.random.default_rng(17)
+    range_max = real(LIMIT * RESOLUTION)
+    highest = np.nextafter(range_max, real(0))
+    reading = np.clip(expected + rng.normal(0, 0.1, expected.shape), 0, highest).astype(real)
+    reading[1::7] = np.minimum(expected[1::7], highest)
+    reading[2::11], reading[3::13] = 0, highest
+    if all_readings:
+        reading[4::9], reading[5::9] = np.nan, np.inf
+    return reading
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+@pytest.mark.parametrize("names", [(), ("ALL_READINGS", "ORIGINS_OUTSIDE", "SHARED_RAYS")])
+@pytest.mark.parametrize("name", list(MIXTURES))
+def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
+    occupied = GRIDS["rooms"]
+    flags, terms = mixture(name, real, z_max=0.05)
+    flags = scene_flags(real, "PER_BEAM", *flags, *names)
+    cell, pose = adversarial_poses(occupied, real, outside="ORIGINS_OUTSIDE" in names)
+    cell, pose = cell[:60], pose[:60]
+    ray = directions(real)
+    expected, _ = ranges_on_both(get_backend("numpy"), occupied, real, flags, cell, pose)
+    repeats = np.full(len(ray), 1)
+    if "SHARED_RAYS" in names:
+        repeats[::3], repeats[1::5] = 3, 0
+    first = np.append(0, np.cumsum(repeats)).astype(np.int32)
+    expected = np.repeat(expected, repeats, axis=1)
+    reading = scan(expected[9], real, all_readings="ALL_READINGS" in names)
+    count, readings, fixed, temperature = len(pose), len(reading), -3.25, 0.5
+    parts = np.full((count, readings), np.nan, real)
+    found = run(
+        device, "score_beams", flags, (count,), planes_of(occupied), cell, pose, ray, first, reading, terms,
+        np.zeros(1, real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings, *EXACT, 0, 0.0,
+        LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
+    )  # fmt: skip
+
+    # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
+    z = np.broadcast_to(reading.astype(np.float64), expected.shape)
+    wide = flags | {"FLOAT64"}
+    with np.errstate(all="ignore"):
+        truth = log_density(wide, z, expected.astype(np.float64), terms.astype(np.float64))
+    truth = np.where(np.isnan(z), 0.0, np.where(np.isinf(z), float(terms[7]), truth))
+    assert_near(found["parts"], truth, per_beam(truth, real))
+    total = temperature * (truth.sum(axis=1) + fixed)
+    assert_near(found["log_p"], total, per_scan(truth, real, fixed=fixed, temperature=temperature))
+
+
+def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
+    occupied, real = GRIDS["rooms"], np.float32
+    flags, terms = mixture("book", real, z_max=0.05)
+    cell, pose = adversarial_poses(occupied, real, outside=False)
+    count, none = len(pose), np.zeros(0, real)
+    found = run(
+        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), cell, pose, np.zeros((0, 2), real),
+        np.zeros(1, np.int32), none, terms, none, np.empty(count, real), none, *occupied.shape, count, 0, 0, *EXACT,
+        0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
+    )  # fmt: skip
+    assert (found["log_p"] == -1.5).all()
+
+
+# ---- the likelihood field
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+def test_the_table_is_filled_inside_its_ring(real: type, device: Backend) -> None:
+    squared = squared_distances(GRIDS["sparse"])
+    rows, cols = squared.shape
+    cap = 50
+    density = np.random.default_rng(19).random(cap + 1).astype(real)
+    table = np.full((rows + 4, cols + 4), -7, real)
+    call = ("fill_field", scene_flags(real), (cols, rows), squared, density, table, rows, cols, cap)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["table"], reference["table"])
+    expected = np.pad(density[np.minimum(squared, cap)], 2, constant_values=-7)
+    np.testing.assert_array_equal(found["table"], expected)
+
+
+# Flags, and whether the table holds distances.
+FIELDS = {
+    "log table": ("LOG_TABLE", "LINEAR", "HIT"),
+    "nearest": ("LINEAR", "HIT"),
+    "nearest without hit": ("LINEAR",),
+    "nearest in the log domain": ("HIT",),
+    "bilinear": ("BILINEAR", "LINEAR", "HIT"),
+    "bilinear in the log domain": ("BILINEAR", "HIT"),
+}
+
+
+def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.ndarray]:
+    """Table, terms, poses and end points; many end points lie exactly on edges and corners of cells."""
+    occupied = GRIDS["rooms"]
+    rng = np.random.default_rng(23)
+    z_hit, z_rand, sigma, range_max = 0.9, (0.1 if "LINEAR" in FIELDS[name] else 1e-40), 0.2, LIMIT * RESOLUTION
+    distance = np.minimum(np.sqrt(squared_distances(occupied)) * RESOLUTION, 1.5)
+    table = np.pad(distance, 2, constant_values=1.5)
+    terms = np.array([z_hit / (sigma * np.sqrt(2 * np.pi)), 0.5 / sigma**2, z_rand / range_max, 0.05])
+    if "LOG_TABLE" in FIELDS[name]:
+        table = np.log(terms[0] * np.exp(-0.5 * (table / sigma) ** 2) + terms[2])
+    if "LINEAR" not in FIELDS[name]:
+        terms[[0, 2]] = np.log(terms[[0, 2]])
+    terms[3] = np.log(terms[3])
+    heading = directions(np.float64)
+    count = 150
+    pose = np.empty((count, 4))
+    pose[:, :2] = rng.choice([0, 0.25, 0.5, 0.75, 1 - 2.0**-30, 0.1, 0.3], (count, 2))
+    pose[:, 2:] = heading[rng.integers(0, len(heading), count)]
+    exact = pose.copy()
+    pose, pose_low = split(exact, np.dtype(real))
+    pose[:, :2] = np.minimum(pose[:, :2], np.nextafter(real(1), real(0)))
+    pose_low = (exact - pose).astype(real)
+    cell = np.stack([rng.integers(-5, occupied.shape[1] + 5, count), rng.integers(-5, occupied.shape[0] + 5, count)], 1)
+    length = np.where(rng.random(77) < 0.5, rng.integers(0, 40, 77) * 0.25, rng.uniform(0, 40, 77))
+    end = heading[rng.integers(0, len(heading), 77)] * length[:, None]
+    end[:6] = [(0, 0), (1e6, 0), (-4e6, 3e6), (0.5, 0.5), (-0.5, 1e-9), (1e-20, -1e-20)]
+    point, point_low = split(end, np.dtype(real))
+    if all_readings:
+        point[7::10], point[8::10] = np.nan, np.inf
+        point_low[7::10], point_low[8::10] = 0, 0
+    return {
+        "table": table.astype(real),
+        "pose_cell": cell.astype(np.int32),
+        "pose": pose,
+        "pose_low": pose_low,
+        "point": point,
+        "point_low": point_low,
+        "terms": with_low_parts(terms, real),
+        "log_p": np.empty(count, real),
+        "parts": np.full((count, len(end)), np.nan, real),
+    }
+
+
+def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndarray], *fixed: float) -> Any:
+    """Outputs of the field kernel on the reference and on a device."""
+    real, (rows, cols) = scene["pose"].dtype, scene["table"].shape
+    count, readings = scene["parts"].shape
+    finite = scene["point"][np.isfinite(scene["point"])]
+    guard = 8 * np.finfo(real).eps * (np.abs(finite).max(initial=0.0) + 2)
+    return on_both(
+        device, "score_field", flags, (count,), *scene.values(), rows - 4, cols - 4, count, readings, guard, *fixed
+    )
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+@pytest.mark.parametrize("names", [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")])
+@pytest.mark.parametrize("name", list(FIELDS))
+def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
+    flags = scene_flags(real, "PER_BEAM", *FIELDS[name], *names)
+    scene = field_scene(name, real, all_readings="ALL_READINGS" in names)
+    fixed, temperature = -2.5, 0.75
+    reference, found = score_field(device, flags, scene, fixed, temperature)
+    if name == "log table":
+        assert differing(found["parts"], reference["parts"]) == 0
+    truth = reference["parts"].astype(np.float64)
+    # Both may be off by the bound.
+    assert_near(found["parts"], truth, 2 * per_beam(truth, real))
+    total = temperature * (truth.sum(axis=1) + fixed)
+    assert_near(found["log_p"], total, 2 * per_scan(truth, real, fixed=fixed, temperature=temperature))
+
+
+def test_an_impossible_end_point_makes_the_scan_impossible(device: Backend) -> None:
+    scene = field_scene("log table", np.float32, all_readings=False)
+    scene["table"][5:9] = -np.inf
+    flags = frozenset({"LOG_TABLE", "LINEAR", "HIT", "CAREFUL"})
+    reference, found = score_field(device, flags, scene, 0.0, 1.0)
+    assert np.isneginf(reference["log_p"]).any()
+    assert not np.isnan(found["log_p"]).any()
+    np.testing.assert_array_equal(np.isneginf(found["log_p"]), np.isneginf(reference["log_p"]))
+
+
+def test_low_parts_of_poses_are_read_only_where_they_are_needed(device: Backend) -> None:
+    scene = field_scene("log table", np.float32, all_readings=False)
+    flags = frozenset({"LOG_TABLE", "LINEAR", "HIT", "PER_BEAM"})
+    _, expected = score_field(device, flags, scene, 0.0, 1.0)
+    _, found = score_field(device, flags, scene | {"pose_low": scene["pose_low"][:1]}, 0.0, 1.0)
+    assert differing(found["parts"], expected["parts"]) == 0

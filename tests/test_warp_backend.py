@@ -1,0 +1,121 @@
+"""The Warp backend's buffers, launches, words and cache."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpusense.backends import Backend, get_backend
+
+
+@pytest.fixture
+def warp_backend(needs: Callable[[str], str]) -> Backend:
+    """The Warp backend."""
+    return get_backend(needs("warp"))
+
+
+def test_buffers_are_copied_by_their_heads(warp_backend: Backend) -> None:
+    real = np.dtype(np.float32)
+    buffer = warp_backend.empty(10, real, zero=True)
+    host = np.arange(4, dtype=real)
+    assert warp_backend.upload(host, buffer) is buffer
+    host[:] = -1
+    np.testing.assert_array_equal(warp_backend.download(buffer, np.empty(6, real)), [0, 1, 2, 3, 0, 0])
+    assert warp_backend.download(warp_backend.upload(np.empty((0, 2), real)), np.empty(0, real)).size == 0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float32, np.float64])
+def test_every_type_goes_to_the_device_and_back(dtype: type, warp_backend: Backend) -> None:
+    array = np.arange(24, dtype=dtype).reshape(2, 3, 4)
+    array.flags.writeable = False
+    back = warp_backend.download(warp_backend.upload(array), np.empty_like(array))
+    np.testing.assert_array_equal(back, array)
+    turned = array.T
+    np.testing.assert_array_equal(
+        warp_backend.download(warp_backend.upload(turned), np.empty((4, 3, 2), dtype)), turned
+    )
+
+
+def test_what_does_not_fit_is_a_memory_error(warp_backend: Backend) -> None:
+    with pytest.raises(MemoryError, match="cannot hold a buffer of"):
+        warp_backend.empty(warp_backend.info.max_buffer // 4 + 1, np.dtype(np.float32))
+    with pytest.raises(MemoryError, match="and 2147483647 numbers"):
+        warp_backend.empty(1 << 31, np.dtype(np.uint8))
+
+
+def test_launches_keep_no_buffer_alive(warp_backend: Backend) -> None:
+    squared = warp_backend.upload(np.zeros(6, np.int32))
+    density = warp_backend.upload(np.ones(1, np.float32))
+    table = warp_backend.empty(7 * 6, np.dtype(np.float32), zero=True)
+    fill = warp_backend.compile("fill_field", frozenset())
+    fill((2, 3), squared, density, table, 3, 2, 0)
+    alive = [weakref.ref(buffer) for buffer in (squared, density, table)]
+    assert warp_backend.download(table, np.empty((7, 6), np.float32)).sum() == 6
+    del squared, density, table
+    gc.collect()
+    assert [one() for one in alive] == [None] * 3
+
+
+def test_repeated_launches_see_what_changed(warp_backend: Backend) -> None:
+    fill = warp_backend.compile("fill_field", frozenset())
+    squared, density = np.array([0, 1, 2, 3, 4, 5], np.int32), np.arange(10, dtype=np.float32)
+    first = warp_backend.upload(squared), warp_backend.upload(density)
+    for rows, cols, cap in ((3, 2, 9), (2, 3, 9), (2, 3, 1), (1, 1, 0), (3, 2, 9)):
+        table = warp_backend.empty((rows + 4) * (cols + 4), np.dtype(np.float32), zero=True)
+        fill((cols, rows), *first, table, rows, cols, cap)
+        found = warp_backend.download(table, np.empty((rows + 4, cols + 4), np.float32))[2:-2, 2:-2]
+        np.testing.assert_array_equal(found, np.minimum(squared[: rows * cols].reshape(rows, cols), cap))
+    fill((0, 3), *first, table, 3, 0, 0)
+    with pytest.raises(ValueError, match="zip"):
+        fill((2, 3), *first)
+
+
+def test_a_buffer_of_another_type_is_refused(warp_backend: Backend) -> None:
+    doubles = warp_backend.upload(np.zeros(60))
+    squared = warp_backend.upload(np.zeros(6, np.int32))
+    with pytest.raises(RuntimeError, match="density"):
+        warp_backend.compile("fill_field", frozenset())((2, 3), squared, doubles, doubles, 3, 2, 0)
+
+
+_QUIET = """
+import numpy as np, sys
+from gpusense.backends import get_backend
+import warp as wp
+names = [name for name in ("log_level", "quiet", "cache_kernels") if hasattr(wp.config, name)]
+before = {name: getattr(wp.config, name) for name in names}
+backend = get_backend("warp:cpu")
+launch = backend.compile("square_runs", frozenset())
+cells = backend.upload(np.array([0, 0, 1, 0], np.uint8))
+runs = backend.empty(8, np.dtype(np.uint8))
+launch((1, 2), cells, runs, 1, 4)
+backend.synchronize()
+assert backend.download(runs, np.empty(8, np.uint8)).tolist() == [2, 1, 0, 1, 1, 2, 0, 1]
+assert before == {name: getattr(wp.config, name) for name in before}
+"""
+
+
+def run_quietly(folder: Path, **variables: str) -> None:
+    """Run a kernel in a new process with its Warp cache in a folder; it must print nothing at all."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(folder)} | variables
+    done = subprocess.run([sys.executable, "-c", _QUIET], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str], str], tmp_path: Path) -> None:
+    needs("warp")
+    run_quietly(tmp_path, GPUSENSE_CACHE="")
+    assert list(tmp_path.rglob("*.o"))
+
+
+def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Path) -> None:
+    needs("warp")
+    run_quietly(tmp_path, GPUSENSE_CACHE="off")
+    assert not list(tmp_path.rglob("*.o"))

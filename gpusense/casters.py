@@ -18,7 +18,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.directional import directional_table
 from gpusense.lookup_files import read_lookup
-from gpusense.prepare import check_size, quadrant_squares, squared_distances
+from gpusense.prepare import check_size, empty_rectangles, sectors_of, squared_distances
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
 _NO_OBSTACLE = np.iinfo(np.int32).max
@@ -43,10 +43,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Table:
-    """What a caster made of a map: a buffer on the device, and its size in bytes."""
+    """What a caster made of a map: a buffer on the device, its size in bytes, and the flags of kernels that read it."""
 
     buffer: Buffer
     size: int
+    flags: frozenset[str] = frozenset()
 
 
 class Caster(ABC):
@@ -85,18 +86,20 @@ class Caster(ABC):
 
 @dataclass(frozen=True)
 class Exact(Caster):
-    """A walk that crosses a whole empty square at a time."""
+    """A walk that crosses a whole empty rectangle at a time."""
 
     name = "exact"
     exact = True
     error = "exact: float64 to 1e-12 relative; float32 the same bits on every device"
-    memory = "4 bytes per cell of the reachable map"
-    precomputation = "quadrant empty squares, one pass over the map per quadrant"
+    memory = "16 bytes per cell of the reachable map, on GPUs 32, less where that is over 4 GiB"
+    precomputation = "empty rectangles, one pass over the map per quadrant"
 
     def prepare(self, backend: Backend, window: Window) -> Table:
         """See Caster.prepare."""
         rows, cols = window.obstacles.shape
-        return Table(quadrant_squares(backend, window.obstacles), 4 * (rows + 2) * (cols + 2))
+        sectors = sectors_of(backend, rows, cols)
+        flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
+        return Table(empty_rectangles(backend, window.obstacles, sectors), 8 * sectors * (rows + 2) * (cols + 2), flags)
 
 
 @dataclass(frozen=True)
@@ -252,14 +255,14 @@ class Lookup(Caster):
             entries = read_lookup(Path(self.file), window.obstacles, window.limit, window.outside, self.bins)
             return Table(backend.upload(entries), 2 * count)
         table = backend.empty(count, _SHORT)
-        squares = quadrant_squares(backend, window.obstacles)
+        rectangles = empty_rectangles(backend, window.obstacles, 1)
         turns = 2 * math.pi * np.arange(self.bins) / self.bins
         ray = backend.upload(np.stack([np.cos(turns), np.sin(turns)], axis=1).astype(_SINGLE))
         fill = backend.compile("fill_lookup", frozenset({"OUTSIDE_OCCUPIED"} if window.outside == "occupied" else ()))
         tile = max(_TILE[backend.info.kind] // (cols * self.bins), 1)
         for first in range(0, rows, tile):
             these = min(tile, rows - first)
-            fill((self.bins, these * cols), squares, ray, table, rows, cols, self.bins, first, these, window.limit)
+            fill((self.bins, these * cols), rectangles, ray, table, rows, cols, self.bins, first, these, window.limit)
             backend.synchronize()
         return Table(table, 2 * count)
 

@@ -1,4 +1,4 @@
-"""What is made of a map on the device before any particle is scored: distances and quadrant squares.
+"""What is made of a map on the device before any particle is scored: distances and empty rectangles.
 
 Processors get few long work-items, GPUs one per cell, from a map of bits that the host packs: an eighth of the bytes.
 """
@@ -21,10 +21,11 @@ _SHORT = np.dtype(np.uint16)
 _NOTHING: frozenset[str] = frozenset()
 # Kernels count cells of four padded planes in 32 bits.
 _MOST_CELLS = (1 << 31) // 4 - 1
-# The kernel files ``distance`` and ``squares`` have the same numbers.
+# The kernel files ``distance`` and ``rectangles`` have the same numbers.
 NO_OBSTACLE = (1 << 31) - 1
 _BLOCK_ROWS = 32
-SQUARE_REACH = 254
+RECTANGLE_REACH = 254
+_STACK = 1024
 
 
 def check_size(rows: int, cols: int) -> None:
@@ -93,39 +94,60 @@ def _by_cells(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: in
     search((cols, rows), nearest, least, squared, rows, cols, blocks, most)
 
 
-def quadrant_squares(
-    backend: Backend, obstacles: np.ndarray, squares: Buffer | None = None, changed: Region | None = None
+def sectors_of(backend: Backend, rows: int, cols: int) -> int:
+    """Sectors of each quadrant for which rectangles are made: more make steps longer, and tables larger.
+
+    GPUs gain most, since neighbouring rays wait for the slowest; kernels count cells of all planes in 32 bits.
+    """
+    wanted = {"gpu": 4, "cpu": 2}[backend.info.kind] if backend.info.backend != "numpy" else 1
+    while wanted > 1 and 4 * wanted * (rows + 4) * (cols + 4) >= 1 << 31:
+        wanted //= 2
+    return wanted
+
+
+def empty_rectangles(
+    backend: Backend,
+    obstacles: np.ndarray,
+    sectors: int,
+    rectangles: Buffer | None = None,
+    changed: Region | None = None,
 ) -> Buffer:
-    """Padded planes of quadrant empty squares; see the kernel file ``squares``.
+    """Padded planes of empty rectangles; see the kernel file ``rectangles``.
 
     Args:
         backend: The device.
         obstacles: (rows, cols) bool.
-        squares: The planes as they were; they are mended in place. None makes them.
+        sectors: Sectors of a quadrant: 1, 2 or 4.
+        rectangles: The planes as they were; they are mended in place. None makes them.
         changed: Where obstacles are not what they were.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
-    if squares is None or changed is None:
-        squares = backend.empty(4 * (rows + 2) * (cols + 2), _BYTE, zero=True)
+    if rectangles is None or changed is None:
+        rectangles = backend.empty(4 * sectors * (rows + 2) * (cols + 2), _SHORT, zero=True)
         changed = Region(0, 0, rows, cols)
     top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
-    first, begin = max(top - SQUARE_REACH, 0), max(left - SQUARE_REACH, 0)
-    end = min(right + SQUARE_REACH, cols)
-    near = obstacles[first : bottom + SQUARE_REACH]
+    # What the rectangles of cells that reach the changed ones may reach on their other side.
+    far = 2 * RECTANGLE_REACH
+    first, begin = max(top - far, 0), max(left - far, 0)
+    end = min(right + far, cols)
+    near = obstacles[first : bottom + far]
     band = len(near)
     runs = backend.empty(2 * band * cols, _BYTE)
-    place = (rows, cols, first, band, top, left, bottom, right)
+    place = (rows, cols, sectors, first, band, top, left, bottom, right)
     if backend.info.kind == "cpu":
-        backend.compile("square_runs", _NOTHING)((band, 2), backend.upload(_bytes(near)), runs, band, cols, begin, end)
-        backend.compile("squares_rows", _NOTHING)((4,), runs, squares, *place)
+        strips, height = -(-(end - begin) // 64), min(changed.rows + RECTANGLE_REACH, rows)
+        columns = backend.compile("free_columns", _NOTHING)
+        columns((strips, 2), backend.upload(_bytes(near)), runs, band, cols, begin, end)
+        stack = backend.empty(_STACK * height, _INT)
+        backend.compile("rectangles_rows", _NOTHING)((height, 4), runs, stack, rectangles, *place)
     else:
         words, bits = -(-cols // 32), backend.upload(packed(near))
-        backend.compile("square_bits", _NOTHING)((end - begin, band), bits, runs, band, cols, words, begin, end)
-        size = (min(changed.cols + SQUARE_REACH, cols), min(changed.rows + SQUARE_REACH, rows), 4)
-        backend.compile("squares_scan", _NOTHING)(size, runs, squares, *place)
+        backend.compile("free_rows", _NOTHING)((end - begin, band), bits, runs, band, cols, words, begin, end)
+        size = (min(changed.cols + RECTANGLE_REACH, cols), min(changed.rows + RECTANGLE_REACH, rows), 4)
+        backend.compile("rectangles_scan", _NOTHING)(size, runs, rectangles, *place)
     backend.synchronize()
-    return squares
+    return rectangles
 
 
 def _bytes(obstacles: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from gpusense.models.beam import BeamModel
 from gpusense.models.caster import RayCaster
 from gpusense.models.field import LikelihoodFieldModel
 from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.prepare import distance_transform, quadrant_squares
+from gpusense.prepare import distance_transform, empty_rectangles
 from gpusense.reference import field as field_kernels
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.mixture import log_density
@@ -46,7 +46,7 @@ class Launch:
     Attributes:
         kernel: ``"score_beams"`` or ``"score_field"``.
         flags: Flags of its code.
-        values: Arrays cut to their shapes, without the map's squares, and scalars rounded as the device got them.
+        values: Arrays cut to their shapes, without the map's rectangles, and scalars rounded as the device got them.
         expected: (particles, rays) expected ranges of the same device for a beam launch, else None.
     """
 
@@ -255,8 +255,9 @@ def own_results(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     name, obstacles = backend.info.selection, scene.grid.obstacles()
     rows, cols = obstacles.shape
     squared, exact = distance_transform(obstacles, backend=backend), TOLERANCES["distance transform"]
-    planes = backend.download(quadrant_squares(backend, obstacles), np.empty(4 * (rows + 2) * (cols + 2), np.uint8))
-    results: Results = {exact.name: (squared, exact), "quadrant squares": (planes, TOLERANCES["quadrant squares"])}
+    planes = backend.download(empty_rectangles(backend, obstacles, 1), np.empty(4 * (rows + 2) * (cols + 2), np.uint16))
+    sides = np.minimum(planes & 255, planes >> 8)
+    results: Results = {exact.name: (squared, exact), "empty squares": (sides, TOLERANCES["empty squares"])}
     checks = [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]
     launches: dict[str, Launch] = {}
     for precision in ("float32", "float64")[: 1 + backend.info.float64]:

@@ -23,6 +23,8 @@ FLAGS = {
     "SHARP": "the normal density's peak is so high that exponents need more than the working precision",
     "SINGLE": "the mixture has one continuous component",
     "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
+    "SECTORS_2": "empty rectangles are made for 2 sectors of each quadrant's directions",
+    "SECTORS_4": "empty rectangles are made for 4 of them",
     "DDA": "rays are cast cell by cell",
     "MARCH": "rays are cast by marching through the distance field",
     "BRESENHAM": "rays are cast along Bresenham's lines",
@@ -126,9 +128,9 @@ _POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
 # A map as a caster has it: what an entry is, and how many there are, is the caster's.
 _CAST = ("entry map_table [map]",)
 _CASTER = ("int bins", "real slack", "real tolerance")
-_SQUARES = (
-    "uchar runs [2 * band * cols]", "out uchar squares [4 * (rows + 2) * (cols + 2)]", *_MAP, "int first", "int band",
-    "int top", "int left", "int bottom", "int right",
+_PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
+_CHANGED = (
+    *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right",
 )  # fmt: skip
 _RANGE = ("real limit", "real resolution", "real range_max")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
@@ -153,16 +155,21 @@ KERNELS: dict[str, Kernel] = {
         "distance", "col row", "ushort nearest [rows * cols]", "ushort blocks [count * cols]",
         "out int squared [rows * cols]", *_MAP, "int count", "int most",
     ),
-    "square_runs": _kernel(
-        "squares", "row direction", "uchar occupied [band * cols]", "out uchar runs [2 * band * cols]", "int band",
-        "int cols", "int begin", "int end", group=16,
+    "free_columns": _kernel(
+        "rectangles", "strip direction", "uchar occupied [band * cols]", "out uchar runs [2 * band * cols]",
+        "int band", "int cols", "int begin", "int end", group=1,
     ),
-    "square_bits": _kernel(
-        "squares", "col row", "int bits [band * words]", "out uchar runs [2 * band * cols]", "int band", "int cols",
+    "rectangles_rows": _kernel(
+        "rectangles", "row quadrant", "uchar runs [2 * band * cols]", "out int stack [1024 * rows]",
+        f"out {_PLANES}", *_CHANGED, group=1,
+    ),
+    "free_rows": _kernel(
+        "rectangles", "col row", "int bits [band * words]", "out uchar runs [2 * band * cols]", "int band", "int cols",
         "int words", "int begin", "int end",
     ),
-    "squares_rows": _kernel("squares", "plane", *_SQUARES, group=1),
-    "squares_scan": _kernel("squares", "col row plane", *_SQUARES),
+    "rectangles_scan": _kernel(
+        "rectangles", "col row quadrant", "uchar runs [2 * band * cols]", f"out {_PLANES}", *_CHANGED,
+    ),
     "cast_ranges": _kernel(
         "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,
         "int particles", "int rays", *_CASTER, *_RANGE, wide=True,
@@ -174,7 +181,7 @@ KERNELS: dict[str, Kernel] = {
         wide_group=16,
     ),
     "fill_lookup": _kernel(
-        "lookup_table", "bin cell", "uchar squares [4 * (rows + 2) * (cols + 2)]", "real2 ray [bins]",
+        "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",
         "out ushort lookup [rows * cols * bins]", *_MAP, "int bins", "int first_row", "int count", "real limit",
     ),
     "fill_field": _kernel(

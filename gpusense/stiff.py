@@ -23,7 +23,7 @@ from gpusense.models.beam import BeamModel
 from gpusense.models.caster import RayCaster
 from gpusense.models.field import LikelihoodFieldModel
 from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.prepare import quadrant_squares
+from gpusense.prepare import empty_rectangles
 from gpusense.reference.densities import log_mixture, naive_log_mixture
 from gpusense.scanner import Scanner
 from gpusense.selftest import Launch, Recorder, replay
@@ -99,13 +99,13 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
     ulp = float(np.spacing(real.type(RANGE_MAX / 2)))
     poses = np.full((8, 4), (0.5, 0.5, 1.0, 0.0), real)
     poses[1:7, 0] = 1 - ulp / 16, 0.9990234375, 0.5, 0.7109375, 0.328125, ulp
-    squares, count = quadrant_squares(device, obstacles), len(poses)
+    rectangles, count = empty_rectangles(device, obstacles, 1), len(poses)
     cells = device.upload(np.array([(c, 0) for c in (40, 39, 39, 39, 37, 31, 24, 20)], np.int32))
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())
     world, limits = (*obstacles.shape, count, 1), (RANGE_MAX, 1.0, RANGE_MAX)
     exact, none = (0, 0.0, 0.0), device.empty(1, real)
-    device.compile("cast_ranges", wide)((1, count), squares, cells, pose, ray, ranges, *world, *exact, *limits)
+    device.compile("cast_ranges", wide)((1, count), rectangles, cells, pose, ray, ranges, *world, *exact, *limits)
     expected = device.download(ranges, np.empty(count, real))
 
     # Warp takes seconds for each set of flags, so there everything is compiled in, once.
@@ -124,7 +124,7 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
             z = np.clip(np.concatenate([expected, bends]), 0, RANGE_MAX - ulp).astype(real)
             parts, first = device.empty(count * len(z), real), np.array([0, len(z)], np.int32)
             device.compile("score_beams", flags | model._components)(
-                (count,), squares, cells, pose, ray, device.upload(first), device.upload(z),
+                (count,), rectangles, cells, pose, ray, device.upload(first), device.upload(z),
                 device.upload(model._terms), none, device.empty(count, real), parts, *world, len(z), *exact, 0, 0.0,
                 *limits, 0.0, 1.0,
             )  # fmt: skip

@@ -69,7 +69,7 @@ class Tolerance:
 
 _ALL = (
     Tolerance("distance transform", 0, "cells that differ", "squared distances are integers, found exactly"),
-    Tolerance("quadrant squares", 0, "cells that differ", "sides are integers from 0 to 255, found exactly"),
+    Tolerance("empty squares", 0, "cells that differ", "shorter sides of empty rectangles are integers, found exactly"),
     Tolerance(
         "float32 ranges", 0, "values with other bits",
         "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines come "

@@ -180,8 +180,10 @@ class MapCaster:
         self.limit = range_max / grid.resolution
         self.method, self.outside, self.table_bytes = method, outside, 0
         self.map = ReachableMap(backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole)
-        self.flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
-        self.flags |= {method.flag} if method.flag else set()
+        self._own_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
+        self._own_flags |= {method.flag} if method.flag else set()
+        # Those of the table once there is one.
+        self.flags = self._own_flags
         self._wide = {"FLOAT64"} if real == np.float64 else set()
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
@@ -200,6 +202,7 @@ class MapCaster:
     def _prepare(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
         table = self.method.prepare(backend, Window(obstacles, self.limit, self.outside))
         self.table_bytes = table.size
+        self.flags = self._own_flags | table.flags
         return table.buffer
 
     def prepare(self, poses: np.ndarray) -> None:

@@ -11,7 +11,7 @@ BLOCK = 1 << 15
 
 def fill_lookup(
     flags: frozenset[str],
-    squares: np.ndarray,
+    rectangles: np.ndarray,
     ray: np.ndarray,
     lookup: np.ndarray,
     rows: int,
@@ -32,6 +32,6 @@ def fill_lookup(
         pose[:, :2] = 0.5
         pose[:, 2:] = np.tile(ray[:bins], (len(index), 1))
         forward = np.broadcast_to(np.array([1, 0], ray.dtype), (len(cell), 2))
-        t = cast_ray(flags, squares, rows, cols, cell, pose, forward, limit, 0, none, none)
+        t = cast_ray(flags, rectangles, rows, cols, cell, pose, forward, limit, 0, none, none)
         part = np.minimum((t * (real(65535) / limit) + real(0.5)).astype(np.int64), 65534)
         lookup[begin * bins : begin * bins + len(t)] = np.where(t >= limit, 65535, part)

@@ -47,20 +47,14 @@ def make_ray(pose: np.ndarray, ray: np.ndarray) -> Ray:
     return Ray(direction, np.where(ahead, 1, -1), speed, 1 / speed, np.where(ahead, 1 - fraction, fraction))
 
 
-def crossed_before(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray) -> np.ndarray:
-    """Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t."""
-    guess = np.maximum(np.ceil(t * speed - a), 0)
-    more = (guess + a) * inv < t
-    fewer = (guess > 0) & ((guess - 1 + a) * inv >= t) & ~more
-    return guess + more - fewer
+def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, until: np.ndarray | bool) -> np.ndarray:
+    """Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
 
-
-def crossed_until(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray) -> np.ndarray:
-    """The same, those at t included."""
-    guess = np.maximum(np.floor(t * speed - a) + 1, 0)
-    more = (guess + a) * inv <= t
-    fewer = (guess > 0) & ((guess - 1 + a) * inv > t) & ~more
-    return guess + more - fewer
+    Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
+    """
+    k = np.maximum(np.rint(t * speed - a), 0)
+    here = (k + a) * inv
+    return k + np.where(until, here <= t, here < t)
 
 
 def off_grid(at: np.ndarray, rows: int, cols: int) -> np.ndarray:
@@ -87,8 +81,8 @@ def start_walk(
     when = np.maximum(entry[0], entry[1])
     enters = outside & (when >= 0) & (when < limit)
     by_x = entry[0] > entry[1]
-    k_x = np.where(by_x, ahead[0], crossed_until(when, r.speed[0], r.a[0], r.inv[0]))
-    k_y = np.where(by_x, crossed_before(when, r.speed[1], r.a[1], r.inv[1]), ahead[1])
+    k_x = np.where(by_x, ahead[0], crossed(when, r.speed[0], r.a[0], r.inv[0], True))
+    k_y = np.where(by_x, crossed(when, r.speed[1], r.a[1], r.inv[1], False), ahead[1])
     k[:, enters] = np.stack([k_x, k_y])[:, enters]
     at = origin[:, enters] + r.step[:, enters] * k[:, enters].astype(np.int64)
     enters[enters] = ~off_grid(at, rows, cols)

@@ -1,14 +1,25 @@
 """Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
 
-An Amanatides-Woo walk that crosses a whole empty square at a time and visits the same cells; ties (corners) step in x
-first.
+An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step in
+x first.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.ray import crossed_before, crossed_until, make_ray, off_grid, start_casts
+from gpusense.reference.ray import crossed, make_ray, off_grid, start_casts
+
+
+def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
+    """Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps."""
+    if sectors == 1:
+        return np.zeros(len(speed_x), np.intp)
+    steep = speed_y > speed_x
+    if sectors == 2:
+        return steep.astype(np.intp)
+    bound = np.where(steep, speed_x.dtype.type(2.4142136), speed_x.dtype.type(0.41421356))
+    return 2 * steep + (speed_y > bound * speed_x)
 
 
 def cast_ray(
@@ -28,7 +39,7 @@ def cast_ray(
 
     Args:
         flags: Flags of the signature table.
-        map_table: Padded quadrant squares, flat.
+        map_table: Padded planes of empty rectangles, flat.
         rows: Rows of the grid.
         cols: Columns of the grid.
         cell: (M, 2) integer column and row of each origin.
@@ -41,26 +52,29 @@ def cast_ray(
     """
     r = make_ray(pose, ray)
     origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
-    plane = (np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)) * ((rows + 2) * (cols + 2)) + (cols + 3)
+    quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
+    sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
+    plane = quadrant * sectors + sector_of(sectors, *r.speed)
+    table = plane * ((rows + 2) * (cols + 2)) + (cols + 3)
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        side = map_table[plane[active] + at[1] * (cols + 2) + at[0]]
-        stopped = side == 0
+        sides = map_table[table[active] + at[1] * (cols + 2) + at[0]]
+        stopped = sides == 0
         if stopped.any():
             hit = stopped if "OUTSIDE_OCCUPIED" in flags else stopped & ~off_grid(at, rows, cols)
             found[active[hit]] = t[active[hit]]
-            active, side = active[~stopped], side[~stopped]
-        speed, a, inv, crossed = r.speed[:, active], r.a[:, active], r.inv[:, active], k[:, active]
-        jump = side.astype(pose.dtype)
-        t_x, t_y = (crossed + (jump - 1) + a) * inv
-        now = np.minimum(t_x, t_y)
+            active, sides = active[~stopped], sides[~stopped]
+        speed, a, inv = r.speed[:, active], r.a[:, active], r.inv[:, active]
+        far = k[:, active] + (np.stack([sides & 255, sides >> 8]).astype(pose.dtype) - 1)
+        t_x, t_y = (far + a) * inv
         by_x = t_x <= t_y
+        now = np.where(by_x, t_x, t_y)
         other = by_x.astype(np.intp)
         own, lane = 1 - other, np.arange(len(active))
-        pick = (speed[other, lane], a[other, lane], inv[other, lane])
-        crossed[own, lane] += jump
-        crossed[other, lane] = np.where(by_x, crossed_before(now, *pick), crossed_until(now, *pick))
-        k[:, active] = crossed
+        aside = crossed(now, speed[other, lane], a[other, lane], inv[other, lane], ~by_x)
+        far[own, lane] += 1
+        far[other, lane] = aside
+        k[:, active] = far
         t[active] = now
         active = active[now < limit]
     return found

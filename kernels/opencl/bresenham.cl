@@ -1,7 +1,7 @@
 // Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as nav2_amcl and Beluga
 // cast: distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
 // The table holds 1 for occupied cells in a ring of twos.
-// requires: squares ray
+// requires: rectangles ray
 
 typedef uchar entry;
 

@@ -1,6 +1,6 @@
 // Expected range by the plain walk of Amanatides and Woo (1987), cell by cell: exact, and the same bits as the exact
 // caster's. The table holds 1 for occupied cells in a ring of twos.
-// requires: squares ray
+// requires: rectangles ray
 
 typedef uchar entry;
 

@@ -2,13 +2,13 @@
 // requires: raycast
 
 // One work-item a bin and cell; a hit is 65 534 parts of the limit at most.
-kernel void fill_lookup(global const uchar *squares, global const real2 *ray, global ushort *lookup, const int rows,
+kernel void fill_lookup(global const ushort *rectangles, global const real2 *ray, global ushort *lookup, const int rows,
                         const int cols, const int bins, const int first_row, const int count, const real limit) {
     const int bin = get_global_id(0), index = get_global_id(1);
     if (bin >= bins || index >= count * cols) return;
     const int row = first_row + index / cols, col = index % cols;
     const real4 pose = (real4)((real)0.5, (real)0.5, ray[bin].x, ray[bin].y);
-    const real t = cast_ray(squares, rows, cols, (int2)(col, row), pose, (real2)(1, 0), limit, 0, 0, 0);
+    const real t = cast_ray(rectangles, rows, cols, (int2)(col, row), pose, (real2)(1, 0), limit, 0, 0, 0);
     const int part = (int)(t * ((real)65535 / limit) + (real)0.5);
     lookup[((long)row * cols + col) * bins + bin] = (ushort)(t >= limit ? 65535 : part > 65534 ? 65534 : part);
 }

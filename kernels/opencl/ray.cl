@@ -37,25 +37,22 @@ Ray make_ray(const real4 pose, const real2 ray) {
     return r;
 }
 
-// Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t. The guess is off by one at most.
-int crossed_before(const real t, const real speed, const real a, const real inv) {
-    const real place = t * speed - a;
-    const int whole = (int)place;
-    const int above = whole + ((real)whole < place);
-    const int guess = above < 0 ? 0 : above;
-    if (((real)guess + a) * inv < t) return guess + 1;
-    if (guess > 0 && ((real)(guess - 1) + a) * inv >= t) return guess - 1;
-    return guess;
-}
+// Counts of boundaries are whole real numbers, which spares the conversions: adding and taking off a large number rounds
+// to nearest, and the digits of a sum with one hold the integer.
+#if FLOAT64
+#define ROUNDING ((real)6755399441055744.0)
+int whole_int(const real k) { return (int)k; }
+#else
+#define ROUNDING ((real)12582912)
+int whole_int(const real k) { return as_int(k + (real)8388608) - 0x4b000000; }
+#endif
 
-// The same, those at t included.
-int crossed_until(const real t, const real speed, const real a, const real inv) {
-    const real place = t * speed - a;
-    const int whole = (int)place;
-    const int guess = whole - ((real)whole > place) + 1;
-    if (((real)guess + a) * inv <= t) return guess + 1;
-    if (guess > 0 && ((real)(guess - 1) + a) * inv > t) return guess - 1;
-    return guess;
+// Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
+// Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
+real crossed(const real t, const real speed, const real a, const real inv, const int until) {
+    const real place = ((t * speed - a) + ROUNDING) - ROUNDING, k = place > 0 ? place : 0;
+    const real here = (k + a) * inv;
+    return (until ? here <= t : here < t) ? k + 1 : k;
 }
 
 // Whether a cell is none of the grid's.
@@ -78,10 +75,10 @@ Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, co
         if (!(t >= 0 && t < limit)) return walk;
         if (enter_t_x > enter_t_y) {
             walk.k_x = enter_x;
-            walk.k_y = crossed_before(t, r.speed_y, r.a_y, r.inv_y);
+            walk.k_y = whole_int(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
         } else {
             walk.k_y = enter_y;
-            walk.k_x = crossed_until(t, r.speed_x, r.a_x, r.inv_x);
+            walk.k_x = whole_int(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
         }
         if (!off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols)) walk.t = t;
     }

@@ -1,9 +1,33 @@
 // Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
-// An Amanatides-Woo walk that crosses a whole empty square at a time and visits the same cells; ties (corners) step in
-// x first.
-// requires: lanes squares ray
+// An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step
+// in x first.
+// requires: lanes rectangles ray
 
-typedef uchar entry;
+typedef ushort entry;
+
+#if SECTORS_4
+#define SECTORS 4
+#else
+#if SECTORS_2
+#define SECTORS 2
+#else
+#define SECTORS 1
+#endif
+#endif
+
+// Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
+int sector_of(const real speed_x, const real speed_y) {
+#if SECTORS_4
+    const int steep = speed_y > speed_x;
+    return 2 * steep + (speed_y > (steep ? (real)2.4142136 : (real)0.41421356) * speed_x);
+#else
+#if SECTORS_2
+    return speed_y > speed_x;
+#else
+    return 0;
+#endif
+#endif
+}
 
 // Distance in cells to the first occupied cell, or limit where there is none nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
@@ -15,38 +39,36 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
 #endif
 #endif
     const Walk start = start_walk(r, cell, rows, cols, limit);
-    int k_x = start.k_x, k_y = start.k_y;
-    real t = start.t;
+    real k_x = (real)start.k_x, k_y = (real)start.k_y, t = start.t;
     if (t >= limit) return limit;
-    const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * (rows + 2) * (cols + 2);
+    const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
+    global const entry *table = map_table + plane * ((rows + 2) * (cols + 2));
+    const int origin = padded(cell.y, cell.x, cols), step_y = r.up ? cols + 2 : -(cols + 2);
     for (;;) {
-        const int col = cell.x + r.step_x * k_x, row = cell.y + r.step_y * k_y;
-        const int side = map_table[plane + padded(row, col, cols)];
-        if (side == 0) {
+        const uint sides = table[origin + r.step_x * whole_int(k_x) + step_y * whole_int(k_y)];
+        if (sides == 0) {
 #if OUTSIDE_OCCUPIED
             return t;
 #else
+            const int col = cell.x + r.step_x * whole_int(k_x), row = cell.y + r.step_y * whole_int(k_y);
             return off_grid(col, row, rows, cols) ? limit : t;
 #endif
         }
-        const real t_x = ((real)(k_x + side - 1) + r.a_x) * r.inv_x;
-        const real t_y = ((real)(k_y + side - 1) + r.a_y) * r.inv_y;
-        t = t_x <= t_y ? t_x : t_y;
+        const real far_x = k_x + (real)(int)((sides & 255) - 1), far_y = k_y + (real)(int)((sides >> 8) - 1);
+        const real t_x = (far_x + r.a_x) * r.inv_x, t_y = (far_y + r.a_y) * r.inv_y;
+        const int by_x = t_x <= t_y;
+        t = by_x ? t_x : t_y;
         if (t >= limit) return limit;
-        if (t_x <= t_y) {
-            k_x += side;
-            k_y = crossed_before(t, r.speed_y, r.a_y, r.inv_y);
-        } else {
-            k_y += side;
-            k_x = crossed_until(t, r.speed_x, r.a_x, r.inv_x);
-        }
+        const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x, !by_x);
+        k_x = by_x ? far_x + 1 : aside;
+        k_y = by_x ? aside : far_y + 1;
     }
 }
 
 #if WIDE
 // The same walk along LANES rays of one pose inside the grid at once; a lane that is done reads the ring's first zero.
 lanes cast_rays(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-                  const lanes ray_x, const lanes ray_y, const real limit) {
+                const lanes ray_x, const lanes ray_y, const real limit) {
     lanes dx = pose.z * ray_x - pose.w * ray_y, dy = pose.w * ray_x + pose.z * ray_y;
     dx = fabs(dx) < TINY ? (lanes)0 : dx;
     dy = fabs(dy) < TINY ? (lanes)0 : dy;
@@ -55,43 +77,46 @@ lanes cast_rays(global const entry *map_table, const int rows, const int cols, c
     const lanes a_x = right ? (lanes)(1 - pose.x) : (lanes)pose.x;
     const lanes a_y = up ? (lanes)(1 - pose.y) : (lanes)pose.y;
     const int size = (rows + 2) * (cols + 2);
+    ilanes plane = (right ? (ilanes)0 : (ilanes)SECTORS) + (up ? (ilanes)0 : (ilanes)(2 * SECTORS));
+#if SECTORS_2
+    plane = speed_y > speed_x ? plane + 1 : plane;
+#endif
+#if SECTORS_4
+    plane = speed_y > speed_x ? plane + 2 : plane;
+    plane = speed_y > (speed_y > speed_x ? (lanes)2.4142136f : (lanes)0.41421356f) * speed_x ? plane + 1 : plane;
+#endif
     const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)(cols + 2) : (ilanes)(-cols - 2);
-    const ilanes origin = (right ? (ilanes)0 : (ilanes)size) + (up ? (ilanes)0 : (ilanes)(2 * size)) + padded(cell.y, cell.x, cols);
-    ilanes k_x = 0, k_y = 0, going = -1;
-    lanes t = 0, found = limit;
+    const ilanes origin = plane * size + padded(cell.y, cell.x, cols);
+    lanes k_x = 0, k_y = 0, t = 0, found = limit;
+    ilanes going = -1;
     for (;;) {
-        const ilanes at = going ? origin + step_x * k_x + step_y * k_y : (ilanes)0;
-        const ilanes side = GATHER(ilanes, map_table, at);
-        const ilanes stopped = going && side == 0;
+        const ilanes at = going ? origin + step_x * to_ilanes(k_x) + step_y * to_ilanes(k_y) : (ilanes)0;
+        const ilanes sides = GATHER(ilanes, map_table, at);
+        const ilanes stopped = going && sides == 0;
         if (any(stopped)) {
 #if OUTSIDE_OCCUPIED
             found = stopped ? t : found;
 #else
-            const ilanes col = cell.x + (right ? k_x : -k_x), row = cell.y + (up ? k_y : -k_y);
+            const ilanes x = to_ilanes(k_x), y = to_ilanes(k_y);
+            const ilanes col = cell.x + (right ? x : -x), row = cell.y + (up ? y : -y);
             found = stopped && col >= 0 && col < cols && row >= 0 && row < rows ? t : found;
 #endif
-            going = going && side != 0;
+            going = going && sides != 0;
             if (!any(going)) return found;
         }
-        const lanes t_x = (to_lanes(k_x + side - 1) + a_x) * inv_x;
-        const lanes t_y = (to_lanes(k_y + side - 1) + a_y) * inv_y;
+        const lanes far_x = k_x + to_lanes((sides & 255) - 1), far_y = k_y + to_lanes((sides >> 8) - 1);
+        const lanes t_x = (far_x + a_x) * inv_x, t_y = (far_y + a_y) * inv_y;
         const ilanes by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
         going = going && t < limit;
         if (!any(going)) return found;
-        // Boundaries of the other axis that are crossed, those at t excluded where x steps first.
         const lanes a = by_x ? a_y : a_x, inv = by_x ? inv_y : inv_x;
-        const lanes place = t * (by_x ? speed_y : speed_x) - a;
-        const ilanes whole = to_ilanes(place);
-        const lanes back = to_lanes(whole);
-        const ilanes above = whole - (back < place);
-        const ilanes guess = by_x ? (above < 0 ? (ilanes)0 : above) : whole + (back > place) + 1;
-        const lanes here = (to_lanes(guess) + a) * inv, before = (to_lanes(guess - 1) + a) * inv;
-        const ilanes more = here < t || (!by_x && here == t);
-        const ilanes fewer = guess > 0 && !more && (before > t || (by_x && before == t));
-        const ilanes crossed = guess - more + fewer;
-        k_x = by_x ? k_x + side : crossed;
-        k_y = by_x ? crossed : k_y + side;
+        const lanes place = ((t * (by_x ? speed_y : speed_x) - a) + ROUNDING) - ROUNDING;
+        const lanes k = place > 0 ? place : (lanes)0, here = (k + a) * inv;
+        const ilanes more = by_x ? here < t : here <= t;
+        const lanes aside = more ? k + 1 : k;
+        k_x = by_x ? far_x + 1 : aside;
+        k_y = by_x ? aside : far_y + 1;
     }
 }
 

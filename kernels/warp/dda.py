@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from . import squares as squares_file
+from . import rectangles as rectangles_file
 from .prelude import precision
 
 ENTRY = wp.uint8
@@ -21,7 +21,7 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
     make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
-    padded = squares_file.functions(flags).padded
+    padded = rectangles_file.functions(flags).padded
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)

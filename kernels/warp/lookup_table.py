@@ -20,7 +20,7 @@ def make(name, flags):
     # One work-item a bin and cell; a hit is 65 534 parts of the limit at most. The table has fewer than 2^31 entries.
     @kernel
     def fill_lookup(
-        squares: wp.array(dtype=wp.uint8),
+        rectangles: wp.array(dtype=wp.uint16),
         ray: wp.array(dtype=vec2),
         lookup: wp.array(dtype=wp.uint16),
         rows: wp.int32,
@@ -36,7 +36,7 @@ def make(name, flags):
         row = first_row + index / cols
         col = index % cols
         pose = vec4(HALF, HALF, ray[bin].x, ray[bin].y)
-        t = cast_ray(squares, rows, cols, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, 0, ZERO, ZERO)
+        t = cast_ray(rectangles, rows, cols, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, 0, ZERO, ZERO)
         part = int(t * (PARTS / limit) + HALF)
         lookup[(row * cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))
 

@@ -29,6 +29,8 @@ def functions(flags):
     C1, C3, C5, C7, C9 = (real(c) for c in (0.15913362, -0.05256880, 0.02867033, -0.01354934, 0.00331601))
     # Smallest direction component that is told from zero: its inverse must be finite.
     TINY = real(1e-30)
+    # 1.5 * 2^52 or 2^23: sums with it have no digits behind the point.
+    ROUNDING = real(6755399441055744.0 if "FLOAT64" in flags else 12582912.0)
 
     # Direction of a ray in the grid's frame, of unit length: sign, size and inverse of each component, and the distance
     # in x and y to the first boundaries.
@@ -76,25 +78,14 @@ def functions(flags):
         r.a_y = wp.where(r.up, ONE - pose.y, pose.y)
         return r
 
-    # Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t. The guess is off by one at most.
+    # Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
+    # Counts are whole real numbers, which spares conversions: adding and taking off a large number rounds to nearest.
+    # Rounded, the place on the axis names the only boundary that can be in doubt.
     @wp.func
-    def crossed_before(t: real, speed: real, a: real, inv: real):
-        guess = wp.max(int(wp.ceil(t * speed - a)), 0)
-        if (real(guess) + a) * inv < t:
-            return guess + 1
-        if guess > 0 and (real(guess - 1) + a) * inv >= t:
-            return guess - 1
-        return guess
-
-    # The same, those at t included.
-    @wp.func
-    def crossed_until(t: real, speed: real, a: real, inv: real):
-        guess = wp.max(int(wp.floor(t * speed - a)) + 1, 0)
-        if (real(guess) + a) * inv <= t:
-            return guess + 1
-        if guess > 0 and (real(guess - 1) + a) * inv > t:
-            return guess - 1
-        return guess
+    def crossed(t: real, speed: real, a: real, inv: real, until: wp.bool):
+        k = wp.max(((t * speed - a) + ROUNDING) - ROUNDING, ZERO)
+        here = (k + a) * inv
+        return wp.where(wp.where(until, here <= t, here < t), k + ONE, k)
 
     # The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a
     # ray from outside meets the grid no nearer.
@@ -112,10 +103,10 @@ def functions(flags):
                 if t >= ZERO and t < limit:
                     if enter_t_x > enter_t_y:
                         walk.k_x = enter_x
-                        walk.k_y = crossed_before(t, r.speed_y, r.a_y, r.inv_y)
+                        walk.k_y = int(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
                     else:
                         walk.k_y = enter_y
-                        walk.k_x = crossed_until(t, r.speed_x, r.a_x, r.inv_x)
+                        walk.k_x = int(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
                     if not off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols):
                         walk.t = t
         return walk
@@ -150,8 +141,7 @@ def functions(flags):
         off_grid=off_grid,
         ray_direction=ray_direction,
         make_ray=make_ray,
-        crossed_before=crossed_before,
-        crossed_until=crossed_until,
+        crossed=crossed,
         start_walk=start_walk,
         turn_of=turn_of,
         angle_bin=angle_bin,

@@ -1,7 +1,7 @@
 """Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
 
-An Amanatides-Woo walk that crosses a whole empty square at a time and visits the same cells; ties (corners) step in x
-first.
+An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step in
+x first.
 """
 
 import functools
@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from . import squares as squares_file
+from . import rectangles as rectangles_file
 from .prelude import precision
 
-ENTRY = wp.uint8
+ENTRY = wp.uint16
 
 
 @functools.cache
@@ -23,11 +23,27 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
     make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
-    crossed_before, crossed_until = geometry.crossed_before, geometry.crossed_until
-    padded = squares_file.functions(flags).padded
+    crossed = geometry.crossed
+    padded = rectangles_file.functions(flags).padded
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
-    ZERO = real(0.0)
+    SECTORS_2 = "SECTORS_2" in flags
+    SECTORS_4 = "SECTORS_4" in flags
+    SECTORS = 4 if SECTORS_4 else 2 if SECTORS_2 else 1
+    ZERO, ONE = real(0.0), real(1.0)
+    FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
+
+    # Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
+    @wp.func
+    def sector_of(speed_x: real, speed_y: real):
+        sector = int(0)
+        if SECTORS_2:
+            sector = wp.where(speed_y > speed_x, 1, 0)
+        if SECTORS_4:
+            steep = speed_y > speed_x
+            sector = wp.where(steep, 2, 0)
+            sector += wp.where(speed_y > wp.where(steep, STEEPEST, FLATTEST) * speed_x, 1, 0)
+        return sector
 
     # Distance in cells to the first occupied cell, or limit where there is none nearer.
     @wp.func
@@ -48,31 +64,34 @@ def functions(flags):
             if off_grid(cell.x, cell.y, rows, cols):
                 return ZERO
         start = start_walk(r, cell, rows, cols, limit)
-        k_x = int(start.k_x)
-        k_y = int(start.k_y)
+        k_x = real(start.k_x)
+        k_y = real(start.k_y)
         t = real(start.t)
         if t >= limit:
             return limit
-        plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * (rows + 2) * (cols + 2)
+        plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
+        table = plane * (rows + 2) * (cols + 2)
         while True:
-            col = cell.x + r.step_x * k_x
-            row = cell.y + r.step_y * k_y
-            side = int(map_table[plane + padded(row, col, cols)])
-            if side == 0:
+            col = cell.x + r.step_x * int(k_x)
+            row = cell.y + r.step_y * int(k_y)
+            sides = int(map_table[table + padded(row, col, cols)])
+            if sides == 0:
                 if OUTSIDE_OCCUPIED:
                     return t
                 else:
                     return wp.where(off_grid(col, row, rows, cols), limit, t)
-            t_x = (real(k_x + side - 1) + r.a_x) * r.inv_x
-            t_y = (real(k_y + side - 1) + r.a_y) * r.inv_y
-            t = wp.min(t_x, t_y)
+            far_x = k_x + real((sides & 255) - 1)
+            far_y = k_y + real((sides >> 8) - 1)
+            t_x = (far_x + r.a_x) * r.inv_x
+            t_y = (far_y + r.a_y) * r.inv_y
+            by_x = t_x <= t_y
+            t = wp.where(by_x, t_x, t_y)
             if t >= limit:
                 return limit
-            if t_x <= t_y:
-                k_x += side
-                k_y = crossed_before(t, r.speed_y, r.a_y, r.inv_y)
-            else:
-                k_y += side
-                k_x = crossed_until(t, r.speed_x, r.a_x, r.inv_x)
+            speed = wp.where(by_x, r.speed_y, r.speed_x)
+            a = wp.where(by_x, r.a_y, r.a_x)
+            aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x)
+            k_x = wp.where(by_x, far_x + ONE, aside)
+            k_y = wp.where(by_x, aside, far_y + ONE)
 
     return SimpleNamespace(cast_ray=cast_ray)

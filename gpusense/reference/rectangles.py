@@ -1,0 +1,155 @@
+"""Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells there.
+
+The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one step
+without missing an obstacle; it is the one that the ray in the middle of the sector stays in longest. After anisotropic
+Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares. Planes are padded by a ring of zeros; quadrant q
+grows to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep.
+
+Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then only
+cells whose rectangles can hold one of these are. Occupied cells are known of a band of rows from row first on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.bits import cells_left, cells_right, unpacked
+
+LONGEST = 255
+RECTANGLE_REACH = 254
+STACK = 256
+
+
+def reach_begin(way: int, low: int) -> int:
+    """First of the cells whose rectangles, growing that way, can hold the cell low or one beyond it."""
+    return max(low - RECTANGLE_REACH, 0) if way > 0 else low
+
+
+def reach_end(way: int, high: int, size: int) -> int:
+    """One beyond the last of the cells whose rectangles, growing that way, can hold one before the cell high."""
+    return high if way > 0 else min(high + RECTANGLE_REACH, size)
+
+
+def slope(sectors: int, sector: int) -> tuple[int, int]:
+    """Height and width in the proportion of the ray in the middle of a sector."""
+    return {1: [(1, 1)], 2: [(5, 12), (12, 5)], 4: [(1, 5), (2, 3), (3, 2), (5, 1)]}[sectors][sector]
+
+
+def free_columns(
+    flags: frozenset[str], occupied: np.ndarray, runs: np.ndarray, band: int, cols: int, begin: int, end: int
+) -> None:
+    """Free cells of the band in the column, to larger (first plane) or smaller rows, at columns from begin to end."""
+    cells = occupied[: band * cols].reshape(band, cols)[:, begin:end].astype(bool)
+    up, down = _runs(np.ascontiguousarray(cells.T))
+    out = runs[: 2 * band * cols].reshape(2, band, cols)
+    out[0, :, begin:end], out[1, :, begin:end] = up.T, down.T
+
+
+def _runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Free cells to the right and to the left in rows of bool."""
+    room = np.arange(1, cells.shape[1] + 1, dtype=np.int32)
+    right, left = np.minimum(cells_right(cells), room[::-1]), np.minimum(cells_left(cells), room)
+    return np.minimum(right, LONGEST), np.minimum(left, LONGEST)
+
+
+def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
+    """The rectangles of a quadrant and sector that begin at each number of rows of runs and grow to the right.
+
+    Args:
+        runs: (lines, length) free cells across the lines, at most LONGEST.
+        along: Cells along the lines in the proportion of the sector's middle.
+        across: Cells across them.
+
+    Returns:
+        (2, lines, length) cells along and across. The longest one that is high enough is put together from powers of
+        two, whose least runs a pyramid has; the next longer one, not high enough, may be better.
+    """
+    lines, length = runs.shape
+    levels = [np.pad(runs.astype(np.uint8), ((0, 0), (0, LONGEST + 1)))]
+    for power in range(7):
+        last = levels[-1]
+        shifted = np.zeros_like(last)
+        shifted[:, : -(1 << power)] = last[:, 1 << power :]
+        levels.append(np.minimum(last, shifted))
+    reach = np.zeros((lines, length), np.int32)
+    least = np.full((lines, length), LONGEST, np.int32)
+    line, place = np.indices((lines, length), np.int32, sparse=True)
+    for power in range(7, -1, -1):
+        trial = np.minimum(least, levels[power][line, place + reach])
+        fits = trial * along >= (reach + (1 << power)) * across
+        reach, least = reach + (fits << power), np.where(fits, trial, least)
+    lower = np.where(reach < LONGEST, np.minimum(least, levels[0][line, place + reach]), 0)
+    longer = lower * along > reach * across
+    return np.stack([reach + longer, np.where(longer, lower, np.where(reach > 0, least, 0))])
+
+
+def rectangles_rows(
+    flags: frozenset[str],
+    runs: np.ndarray,
+    stack: np.ndarray,
+    rectangles: np.ndarray,
+    rows: int,
+    cols: int,
+    sectors: int,
+    first: int,
+    band: int,
+    top: int,
+    left: int,
+    bottom: int,
+    right: int,
+) -> None:
+    """From free cells in columns: along the rows the widest rectangles of enough height."""
+    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
+    free = runs[: 2 * band * cols].reshape(2, band, cols)
+    for quadrant in range(4):
+        dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
+        row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
+        col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
+        seen = slice(col.start, col.stop + RECTANGLE_REACH) if dx > 0 else slice(max(col.start - RECTANGLE_REACH, 0), col.stop)
+        run = free[quadrant >> 1, row.start - first : row.stop - first, seen][:, ::dx]
+        for sector in range(sectors):
+            height, width = slope(sectors, sector)
+            wide, high = longest(run, width, height)[:, :, ::dx]
+            part = slice(col.start - seen.start, col.stop - seen.start)
+            out = planes[quadrant, sector, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
+            out[...] = (wide + 256 * high)[:, part]
+
+
+def free_rows(
+    flags: frozenset[str], bits: np.ndarray, runs: np.ndarray, band: int, cols: int, words: int, begin: int, end: int
+) -> None:
+    """Free cells of the row, to the right (first plane) or left (second plane), at columns from begin to end."""
+    out = runs[: 2 * band * cols].reshape(2, band, cols)
+    for direction, run in enumerate(_runs(unpacked(bits, band, cols, words))):
+        out[direction, :, begin:end] = run[:, begin:end]
+
+
+def rectangles_scan(
+    flags: frozenset[str],
+    runs: np.ndarray,
+    rectangles: np.ndarray,
+    rows: int,
+    cols: int,
+    sectors: int,
+    first: int,
+    band: int,
+    top: int,
+    left: int,
+    bottom: int,
+    right: int,
+) -> None:
+    """From free cells in rows: along the columns the highest rectangles of enough width."""
+    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
+    free = runs[: 2 * band * cols].reshape(2, band, cols)
+    for quadrant in range(4):
+        dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
+        row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
+        col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
+        seen = slice(row.start, min(row.stop + RECTANGLE_REACH, rows)) if dy > 0 else slice(max(row.start - RECTANGLE_REACH, 0), row.stop)
+        run = free[quadrant & 1, seen.start - first : seen.stop - first, col][::dy].T
+        for sector in range(sectors):
+            height, width = slope(sectors, sector)
+            high, wide = (side.T[::dy] for side in longest(run, height, width))
+            part = slice(row.start - seen.start, row.stop - seen.start)
+            out = planes[quadrant, sector, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
+            out[...] = (wide + 256 * high)[part]

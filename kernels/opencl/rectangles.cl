@@ -1,0 +1,126 @@
+// Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
+// the cell at its corner and grows that way; each at most 255, as width + 256 height. A ray may cross it in one step
+// without missing an obstacle. Of all such rectangles it is the one that the ray in the middle of the sector stays in
+// longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares.
+// Planes are padded by a ring of zeros, so a walk that leaves the grid stops there. Quadrant q grows to
+// (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, a plane each.
+//
+// Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
+// only cells whose rectangles can hold one of these are. Made at first, all of them have changed. What is known of
+// occupied cells is a band of whole rows of the map from row first on.
+// requires: bits
+
+#define LONGEST 255
+// Cells from a changed cell to the farthest one whose rectangle holds it.
+#define RECTANGLE_REACH 254
+// Room for the columns that may bound a rectangle.
+#define STACK 256
+
+int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
+
+// Along an axis: the cells whose rectangles, growing to larger (way 1) or smaller (way -1) indices, can hold one of
+// those in [low, high) are those from reach_begin to before reach_end.
+int reach_begin(const int way, const int low) { return way > 0 ? max(low - RECTANGLE_REACH, 0) : low; }
+int reach_end(const int way, const int high, const int size) {
+    return way > 0 ? high : min(high + RECTANGLE_REACH, size);
+}
+
+// Height and width in the proportion of the ray in the middle of a sector.
+int2 slope(const int sectors, const int sector) {
+    if (sectors == 1) return (int2)(1, 1);
+    if (sectors == 2) return sector == 0 ? (int2)(5, 12) : (int2)(12, 5);
+    return sector == 0 ? (int2)(1, 5) : sector == 1 ? (int2)(2, 3) : sector == 2 ? (int2)(3, 2) : (int2)(5, 1);
+}
+
+// For serial devices, one work-item 64 columns and a direction: free cells of the band in the column, to larger
+// (direction 0) or smaller rows (direction 1), at columns from begin to before end.
+kernel void free_columns(global const uchar *occupied, global uchar *runs, const int band, const int cols,
+                         const int begin, const int end) {
+    const int from = begin + 64 * get_global_id(0), direction = get_global_id(1), until = min(from + 64, end);
+    global uchar *out = runs + (long)direction * band * cols;
+    for (int i = 0; i < band; ++i) {
+        const long row = direction ? i : band - 1 - i, before = direction ? row - 1 : row + 1;
+        for (int col = from; col < until; ++col) {
+            const int run = i == 0 ? 0 : out[before * cols + col];
+            out[row * cols + col] = occupied[row * cols + col] ? 0 : (uchar)min(run + 1, LONGEST);
+        }
+    }
+}
+
+// For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle
+// of enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height,
+// each lower than all before it, with their free cells above 16 bits of the column.
+kernel void rectangles_rows(global const uchar *runs, global int *stack, global ushort *rectangles, const int rows,
+                            const int cols, const int sectors, const int first, const int band, const int top,
+                            const int left, const int bottom, const int right) {
+    const int quadrant = get_global_id(1), dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
+    const int row = reach_begin(dy, top) + get_global_id(0);
+    if (row >= reach_end(dy, bottom, rows)) return;
+    global const uchar *run = runs + (long)((dy > 0 ? 0 : band) + row - first) * cols;
+    global int *waiting = stack + ((long)(row - reach_begin(dy, top)) * 4 + quadrant) * STACK;
+    const int begin = reach_begin(dx, left), end = reach_end(dx, right, cols);
+    const int scanned = dx > 0 ? min(end + RECTANGLE_REACH, cols) - begin : end - max(begin - RECTANGLE_REACH, 0);
+    for (int sector = 0; sector < sectors; ++sector) {
+        const int2 middle = slope(sectors, sector);
+        global ushort *out = rectangles + (long)(quadrant * sectors + sector) * (rows + 2) * (cols + 2);
+        int oldest = 0, newest = 0, width = 0;
+        for (int i = 0; i < scanned; ++i) {
+            const int col = dx > 0 ? begin + scanned - 1 - i : end - scanned + i, here = run[col];
+            while (newest > oldest && waiting[(newest - 1) & (STACK - 1)] >> 16 >= here) --newest;
+            waiting[newest++ & (STACK - 1)] = here << 16 | col;
+            int height = LONGEST;
+            for (width = min(width + 1, LONGEST); width > 0; --width) {
+                while (dx * ((waiting[oldest & (STACK - 1)] & 0xffff) - col) >= width) ++oldest;
+                height = waiting[oldest & (STACK - 1)] >> 16;
+                if (height * middle.y >= width * middle.x) break;
+                height = LONGEST;
+            }
+            const int other = col + dx * width;
+            const int known = width < LONGEST && other >= 0 && other < cols;
+            const int lower = known ? min(height, (int)run[other]) : 0;
+            const int wider = lower * middle.y > width * middle.x;
+            if (col < begin || col >= end) continue;
+            const int found = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : 0;
+            out[padded(row, col, cols)] = (ushort)found;
+        }
+    }
+}
+
+// For parallel devices, one work-item a cell from begin to before end: free cells of the row, to the right (direction 0)
+// or left (direction 1).
+kernel void free_rows(global const int *bits, global uchar *runs, const int band, const int cols, const int words,
+                      const int begin, const int end) {
+    const int col = begin + get_global_id(0), row = get_global_id(1);
+    if (row >= band || col >= end) return;
+    global const int *line = bits + (long)row * words;
+    const long cell = (long)row * cols + col;
+    const int right = min(cells_right(line, words, col, LONGEST), cols - col);
+    const int left = min(cells_left(line, col, LONGEST), col + 1);
+    runs[cell] = (uchar)min(right, LONGEST);
+    runs[(long)band * cols + cell] = (uchar)min(left, LONGEST);
+}
+
+// For parallel devices, one work-item a cell and quadrant, which looks along the column: the higher a rectangle, the
+// narrower. The first work-item of a quadrant has the first of its cells.
+kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles, const int rows, const int cols,
+                            const int sectors, const int first, const int band, const int top, const int left,
+                            const int bottom, const int right) {
+    const int quadrant = get_global_id(2), dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
+    const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
+    if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows)) return;
+    global const uchar *run = runs + (long)(quadrant & 1) * band * cols + (long)(row - first) * cols + col;
+    global ushort *out = rectangles + (long)quadrant * sectors * (rows + 2) * (cols + 2) + padded(row, col, cols);
+    const int room = min(dy > 0 ? rows - row : row + 1, LONGEST);
+    int width = LONGEST, sector = 0;
+    for (int height = 1; sector < sectors; ++height) {
+        const int narrower = height > room ? 0 : min(width, (int)run[(long)(height - 1) * dy * cols]);
+        for (; sector < sectors; ++sector) {
+            const int2 middle = slope(sectors, sector);
+            if (narrower * middle.x >= height * middle.y) break;
+            const int higher = narrower * middle.x > (height - 1) * middle.y;
+            const int found = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : 0;
+            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)found;
+        }
+        width = narrower;
+    }
+}

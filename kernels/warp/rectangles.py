@@ -1,0 +1,241 @@
+"""Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
+the cell at its corner and grows that way; each at most 255, as width + 256 height. A ray may cross it in one step without
+missing an obstacle. Of all such rectangles it is the one that the ray in the middle of the sector stays in longest. After
+anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares.
+
+Planes are padded by a ring of zeros, so a walk that leaves the grid stops there. Quadrant q grows to (+x, +y), (-x, +y),
+(+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, a plane each. All planes have fewer
+than 2^31 cells, so indices fit int32.
+
+Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then only
+cells whose rectangles can hold one of these are. Made at first, all of them have changed. What is known of occupied cells
+is a band of whole rows of the map from row first on.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from .bits import cells_left, cells_right
+from .prelude import kernel
+
+LONGEST = wp.constant(255)
+# Cells from a changed cell to the farthest one whose rectangle holds it.
+RECTANGLE_REACH = wp.constant(254)
+# Room for the columns that may bound a rectangle.
+STACK = wp.constant(256)
+
+
+@wp.func
+def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
+    return (row + 1) * (cols + 2) + col + 1
+
+
+# Along an axis: the cells whose rectangles, growing to larger (way 1) or smaller (way -1) indices, can hold one of those
+# in [low, high) are those from reach_begin to before reach_end.
+@wp.func
+def reach_begin(way: wp.int32, low: wp.int32):
+    return wp.where(way > 0, wp.max(low - RECTANGLE_REACH, 0), low)
+
+
+@wp.func
+def reach_end(way: wp.int32, high: wp.int32, size: wp.int32):
+    return wp.where(way > 0, high, wp.min(high + RECTANGLE_REACH, size))
+
+
+# Height and width in the proportion of the ray in the middle of a sector.
+@wp.func
+def slope(sectors: wp.int32, sector: wp.int32):
+    if sectors == 1:
+        return wp.vec2i(1, 1)
+    if sectors == 2:
+        if sector == 0:
+            return wp.vec2i(5, 12)
+        return wp.vec2i(12, 5)
+    if sector == 0:
+        return wp.vec2i(1, 5)
+    if sector == 1:
+        return wp.vec2i(2, 3)
+    if sector == 2:
+        return wp.vec2i(3, 2)
+    return wp.vec2i(5, 1)
+
+
+# For serial devices, one work-item 64 columns and a direction: free cells of the band in the column, to larger
+# (direction 0) or smaller rows (direction 1), at columns from begin to before end.
+@kernel
+def free_columns(
+    occupied: wp.array(dtype=wp.uint8),
+    runs: wp.array(dtype=wp.uint8),
+    band: wp.int32,
+    cols: wp.int32,
+    begin: wp.int32,
+    end: wp.int32,
+):
+    direction, strip = wp.tid()
+    first = begin + 64 * strip
+    until = wp.min(first + 64, end)
+    out = direction * band * cols
+    for i in range(band):
+        row = wp.where(direction == 1, i, band - 1 - i)
+        before = wp.where(direction == 1, row - 1, row + 1)
+        for col in range(first, until):
+            run = int(0)
+            if i > 0:
+                run = int(runs[out + before * cols + col])
+            free = wp.where(occupied[row * cols + col] != wp.uint8(0), 0, wp.min(run + 1, LONGEST))
+            runs[out + row * cols + col] = wp.uint8(free)
+
+
+# For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle of
+# enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height, each
+# lower than all before it, with their free cells above 16 bits of the column.
+@kernel
+def rectangles_rows(
+    runs: wp.array(dtype=wp.uint8),
+    stack: wp.array(dtype=wp.int32),
+    rectangles: wp.array(dtype=wp.uint16),
+    rows: wp.int32,
+    cols: wp.int32,
+    sectors: wp.int32,
+    first: wp.int32,
+    band: wp.int32,
+    top: wp.int32,
+    left: wp.int32,
+    bottom: wp.int32,
+    right: wp.int32,
+):
+    quadrant, item = wp.tid()
+    dx = wp.where((quadrant & 1) != 0, -1, 1)
+    dy = wp.where((quadrant & 2) != 0, -1, 1)
+    row = reach_begin(dy, top) + item
+    if row >= reach_end(dy, bottom, rows):
+        return
+    run = (wp.where(dy > 0, 0, band) + row - first) * cols
+    waiting = (item * 4 + quadrant) * STACK
+    begin = reach_begin(dx, left)
+    end = reach_end(dx, right, cols)
+    scanned = wp.where(
+        dx > 0, wp.min(end + RECTANGLE_REACH, cols) - begin, end - wp.max(begin - RECTANGLE_REACH, 0)
+    )
+    for sector in range(sectors):
+        middle = slope(sectors, sector)
+        out = (quadrant * sectors + sector) * (rows + 2) * (cols + 2)
+        oldest = int(0)
+        newest = int(0)
+        width = int(0)
+        for i in range(scanned):
+            col = wp.where(dx > 0, begin + scanned - 1 - i, end - scanned + i)
+            here = int(runs[run + col])
+            while newest > oldest and (stack[waiting + ((newest - 1) & (STACK - 1))] >> 16) >= here:
+                newest -= 1
+            stack[waiting + (newest & (STACK - 1))] = (here << 16) | col
+            newest += 1
+            height = int(LONGEST)
+            width = wp.min(width + 1, LONGEST)
+            fits = bool(False)
+            while width > 0 and not fits:
+                while dx * ((stack[waiting + (oldest & (STACK - 1))] & 65535) - col) >= width:
+                    oldest += 1
+                height = stack[waiting + (oldest & (STACK - 1))] >> 16
+                if height * middle[1] >= width * middle[0]:
+                    fits = True
+                else:
+                    height = int(LONGEST)
+                    width -= 1
+            if col >= begin and col < end:
+                other = col + dx * width
+                lower = int(0)
+                if width < LONGEST and other >= 0 and other < cols:
+                    lower = wp.min(height, int(runs[run + other]))
+                found = wp.where(width > 0, width + 256 * height, 0)
+                if lower * middle[1] > width * middle[0]:
+                    found = width + 1 + 256 * lower
+                rectangles[out + padded(row, col, cols)] = wp.uint16(found)
+
+
+# For parallel devices, one work-item a cell from begin to before end: free cells of the row, to the right (direction 0)
+# or left (direction 1).
+@kernel
+def free_rows(
+    bits: wp.array(dtype=wp.int32),
+    runs: wp.array(dtype=wp.uint8),
+    band: wp.int32,
+    cols: wp.int32,
+    words: wp.int32,
+    begin: wp.int32,
+    end: wp.int32,
+):
+    row, item = wp.tid()
+    col = begin + item
+    if row >= band or col >= end:
+        return
+    cell = row * cols + col
+    right = wp.min(cells_right(bits, row * words, words, col, LONGEST), cols - col)
+    left = wp.min(cells_left(bits, row * words, col, LONGEST), col + 1)
+    runs[cell] = wp.uint8(wp.min(right, LONGEST))
+    runs[band * cols + cell] = wp.uint8(wp.min(left, LONGEST))
+
+
+# For parallel devices, one work-item a cell and quadrant, which looks along the column: the higher a rectangle, the
+# narrower. The first work-item of a quadrant has the first of its cells.
+@kernel
+def rectangles_scan(
+    runs: wp.array(dtype=wp.uint8),
+    rectangles: wp.array(dtype=wp.uint16),
+    rows: wp.int32,
+    cols: wp.int32,
+    sectors: wp.int32,
+    first: wp.int32,
+    band: wp.int32,
+    top: wp.int32,
+    left: wp.int32,
+    bottom: wp.int32,
+    right: wp.int32,
+):
+    quadrant, row_item, col_item = wp.tid()
+    dx = wp.where((quadrant & 1) != 0, -1, 1)
+    dy = wp.where((quadrant & 2) != 0, -1, 1)
+    col = reach_begin(dx, left) + col_item
+    row = reach_begin(dy, top) + row_item
+    if col >= reach_end(dx, right, cols) or row >= reach_end(dy, bottom, rows):
+        return
+    run = (quadrant & 1) * band * cols + (row - first) * cols + col
+    plane = (rows + 2) * (cols + 2)
+    out = quadrant * sectors * plane + padded(row, col, cols)
+    room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
+    width = int(LONGEST)
+    height = int(1)
+    sector = int(0)
+    while sector < sectors:
+        narrower = int(0)
+        if height <= room:
+            narrower = wp.min(width, int(runs[run + (height - 1) * dy * cols]))
+        middle = slope(sectors, sector)
+        while sector < sectors and narrower * middle[0] < height * middle[1]:
+            found = wp.where(height > 1, width + 256 * (height - 1), 0)
+            if narrower * middle[0] > (height - 1) * middle[1]:
+                found = narrower + 256 * height
+            rectangles[out + sector * plane] = wp.uint16(found)
+            sector += 1
+            middle = slope(sectors, sector)
+        width = narrower
+        height += 1
+
+
+_KERNELS = {
+    "free_columns": free_columns,
+    "rectangles_rows": rectangles_rows,
+    "free_rows": free_rows,
+    "rectangles_scan": rectangles_scan,
+}
+
+
+def functions(flags):
+    """padded; no flag changes it."""
+    return SimpleNamespace(padded=padded)
+
+
+def make(name, flags):
+    """A kernel of this file; no flag changes it."""
+    return _KERNELS[name]

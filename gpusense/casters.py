@@ -19,6 +19,7 @@ from gpusense.backends.base import Buffer
 from gpusense.directional import directional_table
 from gpusense.lookup_files import read_lookup
 from gpusense.prepare import check_size, quadrant_squares, squared_distances
+from gpusense.region import Region
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
 _NO_OBSTACLE = np.iinfo(np.int32).max
@@ -78,6 +79,10 @@ class Caster(ABC):
     def prepare(self, backend: Backend, window: Window) -> Table:
         """Make the table of a window on a device."""
 
+    def mend(self, backend: Backend, window: Window, table: Buffer, changed: Region) -> bool:
+        """Make a table follow obstacles that changed in a part of its window; False where it is to be made anew."""
+        return False
+
     def scalars(self) -> tuple[int, float, float]:
         """The kernels' arguments bins, slack [cells] and tolerance [cells]."""
         return 0, 0.0, 0.0
@@ -97,6 +102,11 @@ class Exact(Caster):
         """See Caster.prepare."""
         rows, cols = window.obstacles.shape
         return Table(quadrant_squares(backend, window.obstacles), 4 * (rows + 2) * (cols + 2))
+
+    def mend(self, backend: Backend, window: Window, table: Buffer, changed: Region) -> bool:
+        """See Caster.mend."""
+        quadrant_squares(backend, window.obstacles, table, changed)
+        return True
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ A ray may cross such a square in one step without missing an obstacle. Source: a
 (Deakin and Knackstedt 2020). Planes are padded by a ring of zeros; plane q grows to (+x, +y), (-x, +y), (+x, -y),
 (-x, -y) for q = 0, 1, 2, 3.
 
-The planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
-only cells whose squares can hold one of these are. Occupied cells are known of a band of rows from row first on.
+The planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed:
+then only cells whose squares can hold one of these are. Occupied cells are known of a band of rows from row first on.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def squares_scan(
         run = free[plane & 1, :, col]
         side = run[row - first].astype(np.int32)
         for i in range(1, LONGEST):
-            inside = (0 <= row + i * dy) & (row + i * dy < rows)
+            inside = (row + i * dy >= 0) & (row + i * dy < rows)
             other = run[row[inside] + i * dy - first]
             side[inside] = np.minimum(side[inside], np.maximum(other, i))
             side[~inside] = np.minimum(side[~inside], i)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import gc
 import importlib
 import inspect
 import itertools
+import math
 import os
 import re
 import subprocess
@@ -23,15 +25,18 @@ from scipy.ndimage import distance_transform_edt
 
 from gpusense._kernel_files import kernel_root, opencl_source, warp_module
 from gpusense.backends import Backend, get_backend
+from gpusense.backends._numpy import NumpyBackend
 from gpusense.frames import split
-from gpusense.prepare import quadrant_squares
+from gpusense.prepare import packed, quadrant_squares
 from gpusense.reference.mixture import log_density
+from gpusense.region import Region
 from gpusense.signatures import FLAGS, KERNELS, Argument
 from gpusense.sources import assemble, relevant
 from gpusense.tolerances import differing, per_beam, per_scan
 
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
+UNREACHABLE = (1 << 31) - 1
 
 
 @pytest.fixture(params=["opencl", "warp"])
@@ -174,6 +179,14 @@ GRIDS = grids()
 each_grid = pytest.mark.parametrize("occupied", GRIDS.values(), ids=list(GRIDS))
 
 
+def squared_distances(occupied: np.ndarray) -> np.ndarray:
+    """SciPy's squared distances; UNREACHABLE without obstacles."""
+    if not occupied.any():
+        return np.full(occupied.shape, UNREACHABLE, np.int32)
+    nearest = distance_transform_edt(~occupied, return_distances=False, return_indices=True)
+    return ((nearest - np.indices(occupied.shape)) ** 2).sum(axis=0).astype(np.int32)
+
+
 @each_grid
 @pytest.mark.parametrize("columns_first", [True, False])
 def test_distances_are_the_squares_of_the_exact_transform(
@@ -189,12 +202,41 @@ def test_distances_are_the_squares_of_the_exact_transform(
         device, "distance_envelope", frozenset(), (second[0],), reference["along"], blank, blank, *second
     )
     np.testing.assert_array_equal(found["squared"], reference["squared"])
-    if occupied.any():
-        nearest = distance_transform_edt(~occupied, return_distances=False, return_indices=True)
-        expected = ((nearest - np.indices(occupied.shape)) ** 2).sum(axis=0)
-    else:
-        expected = np.full(occupied.shape, np.iinfo(np.int32).max)
-    np.testing.assert_array_equal(found["squared"], expected)
+    np.testing.assert_array_equal(found["squared"], squared_distances(occupied))
+
+
+@each_grid
+@pytest.mark.parametrize("most", [0, 29, 1601, UNREACHABLE])
+def test_distances_of_a_work_item_a_cell_are_exact_up_to_a_cap(
+    occupied: np.ndarray, most: int, device: Backend
+) -> None:
+    rows, cols = occupied.shape
+    bits, blocks = packed(occupied), -(-rows // 32)
+    blank, least = np.zeros(occupied.shape, np.uint16), np.zeros((blocks, cols), np.uint16)
+    reach = min(math.isqrt(most), 32767)
+    call = ("distance_bits", frozenset(), (cols, rows), bits, blank, rows, cols, bits.shape[1], reach)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["nearest"], reference["nearest"])
+    nearest = found["nearest"]
+    call = ("distance_blocks", frozenset(), (cols, blocks), nearest, least, rows, cols, blocks)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["blocks"], reference["blocks"])
+    squared = np.zeros(occupied.shape, np.int32)
+    call = ("distance_search", frozenset(), (cols, rows), nearest, found["blocks"], squared, rows, cols, blocks, most)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["squared"], reference["squared"])
+    exact = squared_distances(occupied)
+    np.testing.assert_array_equal(found["squared"], np.where(exact <= most, exact, UNREACHABLE))
+
+
+def test_bits_of_a_map_are_its_cells() -> None:
+    for occupied in GRIDS.values():
+        for part in (occupied, occupied[:, 1:], occupied[::2, ::2]):
+            words = packed(part)
+            assert (words.dtype, words.shape) == (np.int32, (len(part), -(-part.shape[1] // 32)))
+            cells = (words[:, :, None] >> np.arange(32)) & 1
+            np.testing.assert_array_equal(cells.reshape(len(part), -1)[:, : part.shape[1]], part)
+            assert words.size == 0 or cells.sum() == part.sum()
 
 
 @each_grid
@@ -202,12 +244,34 @@ def test_distances_are_the_squares_of_the_exact_transform(
 def test_squares_agree_by_both_methods(occupied: np.ndarray, method: str, device: Backend) -> None:
     rows, cols = occupied.shape
     cells, blank = occupied.astype(np.uint8), np.zeros((2, rows, cols), np.uint8)
-    reference, found = on_both(device, "square_runs", frozenset(), (rows, 2), cells, blank, rows, cols)
+    reference, found = on_both(device, "square_runs", frozenset(), (rows, 2), cells, blank, rows, cols, 0, cols)
     np.testing.assert_array_equal(found["runs"], reference["runs"])
-    size = (4,) if method == "squares_rows" else (rows * cols, 4)
+    bits = packed(occupied)
+    call = ("square_bits", frozenset(), (cols, rows), bits, blank, rows, cols, bits.shape[1], 0, cols)
+    for other in on_both(device, *call):
+        np.testing.assert_array_equal(other["runs"], reference["runs"])
+    size = (4,) if method == "squares_rows" else (cols, rows, 4)
     planes = np.zeros((4, rows + 2, cols + 2), np.uint8)
-    reference, found = on_both(device, method, frozenset(), size, reference["runs"], planes, rows, cols)
+    whole = (rows, cols, 0, rows, 0, 0, rows, cols)
+    reference, found = on_both(device, method, frozenset(), size, reference["runs"], planes, *whole)
     np.testing.assert_array_equal(found["squares"], reference["squares"])
+
+
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_mended_squares_are_those_made_anew(kind: str, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    device, rng = get_backend(backend), np.random.default_rng(5)
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind))
+    for shape, share in (((610, 590), 0.0), ((610, 590), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)):
+        occupied = rng.random(shape) < share
+        planes = np.empty((4, shape[0] + 2, shape[1] + 2), np.uint8)
+        squares = quadrant_squares(device, occupied)
+        for _ in range(4):
+            row, col = (int(rng.integers(0, size)) for size in shape)
+            changed = Region(row, col, min(30, shape[0] - row), min(25, shape[1] - col))
+            changed.cut(occupied)[...] = rng.random((changed.rows, changed.cols)) < rng.choice([0, 0.02, 1])
+            assert quadrant_squares(device, occupied, squares, changed) is squares
+            device.download(squares, planes)
+            np.testing.assert_array_equal(planes, planes_of(occupied))
 
 
 def test_squares_are_empty_and_the_largest() -> None:
@@ -270,7 +334,8 @@ def scene_flags(real: type, *names: str) -> frozenset[str]:
 
 def planes_of(occupied: np.ndarray) -> np.ndarray:
     rows, cols = occupied.shape
-    backend = get_backend("numpy")
+    # A backend of its own: that of the tests may pretend to be a GPU.
+    backend = NumpyBackend()
     return backend.download(quadrant_squares(backend, occupied), np.empty((4, rows + 2, cols + 2), np.uint8))
 
 
@@ -422,23 +487,32 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
 # ---- the likelihood field
 
 
-def squared_distances(occupied: np.ndarray) -> np.ndarray:
-    nearest = distance_transform_edt(~occupied, return_distances=False, return_indices=True)
-    return ((nearest - np.indices(occupied.shape)) ** 2).sum(axis=0).astype(np.int32)
+@pytest.mark.parametrize("real", PRECISIONS)
+def test_the_table_is_filled_with_its_ring(real: type, device: Backend) -> None:
+    squared = squared_distances(GRIDS["sparse"])
+    rows, cols = squared.shape
+    cap, beyond = 50, -3.5
+    density = np.random.default_rng(19).random(cap + 1).astype(real)
+    table = np.full((rows + 4, cols + 4), -7, real)
+    place = (-2, -2, cols + 4, rows + 4, 0, cols + 4)
+    call = ("fill_field", scene_flags(real), (cols + 4, rows + 4), squared, density, table, rows, cols, cap, beyond)
+    reference, found = on_both(device, *call, *place)
+    np.testing.assert_array_equal(found["table"], reference["table"])
+    expected = np.pad(density[np.minimum(squared, cap)], 2, constant_values=beyond)
+    np.testing.assert_array_equal(found["table"], expected)
 
 
 @pytest.mark.parametrize("real", PRECISIONS)
-def test_the_table_is_filled_inside_its_ring(real: type, device: Backend) -> None:
-    squared = squared_distances(GRIDS["sparse"])
+def test_a_part_of_the_table_is_filled(real: type, device: Backend) -> None:
+    squared, density = squared_distances(GRIDS["sparse"]), np.arange(51).astype(real)
     rows, cols = squared.shape
-    cap = 50
-    density = np.random.default_rng(19).random(cap + 1).astype(real)
-    table = np.full((rows + 4, cols + 4), -7, real)
-    call = ("fill_field", scene_flags(real), (cols, rows), squared, density, table, rows, cols, cap)
+    table = np.full((30, 40), -7, real)
+    # Rows 20 to 24 and columns 3 to 9 go to row 6 and column 11.
+    call = ("fill_field", scene_flags(real), (7, 5), squared, density, table, rows, cols, 50, 0.0, 3, 20, 7, 5, 251, 40)
     reference, found = on_both(device, *call)
     np.testing.assert_array_equal(found["table"], reference["table"])
-    expected = np.pad(density[np.minimum(squared, cap)], 2, constant_values=-7)
-    np.testing.assert_array_equal(found["table"], expected)
+    table[6:11, 11:18] = np.minimum(squared[20:25, 3:10], 50)
+    np.testing.assert_array_equal(found["table"], table)
 
 
 # Flags, and whether the table holds distances.
@@ -678,7 +752,7 @@ def test_launches_keep_no_buffer_alive(warp_backend: Backend) -> None:
     density = warp_backend.upload(np.ones(1, np.float32))
     table = warp_backend.empty(7 * 6, np.dtype(np.float32), zero=True)
     fill = warp_backend.compile("fill_field", frozenset())
-    fill((2, 3), squared, density, table, 3, 2, 0)
+    fill((2, 3), squared, density, table, 3, 2, 0, 0.0, 0, 0, 2, 3, 14, 6)
     alive = [weakref.ref(buffer) for buffer in (squared, density, table)]
     assert warp_backend.download(table, np.empty((7, 6), np.float32)).sum() == 6
     del squared, density, table
@@ -692,10 +766,11 @@ def test_repeated_launches_see_what_changed(warp_backend: Backend) -> None:
     first = warp_backend.upload(squared), warp_backend.upload(density)
     for rows, cols, cap in ((3, 2, 9), (2, 3, 9), (2, 3, 1), (1, 1, 0), (3, 2, 9)):
         table = warp_backend.empty((rows + 4) * (cols + 4), np.dtype(np.float32), zero=True)
-        fill((cols, rows), *first, table, rows, cols, cap)
+        stride = cols + 4
+        fill((cols, rows), *first, table, rows, cols, cap, 0.0, 0, 0, cols, rows, 2 * stride + 2, stride)
         found = warp_backend.download(table, np.empty((rows + 4, cols + 4), np.float32))[2:-2, 2:-2]
         np.testing.assert_array_equal(found, np.minimum(squared[: rows * cols].reshape(rows, cols), cap))
-    fill((0, 3), *first, table, 3, 0, 0)
+    fill((0, 3), *first, table, 3, 0, 0, 0.0, 0, 0, 0, 3, 0, 4)
     with pytest.raises(ValueError, match="zip"):
         fill((2, 3), *first)
 
@@ -704,7 +779,8 @@ def test_a_buffer_of_another_type_is_refused(warp_backend: Backend) -> None:
     doubles = warp_backend.upload(np.zeros(60))
     squared = warp_backend.upload(np.zeros(6, np.int32))
     with pytest.raises(RuntimeError, match="density"):
-        warp_backend.compile("fill_field", frozenset())((2, 3), squared, doubles, doubles, 3, 2, 0)
+        fill = warp_backend.compile("fill_field", frozenset())
+        fill((2, 3), squared, doubles, doubles, 3, 2, 0, 0.0, 0, 0, 2, 3, 0, 6)
 
 
 _QUIET = """
@@ -717,7 +793,7 @@ backend = get_backend("warp:cpu")
 launch = backend.compile("square_runs", frozenset())
 cells = backend.upload(np.array([0, 0, 1, 0], np.uint8))
 runs = backend.empty(8, np.dtype(np.uint8))
-launch((1, 2), cells, runs, 1, 4)
+launch((1, 2), cells, runs, 1, 4, 0, 4)
 backend.synchronize()
 assert backend.download(runs, np.empty(8, np.uint8)).tolist() == [2, 1, 0, 1, 1, 2, 0, 1]
 assert before == {name: getattr(wp.config, name) for name in before}

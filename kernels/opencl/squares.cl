@@ -79,15 +79,15 @@ kernel void squares_scan(global const uchar *runs, global uchar *squares, const 
     const int plane = get_global_id(2), dx = plane & 1 ? -1 : 1, dy = plane & 2 ? -1 : 1;
     const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
     if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows)) return;
-    global const uchar *run = runs + (long)(plane & 1) * band * cols + col;
-    int side = run[(long)(row - first) * cols];
-    for (int i = 1; i < side; ++i) {
-        const int other = row + i * dy;
-        if (other < 0 || other >= rows) {
-            side = i;
-            break;
-        }
-        side = min(side, max((int)run[(long)(other - first) * cols], i));
+    global const uchar *run = runs + (long)(plane & 1) * band * cols + (long)(row - first) * cols + col;
+    const long next = (long)dy * cols;
+    int side = min((int)run[0], dy > 0 ? rows - row : row + 1), i = 1;
+    // Four rows between two decisions, so that reads need not wait for one another.
+    for (; i + 3 < side; i += 4) {
+        const int a = max((int)run[i * next], i), b = max((int)run[(i + 1) * next], i + 1);
+        const int c = max((int)run[(i + 2) * next], i + 2), d = max((int)run[(i + 3) * next], i + 3);
+        side = min(side, min(min(a, b), min(c, d)));
     }
+    for (; i < side; ++i) side = min(side, max((int)run[i * next], i));
     squares[(long)plane * (rows + 2) * (cols + 2) + padded(row, col, cols)] = (uchar)side;
 }

@@ -140,15 +140,20 @@ def squares_scan(
     row = reach_begin(dy, top) + row_item
     if col >= reach_end(dx, right, cols) or row >= reach_end(dy, bottom, rows):
         return
-    run = (plane & 1) * band * cols + col
-    side = int(runs[run + (row - first) * cols])
+    run = (plane & 1) * band * cols + (row - first) * cols + col
+    next_row = dy * cols
+    side = wp.min(int(runs[run]), wp.where(dy > 0, rows - row, row + 1))
     i = int(1)
+    # Four rows between two decisions, so that reads need not wait for one another.
+    while i + 3 < side:
+        a = wp.max(int(runs[run + i * next_row]), i)
+        b = wp.max(int(runs[run + (i + 1) * next_row]), i + 1)
+        c = wp.max(int(runs[run + (i + 2) * next_row]), i + 2)
+        d = wp.max(int(runs[run + (i + 3) * next_row]), i + 3)
+        side = wp.min(side, wp.min(wp.min(a, b), wp.min(c, d)))
+        i += 4
     while i < side:
-        other = row + i * dy
-        if other < 0 or other >= rows:
-            side = i
-        else:
-            side = wp.min(side, wp.max(int(runs[run + (other - first) * cols]), i))
+        side = wp.min(side, wp.max(int(runs[run + i * next_row]), i))
         i += 1
     squares[plane * (rows + 2) * (cols + 2) + padded(row, col, cols)] = wp.uint8(side)
 

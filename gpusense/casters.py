@@ -19,6 +19,7 @@ from gpusense.backends.base import Buffer
 from gpusense.directional import directional_table
 from gpusense.lookup_files import read_lookup
 from gpusense.prepare import check_size, empty_rectangles, sectors_of, squared_distances
+from gpusense.region import Region
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
 _NO_OBSTACLE = np.iinfo(np.int32).max
@@ -79,6 +80,10 @@ class Caster(ABC):
     def prepare(self, backend: Backend, window: Window) -> Table:
         """Make the table of a window on a device."""
 
+    def mend(self, backend: Backend, window: Window, table: Buffer, changed: Region) -> bool:
+        """Make a table follow obstacles that changed in a part of its window; False where it is to be made anew."""
+        return False
+
     def scalars(self) -> tuple[int, float, float]:
         """The kernels' arguments bins, slack [cells] and tolerance [cells]."""
         return 0, 0.0, 0.0
@@ -100,6 +105,11 @@ class Exact(Caster):
         sectors = sectors_of(backend, rows, cols)
         flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
         return Table(empty_rectangles(backend, window.obstacles, sectors), 8 * sectors * (rows + 2) * (cols + 2), flags)
+
+    def mend(self, backend: Backend, window: Window, table: Buffer, changed: Region) -> bool:
+        """See Caster.mend."""
+        empty_rectangles(backend, window.obstacles, sectors_of(backend, *window.obstacles.shape), table, changed)
+        return True
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,36 @@ class OccupancyGrid:
             ValueError: ``unknown`` is neither of the two.
         """
         _checks.choice("unknown", unknown, ("free", "occupied"))
-        return self.occupied if unknown == "free" else self.occupied | self.unknown
+        if unknown == "free":
+            return self.occupied
+        # One pass: as a byte, -1 is above every threshold.
+        return self._cells.view(np.uint8) >= self._occupied_threshold
+
+    def with_cells(self, cells: ArrayLike, region: ArrayLike) -> OccupancyGrid:
+        """A grid of which some cells are others.
+
+        Args:
+            cells: (h, w) integers, at least one: occupancy in per cent, 0 to 100, or -1 for unknown.
+            region: (row, col) of the cell that ``cells[0, 0]`` replaces. All must lie in the grid.
+
+        Raises:
+            TypeError: the cells or the region are not integers.
+            ValueError: a shape or a value breaks the rules above.
+        """
+        patch = _own_cells(cells)
+        row, col = _checks.array("region", region, (2,), dtype=np.int64).tolist()
+        rows, cols = patch.shape
+        if not (0 <= row <= self.shape[0] - rows and 0 <= col <= self.shape[1] - cols):
+            size = f"{rows} x {cols} cells within {self.shape[0]} x {self.shape[1]}"
+            raise ValueError(f"region: must put {size}, got ({row}, {col})")
+        changed = self._cells.copy()
+        changed[row : row + rows, col : col + cols] = patch
+        changed.setflags(write=False)
+        # All but the patch has been checked before.
+        grid = object.__new__(OccupancyGrid)
+        grid._cells, grid._resolution, grid._origin = changed, self._resolution, self._origin
+        grid._occupied_threshold, grid._occupied = self._occupied_threshold, None
+        return grid
 
     def bounds(self) -> tuple[float, float, float, float]:
         """The upright box around the grid in the world: (x_min, y_min, x_max, y_max) [m]."""

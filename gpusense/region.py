@@ -42,9 +42,35 @@ class Region:
             and other.col + other.cols <= self.col + self.cols
         )
 
+    def grown(self, by: int, shape: tuple[int, int]) -> Region:
+        """The window with so many more cells on every side, as far as there are cells in an array of that shape."""
+        row, col = max(self.row - by, 0), max(self.col - by, 0)
+        bottom, right = min(self.row + self.rows + by, shape[0]), min(self.col + self.cols + by, shape[1])
+        return Region(row, col, bottom - row, right - col)
+
+    def shared(self, other: Region) -> Region | None:
+        """The cells in both windows; None without any."""
+        row, col = max(self.row, other.row), max(self.col, other.col)
+        rows = min(self.row + self.rows, other.row + other.rows) - row
+        cols = min(self.col + self.cols, other.col + other.cols) - col
+        return Region(row, col, rows, cols) if rows > 0 and cols > 0 else None
+
+    def moved(self, rows: int, cols: int) -> Region:
+        """The window so many rows and columns farther on."""
+        return Region(self.row + rows, self.col + cols, self.rows, self.cols)
+
     def cut(self, array: np.ndarray) -> np.ndarray:
         """The window of a (H, W) array."""
         return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
+
+
+def box(cells: np.ndarray) -> Region | None:
+    """The smallest window of all that is True in a (H, W) array; None where nothing is."""
+    rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
+    if len(rows) == 0:
+        return None
+    row, col = int(rows[0]), int(cols[0])
+    return Region(row, col, int(rows[-1]) + 1 - row, int(cols[-1]) + 1 - col)
 
 
 def whole(grid: OccupancyGrid) -> Region:

@@ -121,6 +121,22 @@ class BeamModel(ScanModel):
         """
         self._caster.prepare(check_poses(poses))
 
+    def update_map(self, cells: object, region: object) -> None:
+        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+
+        With the exact caster only what can have changed is made anew; see ``RayCaster.update_map``.
+
+        Args:
+            cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
+            region: (row, col) of the cell that ``cells[0, 0]`` replaces.
+
+        Raises:
+            TypeError, ValueError: cells or a region that are not integers, or do not fit the grid, or a look-up table
+                from a file; nothing has changed.
+        """
+        with self._lock:
+            self.grid = self._caster.update(cells, region)
+
     def expected_ranges(self, poses: object) -> np.ndarray:
         """z* of every beam of the scanner at each pose.
 

@@ -20,6 +20,7 @@ from gpusense.lookup_files import describe, write_lookup
 from gpusense.models.reachable import ReachableMap
 from gpusense.models.scan_model import check_poses, check_scene, chunk_of, in_chunks, place_in, real_dtype
 from gpusense.plan import Omission
+from gpusense.region import Region
 from gpusense.workspace import Workspace
 
 _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
@@ -119,6 +120,22 @@ class RayCaster:
         """
         self._caster.prepare(check_poses(poses))
 
+    def update_map(self, cells: object, region: object) -> None:
+        """Replace cells of the map; afterwards every range is that of a caster of the changed grid.
+
+        The exact caster mends its table where squares can hold a changed obstacle, up to 254 cells off; the others make
+        theirs anew with the next cast.
+
+        Args:
+            cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
+            region: (row, col) of the cell that ``cells[0, 0]`` replaces.
+
+        Raises:
+            TypeError, ValueError: cells or a region that are not integers, or do not fit the grid, or a look-up table
+                from a file; nothing has changed.
+        """
+        self.grid = self._caster.update(cells, region)
+
     def save_table(self, path: str | Path) -> None:
         """Write the look-up table, whole or not at all, for ``casters.Lookup(bins, file=path)``.
 
@@ -179,7 +196,9 @@ class MapCaster:
         self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
         self.limit = range_max / grid.resolution
         self.method, self.outside, self.table_bytes = method, outside, 0
-        self.map = ReachableMap(backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole)
+        self.map = ReachableMap(
+            backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._mend
+        )
         self._own_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
         self._own_flags |= {method.flag} if method.flag else set()
         # Those of the table once there is one.
@@ -204,6 +223,17 @@ class MapCaster:
         self.table_bytes = table.size
         self.flags = self._own_flags | table.flags
         return table.buffer
+
+    def _mend(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Region) -> bool:
+        return self.method.mend(backend, Window(obstacles, self.limit, self.outside), table, changed)
+
+    def update(self, cells: object, region: object) -> OccupancyGrid:
+        """Replace cells of the map, and return it."""
+        if isinstance(self.method, casters.Lookup) and self.method.file is not None:
+            raise ValueError(f"file: must be None where the map changes, got {_checks.show(self.method.file)}")
+        with self._lock:
+            self.grid = self.map.update(cells, region)
+            return self.grid
 
     def prepare(self, poses: np.ndarray) -> None:
         """Make the table for (N, 3) poses."""

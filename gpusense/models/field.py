@@ -10,10 +10,10 @@ import numpy as np
 from gpusense import _checks
 from gpusense import compat as compat_module
 from gpusense.backends import Backend
-from gpusense.backends.base import Buffer
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
+from gpusense.models.field_table import RING, FieldTable
 from gpusense.models.reachable import ReachableMap
 from gpusense.models.scan_model import (
     HIGH_PEAK,
@@ -26,13 +26,8 @@ from gpusense.models.scan_model import (
 )
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
-from gpusense.prepare import check_size, squared_distances
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
-
-_RING = 2
-# Longest table from squared distances to densities; a larger cap is looked up on the host while preparing.
-_LONGEST_TABLE = 1 << 22
 
 
 class LikelihoodFieldModel(ScanModel):
@@ -93,16 +88,20 @@ class LikelihoodFieldModel(ScanModel):
         self._lead = 0.0 if peer is None else 1.0
         self._log_table = (specialize or peer is not None) and not self._bilinear
         self._flags, self._terms = self._mixture()
+        table = FieldTable(
+            self._real, p, grid.resolution, scanner.range_max, outside=self.outside, compat=compat,
+            log_table=self._log_table, flags=self._flags,
+        )  # fmt: skip
         reach = (scanner.range_max + p.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self._backend, grid, self.unknown, scanner.mount, reach, self._prepare_table, crop=specialize
+            self._backend, grid, self.unknown, scanner.mount, reach, table.make, specialize, table.mend
         )
 
     @property
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before the first call."""
         region = self._map.region
-        return 0 if region is None else self._real.itemsize * (region.rows + 2 * _RING) * (region.cols + 2 * _RING)
+        return 0 if region is None else self._real.itemsize * (region.rows + 2 * RING) * (region.cols + 2 * RING)
 
     def prepare(self, poses: object) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
@@ -115,6 +114,21 @@ class LikelihoodFieldModel(ScanModel):
         if len(checked):
             with self._lock:
                 self._map.ensure(checked)
+
+    def update_map(self, cells: object, region: object) -> None:
+        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+
+        Only distances that can have changed, those within ``max_distance`` of a changed obstacle, are computed again.
+
+        Args:
+            cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
+            region: (row, col) of the cell that ``cells[0, 0]`` replaces.
+
+        Raises:
+            TypeError, ValueError: cells or a region that are not integers, or do not fit the grid; nothing has changed.
+        """
+        with self._lock:
+            self.grid = self._map.update(cells, region)
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
@@ -165,61 +179,6 @@ class LikelihoodFieldModel(ScanModel):
         terms = [head[0], 0.5 / p.sigma_hit / p.sigma_hit, head[1], log_weight(p.z_max)]
         return frozenset(flags), rounded_terms(terms, self._real)
 
-    def _values(self, squared: np.ndarray) -> np.ndarray:
-        """What the table holds for squared cell distances: log densities, or distances in metres. float64."""
-        p = self.parameters
-        distance = np.minimum(np.sqrt(squared) * self.grid.resolution, p.max_distance)
-        if self._peer is not None:
-            return self._cubes(distance)
-        return self._log_density(distance) if self._log_table else distance
-
-    def _cubes(self, distance: np.ndarray) -> np.ndarray:
-        """What the peer sums: the cube of its density at a distance."""
-        p, amcl = self.parameters, self.compat == "amcl"
-        hit = p.z_hit if amcl else p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-        density = hit * np.exp(-0.5 * (distance / p.sigma_hit) ** 2) + p.z_rand / self.scanner.range_max
-        return np.asarray(density**3)
-
-    def _log_density(self, distance: np.ndarray) -> np.ndarray:
-        p = self.parameters
-        with np.errstate(over="ignore"):
-            exponent = 0.5 * (distance / p.sigma_hit) ** 2
-        log_hit = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - exponent
-        return np.logaddexp(log_hit, log_weight(p.z_rand) - math.log(self.scanner.range_max))
-
-    def _prepare_table(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
-        """Padded table of a window; its ring holds what lies outside the grid."""
-        rows, cols = obstacles.shape
-        check_size(rows, cols)
-        p = self.parameters
-        beyond = self._values(np.array([0.0 if self.outside == "occupied" else np.inf])).astype(self._real)
-        if self.compat == "beluga" and self.outside == "free":
-            beyond[:] = 1 / self.scanner.range_max**3
-        size = (rows + 2 * _RING, cols + 2 * _RING)
-        reach, diagonal = p.max_distance / self.grid.resolution, rows * rows + cols * cols
-        farthest = diagonal if reach * reach >= diagonal else math.floor(reach * reach) + 1
-        if self.outside == "occupied":
-            return backend.upload(self._table_with_walls(obstacles, size))
-        squared = squared_distances(backend, obstacles)
-        if farthest > _LONGEST_TABLE:
-            distances = backend.download(squared, np.empty((rows, cols), np.int32))
-            table = np.full(size, beyond[0])
-            table[_RING:-_RING, _RING:-_RING] = self._values(_with_infinity(distances))
-            return backend.upload(table)
-        density = self._values(np.append(np.arange(farthest + 1, dtype=np.float64), np.inf)).astype(self._real)
-        table = backend.upload(np.full(size, beyond[0]))
-        backend.compile("fill_field", self._flags)(
-            (cols, rows), squared, backend.upload(density), table, rows, cols, farthest + 1
-        )
-        backend.synchronize()
-        return table
-
-    def _table_with_walls(self, obstacles: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Table of a window whose surroundings are occupied: distances see the ring as obstacles."""
-        walled = np.pad(obstacles, _RING, constant_values=True)
-        squared = self._backend.download(squared_distances(self._backend, walled), np.empty(size, np.int32))
-        return self._values(_with_infinity(squared)).astype(self._real)
-
     def _impossible(self) -> bool:
         return self.parameters.z_hit == 0 and self.parameters.z_rand == 0
 
@@ -254,8 +213,3 @@ class LikelihoodFieldModel(ScanModel):
             return self._backend.download(parts, each) if per_beam else each
 
         return launch
-
-
-def _with_infinity(squared: np.ndarray) -> np.ndarray:
-    """Squared distances as float64, infinite where there is no obstacle."""
-    return np.where(squared == np.iinfo(np.int32).max, np.inf, squared.astype(np.float64))

@@ -25,6 +25,8 @@ class ReachableMap:
         reach: Longest distance in cells from a sensor that matters.
         prepare: Makes the table of a window from its (rows, cols) obstacles.
         crop: False prepares the whole map at once.
+        mend: Makes a table follow obstacles that changed within a part of its window, and says whether it did; False
+            where the table is to be made anew.
     """
 
     def __init__(
@@ -36,9 +38,10 @@ class ReachableMap:
         reach: float,
         prepare: Callable[[Backend, np.ndarray], Buffer],
         crop: bool,
+        mend: Callable[[Backend, np.ndarray, Buffer, Region], bool],
     ) -> None:
         self._backend, self._grid, self._mount, self._reach, self._crop = backend, grid, mount, reach, crop
-        self._prepare = prepare
+        self._prepare, self._mend, self._unknown, self._shared = prepare, mend, unknown, True
         self.obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")
         self._table: Buffer = None
         self.region: Region | None = None
@@ -50,13 +53,46 @@ class ReachableMap:
             wanted = region.choose(self._grid, self.region, poses, self._mount, self._reach)
         else:
             wanted = region.whole(self._grid)
-        if wanted != self.region:
+        if wanted != self.region or self._table is None:
             self._table, self.region = None, None
             self._table = self._prepare(self._backend, wanted.cut(self.obstacles))
             self.region = wanted
             self.preparations += 1
         assert self.region is not None
         return self._table, self.region
+
+    def update(self, cells: object, place: object) -> OccupancyGrid:
+        """Replace cells of the map from (row, col) on; the table follows, now or, where it is made anew, when needed.
+
+        Returns:
+            The map as it is now.
+
+        Raises:
+            TypeError, ValueError: cells or a place that no grid can have; nothing has changed then.
+        """
+        grid = self._grid.with_cells(cells, place)  # type: ignore[arg-type]
+        row, col = np.asarray(place).tolist()
+        patch = OccupancyGrid(cells, occupied_threshold=grid.occupied_threshold)  # type: ignore[arg-type]
+        obstacles = patch.obstacles("occupied" if self._unknown == "occupied" else "free")
+        self._grid, part = grid, Region(row, col, *patch.shape)
+        changed = region.box(part.cut(self.obstacles) != obstacles)
+        if changed is None:
+            return grid
+        if self._shared:
+            # The grid's own array, and read-only.
+            self.obstacles, self._shared = self.obstacles.copy(), False
+        part.cut(self.obstacles)[...] = obstacles
+        window = self.region
+        if window is None or (near := window.shared(changed.moved(row, col))) is None or self._table is None:
+            return grid
+        # Should the device refuse, nothing is left that could be taken for the table of this map.
+        table, self._table = self._table, None
+        try:
+            mended = self._mend(self._backend, window.cut(self.obstacles), table, near.moved(-window.row, -window.col))
+        except MemoryError:
+            mended = False
+        self._table = table if mended else None
+        return grid
 
     def omission(self, bytes_per_cell: float) -> Omission | None:
         """What cropping leaves out, once a cloud has been seen."""

@@ -75,6 +75,8 @@ kernel void distance_envelope(global const int *along, global int *starts, globa
 #define FAR 46341
 #define BLOCK_BITS 5
 #define BLOCK_ROWS (1 << BLOCK_BITS)
+// Rows looked at between two decisions, so that reads need not wait for one another.
+#define STEP_ROWS 4
 
 // First pass, one work-item a cell: cells to the nearest occupied cell of the same row, FAR if it is over reach.
 kernel void distance_bits(global const int *bits, global ushort *nearest, const int rows, const int cols,
@@ -112,9 +114,11 @@ kernel void distance_search(global const ushort *nearest, global const ushort *b
     // One more than may be found.
     uint best = min(squares_sum(0, column[(long)row * cols]), (uint)most + 1);
     int i = 1;
-    for (; i <= BLOCK_ROWS && (uint)(i * i) < best; ++i) {
-        if (i <= row) best = min(best, squares_sum(i, column[(long)(row - i) * cols]));
-        if (row + i < rows) best = min(best, squares_sum(i, column[(long)(row + i) * cols]));
+    for (; i <= BLOCK_ROWS && (uint)(i * i) < best; i += STEP_ROWS) {
+        for (int j = i; j < i + STEP_ROWS; ++j) {
+            if (j <= row) best = min(best, squares_sum(j, column[(long)(row - j) * cols]));
+            if (row + j < rows) best = min(best, squares_sum(j, column[(long)(row + j) * cols]));
+        }
     }
     // Blocks begin beyond what has been seen, so all rows of a block lie on one side.
     for (int pass = (uint)(i * i) < best ? 0 : 2; pass < 2; ++pass) {

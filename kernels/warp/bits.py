@@ -1,5 +1,5 @@
-"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit; what a row lacks
-to a whole word is 0. A look at a word is a look at 32 cells.
+"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit; what a row
+lacks to a whole word is 0. A look at a word is a look at 32 cells.
 """
 
 from types import SimpleNamespace

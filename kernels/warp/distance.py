@@ -105,6 +105,8 @@ def distance_envelope(
 FAR = wp.constant(46341)
 BLOCK_BITS = wp.constant(5)
 BLOCK_ROWS = wp.constant(32)
+# Rows looked at between two decisions, so that reads need not wait for one another.
+STEP_ROWS = wp.constant(4)
 
 
 # First pass, one work-item a cell: cells to the nearest occupied cell of the same row, FAR if it is over reach.
@@ -171,11 +173,13 @@ def distance_search(
     best = wp.min(squares_sum(wp.uint32(0), wp.uint32(nearest[row * cols + col])), wp.uint32(most) + wp.uint32(1))
     i = int(1)
     while i <= BLOCK_ROWS and wp.uint32(i * i) < best:
-        if i <= row:
-            best = wp.min(best, squares_sum(wp.uint32(i), wp.uint32(nearest[(row - i) * cols + col])))
-        if row + i < rows:
-            best = wp.min(best, squares_sum(wp.uint32(i), wp.uint32(nearest[(row + i) * cols + col])))
-        i += 1
+        for k in range(STEP_ROWS):
+            j = i + k
+            if j <= row:
+                best = wp.min(best, squares_sum(wp.uint32(j), wp.uint32(nearest[(row - j) * cols + col])))
+            if row + j < rows:
+                best = wp.min(best, squares_sum(wp.uint32(j), wp.uint32(nearest[(row + j) * cols + col])))
+        i += STEP_ROWS
     # Blocks begin beyond what has been seen, so all rows of a block lie on one side.
     step = int(4)
     if wp.uint32(i * i) < best:
@@ -194,11 +198,11 @@ def distance_search(
             if step < 2:
                 best = wp.min(best, squares_sum(wp.uint32(far), least) + wp.uint32(1))
             elif squares_sum(wp.uint32(near), least) < best:
-                j = near
-                while j <= far:
-                    number = wp.uint32(nearest[(row + way * j) * cols + col])
-                    best = wp.min(best, squares_sum(wp.uint32(j), number))
-                    j += 1
+                n = near
+                while n <= far:
+                    number = wp.uint32(nearest[(row + way * n) * cols + col])
+                    best = wp.min(best, squares_sum(wp.uint32(n), number))
+                    n += 1
             b += way
         step += 1
     result = int(UNREACHABLE)

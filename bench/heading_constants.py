@@ -21,8 +21,15 @@ PART_BITS, WORD_BITS = 33, 32
 # Two words of zeros come first. A number below 2^1024 needs the bits up to 2^-969 and 192 more.
 ZERO_WORDS, WORDS = 2, 39
 
-
 Function = Callable[[mp.mpf], mp.mpf]
+
+
+def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
+    """Its value; lowest power first."""
+    value = mp.mpf(0)
+    for power in reversed(powers):
+        value = value * z + power
+    return value
 
 
 def remez(f: Function, weight: Function) -> list[mp.mpf]:
@@ -34,7 +41,7 @@ def remez(f: Function, weight: Function) -> list[mp.mpf]:
     for _ in range(20):
         rows = [[grid[i] ** k for k in range(count)] + [(-1) ** j / weights[i]] for j, i in enumerate(chosen)]
         powers = list(mp.lu_solve(mp.matrix(rows), mp.matrix([targets[i] for i in chosen])))[:count]
-        error = [(mp.polyval(powers[::-1], z) - t) * w for z, t, w in zip(grid, targets, weights, strict=True)]
+        error = [(polynomial(powers, z) - t) * w for z, t, w in zip(grid, targets, weights, strict=True)]
         # The largest error between two changes of its sign.
         runs: list[int] = []
         for i, e in enumerate(error):
@@ -62,7 +69,7 @@ def errors(sine: list[float], cosine: list[float]) -> tuple[float, float]:
     for i in range(1, 2001):
         z = END * i / 2000
         r = mp.sqrt(z)
-        found = r + r * z * mp.polyval(sine[::-1], z), 1 - z / 2 + z * z * mp.polyval(cosine[::-1], z)
+        found = r + r * z * polynomial(sine, z), 1 - z / 2 + z * z * polynomial(cosine, z)
         for k, (value, truth) in enumerate(zip(found, (mp.sin(r), mp.cos(r)), strict=True)):
             worst[k] = max(worst[k], abs(value / truth - 1))
     return float(mp.log(worst[0], 2)), float(mp.log(worst[1], 2))

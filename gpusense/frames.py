@@ -1,7 +1,8 @@
 """Poses and bearings on their way to a device: into the grid's frame in float64, split, and only then rounded.
 
 A pose becomes an integer cell, the fraction of that cell, and the cosine and sine of its heading. Precision then does
-not depend on how large the map or its coordinates are, and no kernel evaluates a trigonometric function.
+not depend on how large the map or its coordinates are. Poses are placed by the kernel ``place_poses`` or here, by its
+reference; both give the same bits.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from gpusense.reference import placement
 from gpusense.reference.heading import cos_sin
 
 Mount = tuple[float, float, float]
+Frame = tuple[float, float, float, float, float, float, float]
 
 _CAREFUL = frozenset({"CAREFUL"})
 
@@ -49,10 +51,11 @@ def to_grid(grid: OccupancyGrid, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarr
     return x / grid.resolution, y / grid.resolution
 
 
-def frame_scalars(grid: OccupancyGrid, mount: Mount) -> tuple[float, ...]:
-    """The grid's frame and the mount as the kernel ``place_poses`` wants them, from origin_x to yaw_sin."""
-    cos, sin = cos_sin(np.array([grid.origin[2]], np.float64))
-    return (*grid.origin[:2], grid.resolution, *mount[:2], float(cos[0]), float(sin[0]))
+def frame_scalars(grid: OccupancyGrid, mount: Mount) -> Frame:
+    """The grid's frame and the mount as the kernel ``place_poses`` takes them, from ``origin_x`` to ``yaw_sin``."""
+    x, y, yaw = grid.origin
+    cos, sin = cos_sin(np.array([yaw], np.float64))
+    return x, y, grid.resolution, mount[0], mount[1], float(cos[0]), float(sin[0])
 
 
 def place_poses(poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.dtype) -> PlacedPoses:
@@ -66,10 +69,11 @@ def place_poses(poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.d
     """
     count = len(poses)
     placed = PlacedPoses(np.empty((count, 2), np.int32), np.empty((count, 4), real), np.empty((count, 4), real))
+    verdict = np.zeros(2, np.int32)
     with np.errstate(all="ignore"):
         placement.place_poses(
-            _CAREFUL, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low,
-            np.zeros(2, np.int32), *(np.float64(value) for value in frame_scalars(grid, mount)), 0, 0, *grid.shape, count,
+            _CAREFUL, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, verdict,
+            *frame_scalars(grid, mount), 0, 0, *grid.shape, count,
         )  # fmt: skip
     return placed
 

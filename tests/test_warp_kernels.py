@@ -127,6 +127,7 @@ def test_warp_kernels_have_the_arguments_of_their_row(
     real = {np.float32: (wp.float32, wp.vec2f, wp.vec4f), np.float64: (wp.float64, wp.vec2d, wp.vec4d)}[precision]
     types = dict(zip(("real", "real2", "real4"), real, strict=True))
     types |= {"int": wp.int32, "int2": wp.vec2i, "uchar": wp.uint8, "ushort": wp.uint16, "entry": wp.uint8}
+    types |= {"double": wp.float64, "coordinate": wp.float64}
     row = KERNELS[kernel]
     made = warp_module(row.file).make(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
     expected = {a.name: (types[a.type], a.shape is not None) for a in row.arguments}
@@ -561,6 +562,8 @@ TRACES = [
     ("score_beams", "SHARED_RAYS", ("RAND", "LINEAR"), r"\bfirst\[", r"address\(var_first\b"),
     ("score_beams", "ALL_READINGS", ("RAND", "LINEAR"), r"\bisnan\(", r"\bwp::isnan\("),
     ("score_beams", "PER_BEAM", ("RAND", "LINEAR"), r"\bparts\[", r"array_store\(var_parts\b"),
+    ("place_poses", "CAREFUL", (), r"\bpose_low\[", r"array_store\(var_pose_low\b"),
+    ("place_poses", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32>"),
     ("score_field", "HIT", ("LINEAR",), r"\bexp\(", r"\bwp::exp\("),
     ("score_field", "CAREFUL", ("LOG_TABLE",), r"\bcareful_offset\(", r"careful_offset_\d+\("),
     ("score_field", "BILINEAR", ("LINEAR",), r"\bbilinear\(", r"bilinear_\d+\("),
@@ -610,25 +613,37 @@ def warp_code(kernel: str, flags: frozenset[str]) -> str:
         return without_comments(source.read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_cuda_code_rounds_every_operation_by_itself(
-    precision: type, needs: Callable[[str], str], tmp_path: Path
-) -> None:
-    needs("warp")
+def cuda_operations(kernel: str, flags: frozenset[str], folder: Path) -> set[str]:
+    """The floating-point operations that round, of the code that Warp makes of a kernel for a CUDA device."""
     import warp as wp
 
     architectures = wp.get_cuda_supported_archs()
     if not architectures:
         pytest.skip("this build of Warp has no CUDA compiler")
-    made = warp_module("ranges").make("cast_ranges", scene_flags(precision, "ORIGINS_OUTSIDE"))
+    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
     arch = min(architectures, key=lambda number: abs(number - 90))
-    wp.compile_aot_module(made.module, arch=arch, module_dir=tmp_path, use_ptx=True)
-    (code,) = tmp_path.glob("*.ptx")
-    operations = set(
-        re.findall(r"\b(?:fma|mad|mul|add|sub|div|rcp)\.\S*f(?:32|64)\b", code.read_text(encoding="utf-8"))
-    )
+    wp.compile_aot_module(made.module, arch=arch, module_dir=folder, use_ptx=True)
+    (code,) = folder.glob("*.ptx")
+    return set(re.findall(r"\b(?:fma|mad|mul|add|sub|div|rcp)\.\S*f(?:32|64)\b", code.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_cuda_code_rounds_every_operation_by_itself(
+    precision: type, needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    operations = cuda_operations("cast_ranges", scene_flags(precision, "ORIGINS_OUTSIDE"), tmp_path)
     bits = "f64" if precision is np.float64 else "f32"
     assert {f"rcp.rn.{bits}"} <= operations <= {f"{name}.rn.{bits}" for name in ("mul", "add", "sub", "div", "rcp")}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_cuda_code_places_poses_by_rounded_operations(
+    precision: type, needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    operations = cuda_operations("place_poses", scene_flags(precision, "CAREFUL"), tmp_path)
+    assert {"div.rn.f64"} <= operations <= {f"{name}.rn.f64" for name in ("mul", "add", "sub", "div")}
 
 
 @pytest.mark.parametrize("kernel", ["cast_ranges", "score_beams", "score_field"])

@@ -21,13 +21,13 @@ def place_poses(
     pose: np.ndarray,
     pose_low: np.ndarray,
     verdict: np.ndarray,
-    origin_x: np.float64,
-    origin_y: np.float64,
-    resolution: np.float64,
-    mount_x: np.float64,
-    mount_y: np.float64,
-    yaw_cos: np.float64,
-    yaw_sin: np.float64,
+    origin_x: float,
+    origin_y: float,
+    resolution: float,
+    mount_x: float,
+    mount_y: float,
+    yaw_cos: float,
+    yaw_sin: float,
     first_col: int,
     first_row: int,
     rows: int,
@@ -56,13 +56,13 @@ def place_poses(
         if yaw_sin != 0.0:
             x, y = yaw_cos * x + yaw_sin * y, yaw_cos * y - yaw_sin * x
             cos, sin = cos * yaw_cos + sin * yaw_sin, sin * yaw_cos - cos * yaw_sin
+        # What is not a number, as after an overflow, is far away too.
+        x, y = (np.fmin(np.fmax(position / resolution, -FARTHEST), FARTHEST) for position in (x, y))
         if not finite.all():
             verdict[0] = 1
-            x[~finite] = y[~finite] = -np.inf
+            x[~finite] = y[~finite] = -FARTHEST
             cos[~finite], sin[~finite] = 1.0, 0.0
         for axis, (position, first, count) in enumerate(((x, first_col, cols), (y, first_row, rows))):
-            # What is not a number, as after an overflow, is far away too.
-            position = np.fmin(np.fmax(position / resolution, -FARTHEST), FARTHEST)
             whole = np.floor(position)
             cell = whole.astype(np.int32) - first
             if cell.min() < 0 or cell.max() >= count:

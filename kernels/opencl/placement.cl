@@ -22,6 +22,12 @@ double within_reach(const double position) {
     return above < FARTHEST ? above : FARTHEST;
 }
 
+// floor, which some drivers call as a function; 0 of -0.
+double whole_below(const double position) {
+    const double whole = (double)(int)position;
+    return whole > position ? whole - 1.0 : whole;
+}
+
 // One work-item a particle: the pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low
 // takes what rounding took from pose. verdict, which the caller clears, becomes 1 where (0) a pose is not finite, (1) a
 // sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading (1, 0): it
@@ -52,19 +58,20 @@ kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, 
         cosine = cosine * yaw_cos + sine * yaw_sin;
         sine = sine * yaw_cos - cosine_before * yaw_sin;
     }
-    if (!finite) {
-        atomic_or(&verdict[0], 1);
-        x = y = -INFINITY;
-        cosine = 1, sine = 0;
-    }
     x = within_reach(x / resolution);
     y = within_reach(y / resolution);
-    const double whole_x = floor(x), whole_y = floor(y);
+    if (!finite) {
+        atomic_or(&verdict[0], 1);
+        x = y = -FARTHEST;
+        cosine = 1, sine = 0;
+    }
+    const double whole_x = whole_below(x), whole_y = whole_below(y);
     const int2 cell = (int2)((int)whole_x - first_col, (int)whole_y - first_row);
     if (cell.x < 0 || cell.y < 0 || cell.x >= cols || cell.y >= rows) atomic_or(&verdict[1], 1);
     pose_cell[particle] = cell;
-    x -= whole_x;
-    y -= whole_y;
+    // The sum makes 0 of -0.
+    x = (x - whole_x) + 0.0;
+    y = (y - whole_y) + 0.0;
     // A fraction just below 1 may round to 1, which would be the next cell.
     real rounded_x = (real)x, rounded_y = (real)y;
     rounded_x = rounded_x < BELOW_ONE ? rounded_x : BELOW_ONE;

@@ -78,7 +78,6 @@ def make(name, flags):
             y = yaw_cos * y - yaw_sin * x_before
             cosine = cosine * yaw_cos + sine * yaw_sin
             sine = sine * yaw_cos - cosine_before * yaw_sin
-        # An infinity divided by the resolution is far away.
         x = within_reach(x / resolution)
         y = within_reach(y / resolution)
         if not finite:

@@ -57,18 +57,18 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
     # last place.
     first = (bits >> np.uint64(52)).astype(np.int64) - (1075 - 62)
     word, shift = first >> 5, (first & 31).astype(np.uint64)
-    # turns = mantissa * window modulo 2^192, of which the upper 128 bits stay: turn_high and turn_low.
-    turn_high, turn_low, carry_1, carry_2, below = (np.zeros_like(bits) for _ in range(5))
+    # turns = mantissa * window modulo 2^192, of which the upper four words stay.
+    turn_1, turn_2, turn_3, turn_4, carry_1, carry_2, below = (np.zeros_like(bits) for _ in range(7))
     for k in (5, 4, 3, 2, 1, 0):
         both = WORDS[word + k] << np.uint64(32) | WORDS[word + k + 1]
         here = both << shift >> np.uint64(32)
         sum_1 = low_half * here + carry_1
         sum_2 = high_half * below + (sum_1 & np.uint64(0xFFFFFFFF)) + carry_2
         carry_1, carry_2, below = sum_1 >> np.uint64(32), sum_2 >> np.uint64(32), here
-        turn_low = turn_low >> np.uint64(32) | turn_high << np.uint64(32)
-        turn_high = turn_high >> np.uint64(32) | sum_2 << np.uint64(32)
+        turn_4, turn_3, turn_2, turn_1 = turn_3, turn_2, turn_1, sum_2 & np.uint64(0xFFFFFFFF)
     # To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.
-    turn_high = turn_high + np.uint64(0x2000000000000000)
+    turn_high = (turn_1 << np.uint64(32) | turn_2) + np.uint64(0x2000000000000000)
+    turn_low = turn_3 << np.uint64(32) | turn_4
     quadrant = (turn_high >> np.uint64(62)).astype(np.int32)
     rest = (turn_high & np.uint64(0x3FFFFFFFFFFFFFFF)).astype(np.int64) - 0x2000000000000000
     piece_1, piece_2 = (rest >> 30) * 2.0**-32, (rest & 0x3FFFFFFF) * 2.0**-62

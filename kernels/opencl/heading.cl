@@ -86,19 +86,18 @@ Turn reduce_huge(const double theta) {
     // last place.
     const int first = (int)(bits >> 52) - (1075 - 62);
     const int word = first >> 5, shift = first & 31;
-    // turns = mantissa * window modulo 2^192, of which the upper 128 bits stay: turn_high and turn_low.
-    ulong turn_high = 0, turn_low = 0, carry_1 = 0, carry_2 = 0, below = 0;
+    // turns = mantissa * window modulo 2^192, of which the upper four words stay.
+    ulong turn_1 = 0, turn_2 = 0, turn_3 = 0, turn_4 = 0, carry_1 = 0, carry_2 = 0, below = 0;
     for (int k = 5; k >= 0; k--) {
         const ulong both = (ulong)WORDS[word + k] << 32 | WORDS[word + k + 1];
         const ulong here = both << shift >> 32;
         const ulong sum_1 = low_half * here + carry_1;
         const ulong sum_2 = high_half * below + (sum_1 & 0xFFFFFFFFUL) + carry_2;
         carry_1 = sum_1 >> 32, carry_2 = sum_2 >> 32, below = here;
-        turn_low = turn_low >> 32 | turn_high << 32;
-        turn_high = turn_high >> 32 | sum_2 << 32;
+        turn_4 = turn_3, turn_3 = turn_2, turn_2 = turn_1, turn_1 = sum_2 & 0xFFFFFFFFUL;
     }
     // To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.
-    turn_high += 0x2000000000000000UL;
+    const ulong turn_high = (turn_1 << 32 | turn_2) + 0x2000000000000000UL, turn_low = turn_3 << 32 | turn_4;
     const int quadrant = (int)(turn_high >> 62);
     const long rest = (long)(turn_high & 0x3FFFFFFFFFFFFFFFUL) - 0x2000000000000000L;
     const double piece_1 = (double)(rest >> 30) * 0x1p-32, piece_2 = (double)(rest & 0x3FFFFFFFL) * 0x1p-62;

@@ -86,9 +86,11 @@ def functions():
         first = int(bits >> wp.uint64(52)) - (1075 - 62)
         word = first >> 5
         shift = wp.uint64(first & 31)
-        # turns = mantissa * window modulo 2^192, of which the upper 128 bits stay: turn_high and turn_low.
-        turn_high = wp.uint64(0)
-        turn_low = wp.uint64(0)
+        # turns = mantissa * window modulo 2^192, of which the upper four words stay.
+        turn_1 = wp.uint64(0)
+        turn_2 = wp.uint64(0)
+        turn_3 = wp.uint64(0)
+        turn_4 = wp.uint64(0)
         carry_1 = wp.uint64(0)
         carry_2 = wp.uint64(0)
         below = wp.uint64(0)
@@ -101,10 +103,13 @@ def functions():
             carry_1 = sum_1 >> wp.uint64(32)
             carry_2 = sum_2 >> wp.uint64(32)
             below = here
-            turn_low = turn_low >> wp.uint64(32) | turn_high << wp.uint64(32)
-            turn_high = turn_high >> wp.uint64(32) | sum_2 << wp.uint64(32)
+            turn_4 = turn_3
+            turn_3 = turn_2
+            turn_2 = turn_1
+            turn_1 = sum_2 & MASK_32
         # To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.
-        turn_high = turn_high + EIGHTH
+        turn_high = (turn_1 << wp.uint64(32) | turn_2) + EIGHTH
+        turn_low = turn_3 << wp.uint64(32) | turn_4
         quadrant = int(turn_high >> wp.uint64(62))
         rest = wp.int64(turn_high & MASK_62) - SIGNED_EIGHTH
         piece_1 = wp.float64(rest >> wp.int64(30)) * PIECE_1

@@ -7,6 +7,7 @@ reference; both give the same bits.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,11 +52,16 @@ def to_grid(grid: OccupancyGrid, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarr
     return x / grid.resolution, y / grid.resolution
 
 
+@functools.lru_cache(maxsize=256)
+def _cos_sin(angle: float) -> tuple[float, float]:
+    cos, sin = cos_sin(np.array([angle]))
+    return float(cos[0]), float(sin[0])
+
+
 def frame_scalars(grid: OccupancyGrid, mount: Mount) -> Frame:
     """The grid's frame and the mount as the kernel ``place_poses`` takes them, from ``origin_x`` to ``yaw_sin``."""
     x, y, yaw = grid.origin
-    cos, sin = cos_sin(np.array([yaw], np.float64))
-    return x, y, grid.resolution, mount[0], mount[1], float(cos[0]), float(sin[0])
+    return x, y, grid.resolution, mount[0], mount[1], *_cos_sin(yaw)
 
 
 def place_poses(poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.dtype) -> PlacedPoses:

@@ -42,40 +42,40 @@ def place_poses(
     """
     real = pose.dtype.type
     below_one = np.nextafter(real(1), real(0))
+    origin, mount = np.array([[origin_x], [origin_y]]), (mount_x, mount_y)
+    first, size = np.array([[first_col], [first_row]], np.int32), np.array([[cols], [rows]], np.int32)
     given = poses.reshape(-1, 3)[:particles]
     for begin in range(0, particles, BLOCK):
-        end = min(begin + BLOCK, particles)
-        x, y, theta = given[begin:end].T.astype(np.float64)
-        finite = (x - x) + (y - y) + (theta - theta) == 0.0
-        cos, sin = cos_sin(theta)
-        x -= origin_x
-        y -= origin_y
-        if mount_x != 0.0 or mount_y != 0.0:
-            x += cos * mount_x - sin * mount_y
-            y += sin * mount_x + cos * mount_y
+        block = slice(begin, min(begin + BLOCK, particles))
+        x_y_theta = given[block].T.astype(np.float64, order="C")
+        finite = np.isfinite(x_y_theta).all(axis=0)
+        cos, sin = cos_sin(x_y_theta[2])
+        position = x_y_theta[:2] - origin
+        if mount != (0.0, 0.0):
+            position[0] += cos * mount_x - sin * mount_y
+            position[1] += sin * mount_x + cos * mount_y
         if yaw_sin != 0.0:
-            x, y = yaw_cos * x + yaw_sin * y, yaw_cos * y - yaw_sin * x
+            x, y = position
+            position = np.stack([yaw_cos * x + yaw_sin * y, yaw_cos * y - yaw_sin * x])
             cos, sin = cos * yaw_cos + sin * yaw_sin, sin * yaw_cos - cos * yaw_sin
         # What is not a number, as after an overflow, is far away too.
-        x, y = (np.fmin(np.fmax(position / resolution, -FARTHEST), FARTHEST) for position in (x, y))
+        position = np.fmin(np.fmax(position / resolution, -FARTHEST), FARTHEST)
         if not finite.all():
             verdict[0] = 1
-            x[~finite] = y[~finite] = -FARTHEST
+            position[:, ~finite] = -FARTHEST
             cos[~finite], sin[~finite] = 1.0, 0.0
-        for axis, (position, first, count) in enumerate(((x, first_col, cols), (y, first_row, rows))):
-            whole = np.floor(position)
-            cell = whole.astype(np.int32) - first
-            if cell.min() < 0 or cell.max() >= count:
-                verdict[1] = 1
-            pose_cell[begin:end, axis] = cell
-            fraction = position - whole
-            # A fraction just below 1 may round to 1, which would be the next cell.
-            rounded = np.minimum(fraction.astype(real), below_one)
-            pose[begin:end, axis] = rounded
+        whole = np.floor(position)
+        cell = whole.astype(np.int32) - first
+        if ((cell < 0) | (cell >= size)).any():
+            verdict[1] = 1
+        exact = np.stack([*(position - whole), cos, sin])
+        rounded = exact.astype(real)
+        # A fraction just below 1 may round to 1, which would be the next cell.
+        rounded[:2] = np.minimum(rounded[:2], below_one)
+        # Column by column, which is faster than the transpose at once.
+        for axis in range(2):
+            pose_cell[block, axis] = cell[axis]
+        for column in range(4):
+            pose[block, column] = rounded[column]
             if "CAREFUL" in flags:
-                pose_low[begin:end, axis] = fraction - rounded
-        for column, value in ((2, cos), (3, sin)):
-            rounded = value.astype(real)
-            pose[begin:end, column] = rounded
-            if "CAREFUL" in flags:
-                pose_low[begin:end, column] = value - rounded
+                pose_low[block, column] = exact[column] - rounded[column]

@@ -1,21 +1,25 @@
 """Poses and bearings on their way to a device: into the grid's frame in float64, split, and only then rounded.
 
 A pose becomes an integer cell, the fraction of that cell, and the cosine and sine of its heading. Precision then does
-not depend on how large the map or its coordinates are, and no kernel evaluates a trigonometric function.
+not depend on how large the map or its coordinates are. Poses are placed by the kernel ``place_poses`` or here, by its
+reference; both give the same bits.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpusense.grid import OccupancyGrid
+from gpusense.reference import placement
+from gpusense.reference.heading import cos_sin
 
 Mount = tuple[float, float, float]
+Frame = tuple[float, float, float, float, float, float, float]
 
-# Cells farther off than this are as good as here: no range reaches them, and sums of two stay within int32.
-_FARTHEST = float(1 << 30)
+_CAREFUL = frozenset({"CAREFUL"})
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,18 @@ def to_grid(grid: OccupancyGrid, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarr
     return x / grid.resolution, y / grid.resolution
 
 
+@functools.lru_cache(maxsize=256)
+def _cos_sin(angle: float) -> tuple[float, float]:
+    cos, sin = cos_sin(np.array([angle]))
+    return float(cos[0]), float(sin[0])
+
+
+def frame_scalars(grid: OccupancyGrid, mount: Mount) -> Frame:
+    """The grid's frame and the mount as the kernel ``place_poses`` takes them, from ``origin_x`` to ``yaw_sin``."""
+    x, y, yaw = grid.origin
+    return x, y, grid.resolution, mount[0], mount[1], *_cos_sin(yaw)
+
+
 def place_poses(poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.dtype) -> PlacedPoses:
     """Place sensors in a grid: the pose times the scanner's mount, without the mount's yaw.
 
@@ -57,24 +73,15 @@ def place_poses(poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.d
         mount: The sensor's pose on the robot; its yaw belongs to the bearings.
         real: Precision of the result.
     """
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x, y = poses[:, 0] - grid.origin[0], poses[:, 1] - grid.origin[1]
-    if mount[0] != 0.0 or mount[1] != 0.0:
-        x = x + (cos * mount[0] - sin * mount[1])
-        y = y + (sin * mount[0] + cos * mount[1])
-    x, y = to_grid(grid, x, y)
-    yaw = grid.origin[2]
-    if yaw != 0.0:
-        turn_cos, turn_sin = np.cos(yaw), np.sin(yaw)
-        cos, sin = cos * turn_cos + sin * turn_sin, sin * turn_cos - cos * turn_sin
-    exact = np.stack([x, y, cos, sin], axis=1)
-    position = np.clip(exact[:, :2], -_FARTHEST, _FARTHEST)
-    whole = np.floor(position)
-    exact[:, :2] = position - whole
-    pose = exact.astype(real)
-    # A fraction just below 1 may round to 1, which would be the next cell.
-    pose[:, :2] = np.minimum(pose[:, :2], np.nextafter(real.type(1), real.type(0)))
-    return PlacedPoses(whole.astype(np.int32), pose, (exact - pose).astype(real))
+    count = len(poses)
+    placed = PlacedPoses(np.empty((count, 2), np.int32), np.empty((count, 4), real), np.empty((count, 4), real))
+    verdict = np.zeros(2, np.int32)
+    with np.errstate(all="ignore"):
+        placement.place_poses(
+            _CAREFUL, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, verdict,
+            *frame_scalars(grid, mount), 0, 0, *grid.shape, count,
+        )  # fmt: skip
+    return placed
 
 
 def ray_vectors(bearings: np.ndarray, mount: Mount) -> np.ndarray:

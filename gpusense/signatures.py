@@ -1,7 +1,8 @@
 """One row per kernel: its file, launch shape and arguments in order. Every backend binds its arguments from here.
 
 A kernel has three bodies (NumPy reference, OpenCL, Warp) with the same name and the same arguments; a test holds the
-three to this table. ``real`` stands for the precision of a model, float32 or float64.
+three to this table. ``real`` stands for the precision of a model, float32 or float64; ``double`` is always float64, and
+``coordinate`` is float64, or float32 with POSES_FLOAT32.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ FLAGS = {
     "PER_BEAM": "the log-likelihood of each reading is wanted",
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
+    "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
     "CAREFUL": "end points need more than the working precision to fall into the right cell",
 }
 
@@ -50,6 +52,7 @@ _SCALARS: dict[str, np.dtype] = {
     "int": np.dtype(np.int32),
     "uchar": np.dtype(np.uint8),
     "ushort": np.dtype(np.uint16),
+    "double": np.dtype(np.float64),
 }
 _WIDTHS = {"": 1, "2": 2, "4": 4}
 
@@ -169,6 +172,12 @@ KERNELS: dict[str, Kernel] = {
     ),
     "rectangles_scan": _kernel(
         "rectangles", "col row quadrant", "uchar runs [2 * band * cols]", f"out {_PLANES}", *_CHANGED,
+    ),
+    "place_poses": _kernel(
+        "placement", "particle", "coordinate poses [particles * 3]", "out int2 pose_cell [particles]",
+        "out real4 pose [particles]", "out real4 pose_low [particles]", "out int verdict [2]", "double origin_x",
+        "double origin_y", "double resolution", "double mount_x", "double mount_y", "double yaw_cos", "double yaw_sin",
+        "int first_col", "int first_row", *_MAP, "int particles",
     ),
     "cast_ranges": _kernel(
         "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,

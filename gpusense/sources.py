@@ -19,10 +19,15 @@ _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 _CONDITION = re.compile(r"#if (!?)([A-Z0-9_]+)$")
 
 
-def prelude(*, float64: bool) -> str:
-    """What every program begins with: no contraction, and the meaning of ``real``."""
+def prelude(*, float64: bool, doubles: bool = False) -> str:
+    """What every program begins with: no contraction, and the meaning of ``real``.
+
+    Args:
+        float64: Whether ``real`` is float64.
+        doubles: Whether the program uses float64 whatever ``real`` is.
+    """
     return _PRELUDE.format(
-        extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 else "",
+        extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 or doubles else "",
         real="double" if float64 else "float",
         float64=int(float64),
         splitter="134217729" if float64 else "4097",
@@ -74,9 +79,15 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
     return "\n".join(kept) + "\n"
 
 
+def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
+    """Whether a kernel file computes in float64 whatever the precision of the model."""
+    texts = (re.sub(r"//.*", "", opencl_source(needed)) for needed in required_files(file, flags))
+    return any(re.search(r"\bdouble[24]?\b", text) for text in texts)
+
+
 def assemble(file: str, flags: frozenset[str]) -> str:
     """Complete OpenCL C source of a kernel file for a set of flags."""
-    parts = [prelude(float64="FLOAT64" in flags)]
+    parts = [prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))]
     for needed in required_files(file, flags):
         parts += [f'#line 1 "{needed}.cl"\n', resolve(opencl_source(needed), flags, f"{needed}.cl")]
     return "".join(parts)

@@ -70,6 +70,11 @@ class Tolerance:
 _ALL = (
     Tolerance("distance transform", 0, "cells that differ", "squared distances are integers, found exactly"),
     Tolerance("empty squares", 0, "cells that differ", "shorter sides of empty rectangles are integers, found exactly"),
+    Tolerance("placed poses", 0, "values with other bits", "float64 sums, products and quotients, each rounded"),
+    Tolerance(
+        "cosines and sines of headings", 0.9, "ulps of float64",
+        "half an ulp of the last sum, and up to 0.4 of what rounds its terms and of the polynomials",
+    ),
     Tolerance(
         "float32 ranges", 0, "values with other bits",
         "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines come "

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 import gpusense as gs
 from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.heading import cos_sin
 from gpusense.tolerances import TOLERANCES, per_beam
 
 CELL, MARGIN, RANGE, CAP, MOUNT = 0.25, 6, 6.0, 1.0, (0.2, -0.1, 0.3)
@@ -164,7 +165,8 @@ def test_turn(kind, on, seed, name, quarters):
     made = scene(kind, seed)
     theta = np.random.default_rng(seed).uniform(-4, 4, 4000)
     turned = theta + quarters * (np.pi / 2)
-    vectors = np.cos(theta) + 1j * np.sin(theta), (np.cos(turned) + 1j * np.sin(turned)) * (-1j) ** quarters
+    (cos, sin), (turned_cos, turned_sin) = cos_sin(theta), cos_sin(turned)
+    vectors = cos + 1j * sin, (turned_cos + 1j * turned_sin) * (-1j) ** quarters
     exact = np.equal(*np.array(vectors).astype({"float32": "c8", "float64": "c16"}[on["precision"]]))
     cells, (x, y, _) = made.cells, made.poses.T
     before = replace(made, poses=np.column_stack([x, y, theta[exact][:12]]))

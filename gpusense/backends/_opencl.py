@@ -12,7 +12,7 @@ import pyopencl as cl
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel, lanes_of
-from gpusense.sources import assemble, relevant, with_places
+from gpusense.sources import assemble, relevant, uses_double, with_places
 
 # Devices that check or emulate: correct, but no one wants to wait for them unasked.
 SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
@@ -131,6 +131,8 @@ class OpenCLBackend(ProcessBound):
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:
             raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
+        if not self.info.float64 and uses_double(file, flags):
+            raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
         binary = self._cache.load(source, self.options)
         if binary is not None:

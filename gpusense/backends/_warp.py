@@ -185,7 +185,7 @@ class _Launch:
 def _binding(argument: Argument) -> Callable[[Any], Any]:
     """What turns a value into an argument of a kernel."""
     if argument.shape is None:
-        return float if argument.type == "real" else int
+        return float if argument.type in ("real", "double") else int
     return functools.partial(_view, width=argument.width)
 
 

@@ -1,0 +1,108 @@
+"""Poses on their way into a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
+
+Only +, -, *, /, floor and comparisons are used, so that every device places a pose alike to the last bit.
+"""
+
+import functools
+
+import warp as wp
+
+from . import heading
+from .prelude import kernel, precision
+
+# Cells farther off than this are as good as here: no range reaches them, and sums of two stay within int32.
+FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+
+
+# What is not a number, as after an overflow, is far away too.
+@wp.func
+def within_reach(position: wp.float64):
+    above = wp.where(position > MINUS_FARTHEST, position, MINUS_FARTHEST)
+    return wp.where(above < FARTHEST, above, FARTHEST)
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel place_poses specialised by the flags."""
+    types = precision(flags)
+    real, vec4 = types.real, types.vec4
+    cos_sin = heading.functions().cos_sin
+    coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
+    CAREFUL = "CAREFUL" in flags
+    BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
+
+    # One work-item a particle: the pose times the scanner's mount, without its yaw, which belongs to the bearings.
+    # pose_low takes what rounding took from pose. verdict, which the caller clears, becomes 1 where (0) a pose is not
+    # finite, (1) a sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and
+    # heading (1, 0): it sees nothing, and no index made of it is out of bounds.
+    @kernel
+    def place_poses(
+        poses: wp.array(dtype=coordinate),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        verdict: wp.array(dtype=wp.int32),
+        origin_x: wp.float64,
+        origin_y: wp.float64,
+        resolution: wp.float64,
+        mount_x: wp.float64,
+        mount_y: wp.float64,
+        yaw_cos: wp.float64,
+        yaw_sin: wp.float64,
+        first_col: wp.int32,
+        first_row: wp.int32,
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+    ):
+        particle = wp.tid()
+        if particle >= particles:
+            return
+        x = wp.float64(poses[3 * particle])
+        y = wp.float64(poses[3 * particle + 1])
+        theta = wp.float64(poses[3 * particle + 2])
+        finite = (x - x) + (y - y) + (theta - theta) == ZERO
+        turned = cos_sin(theta)
+        cosine = turned.x
+        sine = turned.y
+        x = x - origin_x
+        y = y - origin_y
+        if mount_x != ZERO or mount_y != ZERO:
+            x = x + (cosine * mount_x - sine * mount_y)
+            y = y + (sine * mount_x + cosine * mount_y)
+        if yaw_sin != ZERO:
+            x_before = x
+            cosine_before = cosine
+            x = yaw_cos * x + yaw_sin * y
+            y = yaw_cos * y - yaw_sin * x_before
+            cosine = cosine * yaw_cos + sine * yaw_sin
+            sine = sine * yaw_cos - cosine_before * yaw_sin
+        x = within_reach(x / resolution)
+        y = within_reach(y / resolution)
+        if not finite:
+            wp.atomic_max(verdict, 0, 1)
+            x = MINUS_FARTHEST
+            y = MINUS_FARTHEST
+            cosine = ONE
+            sine = ZERO
+        whole_x = wp.floor(x)
+        whole_y = wp.floor(y)
+        cell = wp.vec2i(int(whole_x) - first_col, int(whole_y) - first_row)
+        if cell.x < 0 or cell.y < 0 or cell.x >= cols or cell.y >= rows:
+            wp.atomic_max(verdict, 1, 1)
+        pose_cell[particle] = cell
+        x = x - whole_x
+        y = y - whole_y
+        # A fraction just below 1 may round to 1, which would be the next cell.
+        rounded = vec4(wp.min(real(x), BELOW_ONE), wp.min(real(y), BELOW_ONE), real(cosine), real(sine))
+        pose[particle] = rounded
+        if CAREFUL:
+            pose_low[particle] = vec4(
+                real(x - wp.float64(rounded.x)),
+                real(y - wp.float64(rounded.y)),
+                real(cosine - wp.float64(rounded.z)),
+                real(sine - wp.float64(rounded.w)),
+            )
+
+    return {"place_poses": place_poses}[name]

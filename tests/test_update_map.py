@@ -16,8 +16,8 @@ BEARINGS = np.linspace(-3, 3, 9)
 SCANNER = gs.Scanner(BEARINGS, RANGE_MAX, mount=(0.1, 0.05, 0.3))
 METHODS = ["exact", "dda", "march", "bresenham", casters.Cddt(16), casters.Lookup(12)]
 FIELDS = {
-    "nearest": {"max_distance": 0.7},
-    "bilinear": {"max_distance": 0.7, "interpolation": "bilinear"},
+    "nearest": {"max_distance": 0.72},
+    "bilinear": {"max_distance": 0.72, "interpolation": "bilinear"},
     "uncapped": {"max_distance": 1e3},
 }
 # What a patch is made of: nothing, much unknown, some obstacles, only obstacles.
@@ -114,6 +114,27 @@ def test_the_field_follows(field, outside, precision, device):
     )
 
 
+@pytest.mark.parametrize("outside", ["free", "occupied"])
+def test_every_cell_of_a_mended_field_is_that_of_a_new_one(outside, device):
+    """A cap of 7.2 cells: distances of 7 cells, just within reach of an edit, still count."""
+    rng, shape = np.random.default_rng(14), (90, 80)
+    parameters = gs.LikelihoodFieldParameters(max_distance=0.72)
+
+    def make(grid):
+        model = gs.LikelihoodFieldModel(grid, SCANNER, parameters, backend=device, outside=outside)
+        model.prepare([[1, 1, 0]])
+        return model
+
+    def table(model):
+        return device.download(model._map._table, np.empty((shape[0] + 4, shape[1] + 4), np.float32))
+
+    model = make(gs.OccupancyGrid(np.zeros(shape, int), RESOLUTION))
+    for cells, place in patches(rng, shape, 30):
+        model.update_map(cells, place)
+        np.testing.assert_array_equal(table(model), table(make(model.grid)))
+    assert model._map.preparations == 1
+
+
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
 def test_models_with_the_weights_of_others_follow(compat):
     rng = np.random.default_rng(4)
@@ -146,7 +167,7 @@ def make(request, backend):
             return gs.RayCaster(grid, RANGE_MAX, backend=backend)
         if request.param is gs.BeamModel:
             return gs.BeamModel(grid, SCANNER, backend=backend)
-        parameters = gs.LikelihoodFieldParameters(max_distance=0.7)
+        parameters = gs.LikelihoodFieldParameters(max_distance=0.72)
         return gs.LikelihoodFieldModel(grid, SCANNER, parameters, backend=backend)
 
     return made
@@ -251,7 +272,7 @@ def test_only_what_can_change_is_made_again(monkeypatch):
     """An edit of 5 x 5 cells in 2000 x 2000: what reaches the device."""
     grid = gs.OccupancyGrid(cells_of(np.random.default_rng(12), (2000, 2000)), RESOLUTION)
     device = get_backend("numpy")
-    parameters, sizes, upload = gs.LikelihoodFieldParameters(max_distance=0.7), [], device.upload
+    parameters, sizes, upload = gs.LikelihoodFieldParameters(max_distance=0.72), [], device.upload
 
     def counted(array, out=None):
         sizes.append(array.size)

@@ -106,6 +106,7 @@ def prepare_scan(
     specialize: bool,
     *,
     max_is_range: bool = False,
+    distinct: bool = False,
 ) -> PreparedScan:
     """Class, choose and group the readings of one scan.
 
@@ -117,6 +118,7 @@ def prepare_scan(
         beams: Which beams are used.
         specialize: False keeps readings without information, and casts equal bearings one by one.
         max_is_range: Evaluate finite max readings like ranges, at range_max.
+        distinct: No two bearings are known to be the same.
     """
     kinds = classify(ranges, scanner)
     if max_is_range:
@@ -136,7 +138,7 @@ def prepare_scan(
         values[is_max] = np.inf
         constant = 0.0
         is_max = np.zeros_like(is_max)
-    rays, first, order = _group(vectors[columns], specialize)
+    rays, first, order = _group(vectors[columns], specialize and not distinct)
     return PreparedScan(
         columns=columns[order],
         readings=values[columns][order],

@@ -38,6 +38,9 @@ FLAGS = {
     "LANES_16": "a work-item computes 16 at once",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
+    "ORDERED": "particles come in an order in which neighbours have much the same position and heading",
+    "QUICK": "nearest cells are found by rounding, and again with more digits only where that is in doubt",
+    "INSIDE": "no end point of the cloud leaves the field's table",
     "PER_BEAM": "the log-likelihood of each reading is wanted",
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
@@ -189,6 +192,32 @@ KERNELS: dict[str, Kernel] = {
         "int readings", *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
         wide_group=16,
     ),
+    "cast_tiles": _kernel(
+        "ranges", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]",
+        "out real ranges [particles * rays]", *_MAP, "int particles", "int rays", *_CASTER, *_RANGE, "int spread",
+    ),
+    "beam_tiles": _kernel(
+        "beam", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]", "int first [rays + 1]",
+        "real reading [readings]", "real terms [10]", "real sensor [cells * (cells + 1)]",
+        "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_CASTER,
+        "int cells", "real per_metre", *_RANGE, "int across", "int along", "int spread",
+    ),
+    "sum_parts": _kernel(
+        "sums", "particle", "real parts [particles * count]", "int order [particles]", "out real log_p [particles]",
+        "int particles", "int count", "int block", "int across", "int along", "real fixed", "real temperature",
+    ),
+    "order_bounds": _kernel(
+        "order", "bin", *_POSES, "out int bounds [7]", "out int bins [32768]", "int particles",
+    ),
+    "order_count": _kernel(
+        "order", "particle", *_POSES, "int bounds [7]", "out int bins [32768]", "out int bin_of [particles]",
+        "int particles",
+    ),
+    "order_starts": _kernel("order", "stretch", "out int bounds [7]", "out int bins [32768]"),
+    "order_fill": _kernel(
+        "order", "particle", "int bin_of [particles]", "out int bins [32768]", "out int order [particles]",
+        "int particles",
+    ),
     "fill_lookup": _kernel(
         "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",
         "out ushort lookup [rows * cols * bins]", *_MAP, "int bins", "int first_row", "int count", "real limit",
@@ -197,6 +226,11 @@ KERNELS: dict[str, Kernel] = {
         "field", "col row", "int squared [rows * cols]", "real density [cap + 1]",
         "out real table [begin + height * stride]", *_MAP, "int cap", "real beyond", "int from_col", "int from_row",
         "int width", "int height", "int begin", "int stride",
+    ),
+    "field_blocks": _kernel(
+        "field", "item", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "out real parts [particles * readings]",
+        *_MAP, "int particles", "int readings", "real guard", "int across", "int along", "int spread",
     ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",

@@ -13,23 +13,38 @@ class Workspace:
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
+        # Host arrays that copies under way read or write.
+        self._busy: list[np.ndarray] = []
 
-    def empty(self, name: str, count: int, dtype: np.dtype) -> Buffer:
-        """A buffer of at least ``count`` numbers; what it held is lost."""
+    def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
+        """A buffer of at least ``count`` numbers; what it held is lost. A new one is cleared where asked."""
         dtype = np.dtype(dtype)
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
-            buffer = self._backend.empty(capacity, dtype)
+            buffer = self._backend.empty(capacity, dtype, zero=zero)
             self._buffers[name, dtype] = (capacity, buffer)
         return buffer
 
     def upload(self, name: str, array: np.ndarray) -> Buffer:
-        """Copy a host array into the head of a named buffer."""
-        return self._backend.upload(array, self.empty(name, array.size, array.dtype))
+        """Start to copy a host array, which nobody may change until ``wait``, into the head of a named buffer."""
+        array = np.ascontiguousarray(array)
+        self._busy.append(array)
+        return self._backend.upload(array, self.empty(name, array.size, array.dtype), wait=False)
+
+    def download(self, buffer: Buffer, out: np.ndarray) -> None:
+        """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""
+        self._busy.append(out)
+        self._backend.download(buffer, out, wait=False)
+
+    def wait(self) -> None:
+        """Wait for all copies and launches."""
+        self._backend.synchronize()
+        self._busy.clear()
 
     def release(self) -> None:
-        """Give the memory back; the next call allocates anew."""
+        """Wait, and give the memory back; the next call allocates anew."""
+        self.wait()
         self._buffers.clear()

@@ -26,7 +26,7 @@ class NumpyBackend:
         memory = _memory()
         self.info = BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
 
-    def upload(self, array: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    def upload(self, array: np.ndarray, out: np.ndarray | None = None, *, wait: bool = True) -> np.ndarray:
         """See Backend.upload."""
         if out is None:
             return array.ravel().copy()
@@ -37,10 +37,14 @@ class NumpyBackend:
         """See Backend.empty."""
         return np.zeros(count, dtype) if zero else np.empty(count, dtype)
 
-    def download(self, buffer: np.ndarray, out: np.ndarray) -> np.ndarray:
+    def download(self, buffer: np.ndarray, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
-        out.ravel()[...] = buffer[: out.size]
+        out.reshape(-1)[...] = buffer[: out.size]
         return out
+
+    def part(self, buffer: np.ndarray, first: int, count: int) -> np.ndarray:
+        """See Backend.part."""
+        return buffer[first : first + count]
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""

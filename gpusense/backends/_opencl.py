@@ -79,13 +79,13 @@ class OpenCLBackend(ProcessBound):
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
 
-    def upload(self, array: np.ndarray, out: cl.Buffer | None = None) -> cl.Buffer:
+    def upload(self, array: np.ndarray, out: cl.Buffer | None = None, *, wait: bool = True) -> cl.Buffer:
         """See Backend.upload."""
         self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             with _driver_errors():
-                cl.enqueue_copy(self._queue, buffer, np.ascontiguousarray(array))
+                cl.enqueue_copy(self._queue, buffer, np.ascontiguousarray(array), is_blocking=wait)
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> cl.Buffer:
@@ -101,12 +101,16 @@ class OpenCLBackend(ProcessBound):
                 cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
         return buffer
 
-    def download(self, buffer: cl.Buffer, out: np.ndarray) -> np.ndarray:
+    def download(self, buffer: cl.Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
             with _driver_errors():
-                cl.enqueue_copy(self._queue, out, buffer)
+                cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
+
+    def part(self, buffer: cl.Buffer, first: int, count: int) -> cl.Buffer:
+        """See Backend.part."""
+        raise TypeError("buffer: parts of OpenCL buffers are not used")
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""
@@ -118,7 +122,8 @@ class OpenCLBackend(ProcessBound):
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""
-        self._queue.finish()
+        with _driver_errors():
+            self._queue.finish()
 
     def _launcher(self, kernel: str, flags: frozenset[str]) -> _Launch:
         row = KERNELS[kernel]

@@ -79,15 +79,16 @@ class WarpBackend(ProcessBound):
         self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
         self._asked: dict[tuple[str, frozenset[str]], _Launch] = {}
 
-    def upload(self, array: np.ndarray, out: wp.array | None = None) -> wp.array:
+    def upload(self, array: np.ndarray, out: wp.array | None = None, *, wait: bool = True) -> wp.array:
         """See Backend.upload."""
         self.check_process()
         array = np.ascontiguousarray(array)
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             wp.copy(buffer, _host(array), count=array.size)
-            # Page-locked host memory is still being read when the copy returns.
-            self._wait()
+            if wait:
+                # Page-locked host memory is still being read when the copy returns.
+                self._wait()
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> wp.array:
@@ -107,12 +108,17 @@ class WarpBackend(ProcessBound):
                 raise MemoryError(f"{self.info.name} is out of memory: {error}") from error
             raise
 
-    def download(self, buffer: wp.array, out: np.ndarray) -> np.ndarray:
+    def download(self, buffer: wp.array, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
             wp.copy(_host(out), buffer, count=out.size)
-            self._wait()
+            if wait:
+                self._wait()
         return out
+
+    def part(self, buffer: wp.array, first: int, count: int) -> wp.array:
+        """See Backend.part."""
+        return buffer[first : first + count]
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""

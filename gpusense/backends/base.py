@@ -77,8 +77,11 @@ class Backend(Protocol):
     def info(self) -> BackendInfo:
         """The device behind this backend."""
 
-    def upload(self, array: np.ndarray, out: Buffer | None = None) -> Buffer:
-        """Copy a C-contiguous array to the device, into the head of ``out`` where given."""
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
+        """Copy a C-contiguous array to the device, into the head of ``out`` where given.
+
+        Without ``wait`` the array must stay as it is until ``synchronize`` has returned.
+        """
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """A new buffer of ``count`` numbers, cleared only where asked.
@@ -87,8 +90,14 @@ class Backend(Protocol):
             MemoryError: the device cannot hold it.
         """
 
-    def download(self, buffer: Buffer, out: np.ndarray) -> np.ndarray:
-        """Wait for the device and copy the head of a buffer into a C-contiguous array."""
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """Copy the head of a buffer into a C-contiguous array, after all that was started before.
+
+        Without ``wait`` the array must live, and is not filled, until ``synchronize`` has returned.
+        """
+
+    def part(self, buffer: Buffer, first: int, count: int) -> Buffer:
+        """``count`` numbers of a buffer from number ``first`` on, without a copy."""
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """The kernel of that name, specialised by flags; compiled once and kept."""

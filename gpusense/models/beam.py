@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -12,20 +13,20 @@ from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
+from gpusense.cloud import Cloud, all_within, ordered, tiles_of
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
 from gpusense.models.scan_model import (
     HIGH_PEAK,
     ScanModel,
-    check_poses,
     log_weight,
-    place_in,
     rounded_terms,
     sums_linearly,
 )
 from gpusense.parameters import BeamParameters
 from gpusense.plan import Omission, scene_omissions, share
+from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
@@ -105,6 +106,10 @@ class BeamModel(ScanModel):
         self._lead = 0.0 if peer is None else peer.beam_lead
         self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
+        self._terms_there = self._backend.upload(self._terms)
+        self._none = self._backend.upload(np.zeros(1, np.int32))
+        # Where the readings of each ray begin while no rays are shared.
+        self._one_each = self._backend.upload(np.arange(scanner.count + 1, dtype=np.int32))
         self._sensor, self._cells = self._tabulate(sensor_table)
 
     @property
@@ -119,7 +124,7 @@ class BeamModel(ScanModel):
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
             MemoryError: the device cannot hold the table.
         """
-        self._caster.prepare(check_poses(poses))
+        self._caster.prepare(Cloud(poses, self._backend))
 
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.
@@ -137,11 +142,12 @@ class BeamModel(ScanModel):
         with self._lock:
             self.grid = self._caster.update(cells, region)
 
-    def expected_ranges(self, poses: object) -> np.ndarray:
+    def expected_ranges(self, poses: object, *, out: Any = None) -> Any:
         """z* of every beam of the scanner at each pose.
 
         Args:
-            poses: (N, 3) robot poses in the world [m, m, rad].
+            poses: (N, 3) robot poses in the world [m, m, rad]; arrays of other libraries as in ``log_likelihood``.
+            out: Where to write them, as in ``log_likelihood``.
 
         Returns:
             (N, K) metres in the model's precision; exactly range_max where nothing is nearer.
@@ -149,9 +155,8 @@ class BeamModel(ScanModel):
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
         """
-        checked = check_poses(poses)
         with self._lock:
-            return self._caster.cast(checked, self._vectors)
+            return self._caster.cast(poses, self._vectors, out)
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
@@ -259,34 +264,47 @@ class BeamModel(ScanModel):
         p = self.parameters
         return p.z_hit == 0 and p.z_short == 0 and p.z_rand == 0
 
-    def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
-        space, real = self._workspace, self._real
-        ray = space.upload("ray", scan.rays.astype(real))
-        first = space.upload("first", scan.first)
+    def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
+        space, real, backend = self._workspace, self._real, self._backend
+        ray, shared = space.upload("ray", scan.rays.astype(real)), scan.shared or not self._specialize
+        first = space.upload("first", scan.first) if scan.shared else self._one_each
         reading = space.upload("reading", scan.readings.astype(real))
-        terms = space.upload("terms", self._terms)
         rays, readings = len(scan.rays), len(scan.readings)
+        scalars = (scan.constant + self._lead, self.temperature)
 
-        def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
-            table, region = self._caster.map.ensure(poses)
-            placed, beyond = place_in(region, poses, self.grid, self.scanner.mount, real)
-            flags = self._components | self._scene_flags()
-            flags |= {"SHARED_RAYS"} if scan.shared or not self._specialize else set()
-            flags |= {"ORIGINS_OUTSIDE"} if beyond or not self._specialize else set()
-            flags |= self._caster.flags
+        def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
+            table, region, corners = cloud.ensure(self._caster.map, *part)
+            mount, count = self.scanner.mount, part[1] - part[0]
+            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=False)
+            flags = self._components | self._scene_flags() | self._caster.flags
+            flags |= {"SHARED_RAYS"} if shared else set()
+            inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
+            flags |= set() if inside else {"ORIGINS_OUTSIDE"}
+            world = (region.rows, region.cols, count, rays, readings, *self._caster.scalars, self._cells)
+            world += (self._cells / self.scanner.range_max, self._caster.limit, self.grid.resolution)
+            world += (self.scanner.range_max,)
+            if backend.info.kind == "gpu" and not per_beam:
+                order = ordered(backend, space, placed, count, rays, real)
+                flags |= {"ORDERED"} if order is not None else set()
+                self._last_code = frozenset(flags)
+                order = self._none if order is None else order
+                parts = space.empty("parts", count * readings, real)
+                tiles, spread = tiles_of(count, rays)
+                backend.compile("beam_tiles", self._last_code)(
+                    (tiles,), table, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
+                    self._sensor, parts, *world, 1, count, spread,
+                )  # fmt: skip
+                backend.compile("sum_parts", self._last_code)(
+                    (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
+                )
+                return parts
             flags |= {"PER_BEAM"} if per_beam else set()
-            flags = self._last_code = widened(self._backend.info, "score_beams", flags)
-            count = len(poses)
-            result = space.empty("log_p", count, real)
+            flags = self._last_code = widened(backend.info, "score_beams", flags)
             parts = space.empty("parts", count * readings if per_beam else 1, real)
-            self._backend.compile("score_beams", flags)(
-                (count,), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, first,
-                reading, terms, self._sensor, result, parts, region.rows, region.cols, count, rays, readings,
-                *self._caster.scalars, self._cells, self._cells / self.scanner.range_max, self._caster.limit,
-                self.grid.resolution, self.scanner.range_max, scan.constant + self._lead, self.temperature,
+            backend.compile("score_beams", flags)(
+                (count,), table, placed.cell, placed.pose, ray, first, reading, self._terms_there, self._sensor, result,
+                parts, *world, *scalars,
             )  # fmt: skip
-            self._backend.download(result, log_p)
-            each = np.empty((count, readings if per_beam else 0), real)
-            return self._backend.download(parts, each) if per_beam else each
+            return parts
 
         return launch

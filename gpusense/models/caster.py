@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from gpusense import _checks, casters
+from gpusense import _checks, arrays, casters
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster, Window
+from gpusense.cloud import Cloud, all_within, ordered, tiles_of
 from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.lookup_files import describe, write_lookup
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import check_poses, check_scene, chunk_of, in_chunks, place_in, real_dtype
+from gpusense.models.scan_model import check_scene, chunk_of, in_chunks, real_dtype
 from gpusense.plan import Omission
 from gpusense.region import Region
 from gpusense.workspace import Workspace
@@ -118,7 +119,7 @@ class RayCaster:
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
             MemoryError: the device cannot hold the table.
         """
-        self._caster.prepare(check_poses(poses))
+        self._caster.prepare(Cloud(poses, self._caster.backend))
 
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every range is that of a caster of the changed grid.
@@ -147,12 +148,14 @@ class RayCaster:
             raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.method.name!r}")
         self._caster.save(_checks.path("path", path), self.method.bins)
 
-    def cast(self, poses: object, bearings: object) -> np.ndarray:
+    def cast(self, poses: object, bearings: object, *, out: Any = None) -> Any:
         """Expected ranges.
 
         Args:
-            poses: (N, 3) ray origins and headings in the world [m, m, rad].
+            poses: (N, 3) ray origins and headings in the world [m, m, rad]. Arrays of other libraries are used where they
+                are, and ranges come back in the same library; see ``BeamModel.log_likelihood``.
             bearings: (K,) directions relative to the heading [rad].
+            out: Where to write the ranges: (N, K) in the caster's precision, C-contiguous, where the poses are.
 
         Returns:
             (N, K) metres in the caster's precision: 0 inside an occupied cell, exactly ``range_max`` where nothing is
@@ -162,7 +165,7 @@ class RayCaster:
             TypeError, ValueError: arguments that are not finite numbers of these shapes.
         """
         vectors = ray_vectors(_checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
-        return self._caster.cast(check_poses(poses), vectors)
+        return self._caster.cast(poses, vectors, out)
 
 
 class MapCaster:
@@ -235,11 +238,11 @@ class MapCaster:
             self.grid = self.map.update(cells, region)
             return self.grid
 
-    def prepare(self, poses: np.ndarray) -> None:
-        """Make the table for (N, 3) poses."""
-        if len(poses):
+    def prepare(self, cloud: Cloud) -> None:
+        """Make the table for a cloud."""
+        if cloud.count:
             with self._lock:
-                self.map.ensure(poses)
+                cloud.ensure(self.map, 0, cloud.count)
 
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
@@ -249,31 +252,52 @@ class MapCaster:
             obstacles = region.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
-    def cast(self, poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-        """Expected ranges (N, K) of (N, 3) float64 poses and (K, 2) ray vectors, in pieces that fit the device."""
-        rays = len(vectors)
-        ranges = np.empty((len(poses), rays), self.real)
-        if ranges.size == 0:
-            return ranges
-        with self._lock:
-            ray = self._workspace.upload("ray", vectors.astype(self.real))
-            chunk = chunk_of(self.backend, rays, self.real.itemsize)
-            in_chunks(
-                len(poses), chunk, self._workspace,
-                lambda begin, end: self._cast_chunk(poses[begin:end], ray, ranges[begin:end]),
-            )  # fmt: skip
-        return ranges
+    def cast(self, poses: object, vectors: np.ndarray, out: object = None) -> Any:
+        """Expected ranges (N, K) of (N, 3) poses and (K, 2) ray vectors, in pieces that fit the device."""
+        cloud, rays = Cloud(poses, self.backend), len(vectors)
+        given = arrays.check_out(out, (cloud.count, rays), self.real, poses, self.backend)
+        ranges: Any
+        if cloud.on_device:
+            ranges = self.backend.empty(cloud.count * rays, self.real) if given is None else given
+        else:
+            ranges = np.empty((cloud.count, rays), self.real) if given is None else given
+        if cloud.count * rays:
+            with self._lock:
+                ray = self._workspace.upload("ray", vectors.astype(self.real))
+                chunk = chunk_of(self.backend, rays, self.real.itemsize)
+                in_chunks(
+                    cloud.count, chunk, self._workspace,
+                    lambda begin, end: self._cast_chunk(cloud, (begin, end), ray, rays, ranges),
+                )  # fmt: skip
+                self._workspace.wait()
+                cloud.check_on_device(self.backend, self._workspace)
+        if out is not None:
+            return out
+        if cloud.on_device:
+            return arrays.result_for(poses, ranges.reshape((cloud.count, rays)))
+        return arrays.like(poses, ranges)
 
-    def _cast_chunk(self, poses: np.ndarray, ray: Buffer, ranges: np.ndarray) -> None:
-        space = self._workspace
-        table, region = self.map.ensure(poses)
-        placed, beyond = place_in(region, poses, self.grid, self.mount, self.real)
-        count, rays = ranges.shape
-        result = space.empty("ranges", ranges.size, self.real)
-        flags = self.flags | self._wide | ({"ORIGINS_OUTSIDE"} if beyond else set())
-        flags = widened(self.backend.info, "cast_ranges", flags)
-        self.backend.compile("cast_ranges", flags)(
-            (rays, count), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose), ray, result,
-            region.rows, region.cols, count, rays, *self.scalars, self.limit, self.grid.resolution, self.range_max,
-        )  # fmt: skip
-        self.backend.download(result, ranges)
+    def _cast_chunk(self, cloud: Cloud, part: tuple[int, int], ray: Buffer, rays: int, ranges: Any) -> None:
+        space, backend, count = self._workspace, self.backend, part[1] - part[0]
+        table, region, corners = cloud.ensure(self.map, *part)
+        placed = cloud.place(backend, space, part, (region, self.grid, self.mount), self.real, careful=False)
+        if cloud.on_device:
+            result = backend.part(ranges, part[0] * rays, count * rays)
+        else:
+            result = space.empty("ranges", count * rays, self.real)
+        flags = self.flags | self._wide
+        flags |= set() if all_within(corners, self.grid, self.mount, region, 0) else {"ORIGINS_OUTSIDE"}
+        sizes = (region.rows, region.cols, count, rays, *self.scalars, self.limit, self.grid.resolution, self.range_max)
+        if backend.info.kind == "gpu":
+            order = ordered(backend, space, placed, count, rays, self.real)
+            flags |= {"ORDERED"} if order is not None else set()
+            order = placed.cell if order is None else order
+            tiles, spread = tiles_of(count, rays)
+            backend.compile("cast_tiles", flags)(
+                (tiles,), table, placed.cell, placed.pose, order, ray, result, *sizes, spread
+            )
+        else:
+            flags = widened(backend.info, "cast_ranges", flags)
+            backend.compile("cast_ranges", flags)((rays, count), table, placed.cell, placed.pose, ray, result, *sizes)
+        if not cloud.on_device:
+            space.download(result, ranges[slice(*part)])

@@ -10,6 +10,8 @@ import numpy as np
 from gpusense import _checks
 from gpusense import compat as compat_module
 from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.cloud import Cloud, all_within, spread_of
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
@@ -18,16 +20,19 @@ from gpusense.models.reachable import ReachableMap
 from gpusense.models.scan_model import (
     HIGH_PEAK,
     ScanModel,
-    check_poses,
     log_weight,
-    place_in,
     rounded_terms,
     sums_linearly,
 )
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, scene_omissions
+from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
+
+# The table's ring, and the work-group of ``field_blocks``: the kernel file ``field`` has the same numbers.
+_RING = 2
+_GROUP = 64
 
 
 class LikelihoodFieldModel(ScanModel):
@@ -87,7 +92,9 @@ class LikelihoodFieldModel(ScanModel):
         self._bilinear = p.interpolation == "bilinear"
         self._lead = 0.0 if peer is None else 1.0
         self._log_table = (specialize or peer is not None) and not self._bilinear
-        self._flags, self._terms = self._mixture()
+        self._flags, terms = self._mixture()
+        self._terms_there = self._backend.upload(terms)
+        self._none = self._backend.upload(np.zeros(1, np.int32))
         table = FieldTable(
             self._real, p, grid.resolution, scanner.range_max, outside=self.outside, compat=compat,
             log_table=self._log_table, flags=self._flags,
@@ -110,10 +117,10 @@ class LikelihoodFieldModel(ScanModel):
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
             MemoryError: the device cannot hold the table.
         """
-        checked = check_poses(poses)
-        if len(checked):
+        cloud = Cloud(poses, self._backend)
+        if cloud.count:
             with self._lock:
-                self._map.ensure(checked)
+                cloud.ensure(self._map, 0, cloud.count)
 
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.
@@ -182,34 +189,48 @@ class LikelihoodFieldModel(ScanModel):
     def _impossible(self) -> bool:
         return self.parameters.z_hit == 0 and self.parameters.z_rand == 0
 
-    def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
-        space, real = self._workspace, self._real
+    def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
+        space, real, backend = self._workspace, self._real, self._backend
         cells = scan.readings / self.grid.resolution
         finite = np.isfinite(cells)
         high, low = split(scan.vectors * np.where(finite, cells, 0.0)[:, None], real)
         high[~finite] = cells[~finite, None]
         point, point_low = space.upload("point", high), space.upload("point_low", low)
-        terms = space.upload("terms", self._terms)
         longest = np.max(cells, initial=0.0, where=finite)
         guard = 8 * np.finfo(real).eps * (longest + 2)
         readings = len(scan.readings)
 
-        def launch(poses: np.ndarray, log_p: np.ndarray, per_beam: bool) -> np.ndarray:
-            table, region = self._map.ensure(poses)
-            placed, _ = place_in(region, poses, self.grid, self.scanner.mount, real)
+        careful = "CAREFUL" in self._flags
+        scalars = (scan.constant + self._lead, self.temperature)
+        reach = float(longest) + 2
+
+        def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
+            table, region, corners = cloud.ensure(self._map, *part)
+            mount, count = self.scanner.mount, part[1] - part[0]
+            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=careful)
             flags = self._flags | ({"PER_BEAM"} if per_beam else set())
-            flags = self._last_code = widened(self._backend.info, "score_field", flags)
-            count = len(poses)
-            result = space.empty("log_p", count, real)
+            given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
+            if backend.info.kind == "gpu" and not per_beam:
+                if careful and self._log_table and self._specialize:
+                    inside = all_within(corners, self.grid, mount, region, reach, _RING)
+                    flags |= {"QUICK", "INSIDE"} if inside else {"QUICK"}
+                self._last_code = flags
+                blocks = -(-readings // BLOCK_TERMS)
+                parts = space.empty("parts", count * blocks, real)
+                spread = spread_of(count, blocks)
+                backend.compile("field_blocks", flags)(
+                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, parts, region.rows, region.cols, count, readings,
+                    guard, 1, count, spread,
+                )  # fmt: skip
+                backend.compile("sum_parts", flags)(
+                    (count,), parts, self._none, result, count, blocks, 1, 1, count, *scalars
+                )
+                return parts
+            flags = self._last_code = widened(backend.info, "score_field", flags)
             parts = space.empty("parts", count * readings if per_beam else 1, real)
-            careful = "CAREFUL" in flags
-            self._backend.compile("score_field", flags)(
-                (count,), table, space.upload("cell", placed.cell), space.upload("pose", placed.pose),
-                space.upload("pose_low", placed.low if careful else placed.low[:1]), point, point_low, terms, result,
-                parts, region.rows, region.cols, count, readings, guard, scan.constant + self._lead, self.temperature,
-            )  # fmt: skip
-            self._backend.download(result, log_p)
-            each = np.empty((count, readings if per_beam else 0), real)
-            return self._backend.download(parts, each) if per_beam else each
+            backend.compile("score_field", flags)(
+                (count,), *given, result, parts, region.rows, region.cols, count, readings, guard, *scalars
+            )
+            return parts
 
         return launch

@@ -47,9 +47,9 @@ class ReachableMap:
         self.region: Region | None = None
         self.preparations = 0
 
-    def ensure(self, poses: np.ndarray) -> tuple[Buffer, Region]:
-        """The table and its window, made anew if these (N, 3) poses, N > 0, can reach beyond it."""
-        if self._crop:
+    def ensure(self, poses: np.ndarray | None) -> tuple[Buffer, Region]:
+        """The table and its window, made anew if these (N, 3) poses, N > 0, can reach beyond it; None may be anywhere."""
+        if self._crop and poses is not None:
             wanted = region.choose(self._grid, self.region, poses, self._mount, self._reach)
         else:
             wanted = region.whole(self._grid)

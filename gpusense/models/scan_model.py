@@ -6,17 +6,18 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Literal, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 
-from gpusense import _checks
+from gpusense import _checks, arrays
 from gpusense import compat as compat_module
 from gpusense.backends import Backend, BackendInfo, get_backend
-from gpusense.frames import Mount, PlacedPoses, place_poses, ray_vectors
+from gpusense.backends.base import Buffer
+from gpusense.cloud import Cloud
+from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.plan import Omission, Plan, share
-from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
 from gpusense.scanner import Scanner
 from gpusense.workspace import Workspace
@@ -70,14 +71,18 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     return dtype
 
 
-def place_in(
-    region: Region, poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.dtype
-) -> tuple[PlacedPoses, bool]:
-    """Sensors in the frame of a window of the map, and whether any of them lies outside the window."""
-    placed = place_poses(poses, grid, mount, real)
-    placed.cell[:] -= (region.col, region.row)
-    inside = ((placed.cell >= 0) & (placed.cell < (region.cols, region.rows))).all()
-    return placed, not inside
+def clouds_of(poses: Any, scans: int, backend: Backend) -> list[Cloud]:
+    """The clouds of S scans from (S, N, 3) poses.
+
+    Raises:
+        TypeError, ValueError: not numbers, another shape, or a pose that is not finite.
+    """
+    if not arrays.on_device(poses):
+        return [Cloud(one, backend) for one in _checks.array("poses", arrays.to_host(poses), (scans, "N", 3))]
+    shape = tuple(getattr(poses, "shape", ()))
+    if len(shape) != 3 or shape[0] != scans or shape[2] != 3:
+        raise ValueError(f"poses: shape must be ({scans}, N, 3), got {_checks.shape_text(shape)}")
+    return [Cloud(poses[i], backend) for i in range(scans)]
 
 
 # Above this peak [1/m] an exponent's rounding errors could show beside a log density near 0.
@@ -181,6 +186,7 @@ class ScanModel(ABC):
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
         self._vectors = ray_vectors(scanner.bearings, scanner.mount)
+        self._distinct = len(np.unique(self._vectors, axis=0)) == len(self._vectors)
         self._z_max = z_max if self._peer is None else 0.0
         self._last_scan: PreparedScan | None = None
         self._last_code: frozenset[str] = frozenset()
@@ -196,28 +202,36 @@ class ScanModel(ABC):
         return self._real.name
 
     @overload
-    def log_likelihood(self, poses: object, ranges: object, *, per_beam: Literal[False] = ...) -> np.ndarray: ...
+    def log_likelihood(
+        self, poses: object, ranges: object, *, per_beam: Literal[False] = ..., out: Any = ...
+    ) -> np.ndarray: ...
 
     @overload
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: Literal[True]
+        self, poses: object, ranges: object, *, per_beam: Literal[True], out: Any = ...
     ) -> tuple[np.ndarray, np.ndarray]: ...
 
     @overload
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: bool
+        self, poses: object, ranges: object, *, per_beam: bool, out: Any = ...
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]: ...
 
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: bool = False
+        self, poses: object, ranges: object, *, per_beam: bool = False, out: Any = None
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """log p(z | x, m) of a scan for each particle, natural logarithm.
 
+        Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy where they are: in host memory, or,
+        for ``warp:cuda`` backends, on the model's device. The result is then an array of the same library there.
+
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans.
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
+                float32 or float64 and C-contiguous.
             ranges: (K,) readings [m], or (S, K). NaN, -inf and readings below range_min are missing, +inf and readings
                 of range_max or more are max readings.
-            per_beam: Also return what each reading contributes, before the temperature.
+            per_beam: Also return what each reading contributes, before the temperature; NumPy arrays.
+            out: Where to write the log-likelihoods: an array of their shape and precision in the memory where the poses
+                are, C-contiguous; it is what is returned.
 
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
@@ -225,72 +239,99 @@ class ScanModel(ABC):
             ``compat`` the logarithm of a particle's weight, and the cubes that it sums.
 
         Raises:
-            TypeError: an argument does not hold real numbers.
+            TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
             ValueError: a wrong shape, or a pose that is not finite; the message names it.
             MemoryError: the device cannot hold even a few particles.
         """
-        scans = check_ranges(ranges, self.scanner)
-        if scans.ndim == 1:
-            checked = check_poses(poses)
-            with self._lock:
-                log_p, parts = self._score_scan(checked, scans, per_beam)
-            return (log_p, parts) if per_beam else log_p
-        clouds = _checks.array("poses", poses, (len(scans), "N", 3))
+        backend = self._backend
+        scans = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), self.scanner)
+        single = scans.ndim == 1
+        clouds = [Cloud(poses, backend)] if single else clouds_of(poses, len(scans), backend)
+        count = clouds[0].count if clouds else np.shape(poses)[1]
+        shape = (count,) if single else (len(scans), count)
+        given = arrays.check_out(out, shape, self._real, poses, backend)
+        flat: Any
+        if arrays.on_device(poses):
+            flat = backend.empty(math.prod(shape), self._real) if given is None else given
+        else:
+            flat = (np.empty(shape, self._real) if given is None else given).reshape(-1)
+        parts = np.zeros((*shape, self.scanner.count if per_beam else 0), self._real)
+        each_parts = parts.reshape(len(clouds), count, -1) if clouds else parts
         with self._lock:
-            scored = [self._score_scan(cloud, scan, per_beam) for cloud, scan in zip(clouds, scans, strict=True)]
-        shape = clouds.shape[:2]
-        log_p = np.stack([one for one, _ in scored]) if scored else np.empty(shape, self._real)
-        if not per_beam:
-            return log_p
-        nothing = np.empty((*shape, self.scanner.count), self._real)
-        return log_p, np.stack([parts for _, parts in scored]) if scored else nothing
+            for i, cloud in enumerate(clouds):
+                own = (i * count, (i + 1) * count)
+                target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)
+                self._score_scan(cloud, scans if single else scans[i], target, each_parts[i], per_beam)
+            if clouds and clouds[0].on_device:
+                for cloud in clouds:
+                    cloud.check_on_device(backend, self._workspace)
+            else:
+                self._workspace.wait()
+        if out is not None:
+            log_p = out
+        elif arrays.on_device(poses):
+            log_p = arrays.result_for(poses, flat if single else flat.reshape(shape))
+        else:
+            log_p = arrays.like(poses, flat.reshape(shape))
+        return (log_p, parts) if per_beam else log_p
 
     @abstractmethod
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
 
-    def _score_scan(self, poses: np.ndarray, ranges: np.ndarray, per_beam: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _score_scan(self, cloud: Cloud, ranges: np.ndarray, log_p: Any, parts: np.ndarray, per_beam: bool) -> None:
+        """Start to write log-likelihoods into a host array or a buffer; parts are complete on return."""
         if self._peer is not None:
             ranges = self._peer.readings(ranges, self.scanner, self._end_points)
         scan = prepare_scan(
             ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize,
-            max_is_range=self._peer is not None,
+            max_is_range=self._peer is not None, distinct=self._distinct,
         )  # fmt: skip
         self._last_scan = scan
-        count, used = len(poses), len(scan.readings)
-        log_p = np.empty(count, self._real)
-        parts = np.zeros((count, self.scanner.count if per_beam else 0), self._real)
         if per_beam and len(scan.max_columns):
             parts[:, scan.max_columns] = log_weight(self._z_max)
-        if used == 0:
+        if len(scan.readings) == 0:
             with np.errstate(divide="ignore"):
-                log_p[:] = self.temperature * (scan.constant if self._peer is None else np.log(self._lead))
-            return log_p, parts
+                self._fill(log_p, self.temperature * (scan.constant if self._peer is None else np.log(self._lead)))
+            return
         hits = scan.columns[np.isfinite(scan.readings)]
         if len(hits) and self._peer is None and self._impossible():
-            log_p[:] = -np.inf
+            self._fill(log_p, -np.inf)
             if per_beam:
                 parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)
                 parts[:, hits] = -np.inf
-            return log_p, parts
+            return
         launch = self._prepare_launch(scan)
-        chunk = chunk_of(self._backend, used, self._real.itemsize if per_beam else 0)
+        space, backend = self._workspace, self._backend
+        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize if per_beam or backend.info.kind == "gpu" else 0)
 
         def run(begin: int, end: int) -> None:
-            each = launch(poses[begin:end], log_p[begin:end], per_beam)
+            if cloud.host is None:
+                result = backend.part(log_p, begin, end - begin)
+            else:
+                result = space.empty("log_p", end - begin, self._real)
+            each = launch(cloud, (begin, end), result, per_beam)
+            if cloud.host is not None:
+                space.download(result, log_p[begin:end])
             if per_beam:
-                parts[begin:end, scan.columns] = each
+                shape = (end - begin, len(scan.readings))
+                parts[begin:end, scan.columns] = backend.download(each, np.empty(shape, self._real))
 
-        in_chunks(count, chunk, self._workspace, run)
-        return log_p, parts
+        in_chunks(cloud.count, chunk, space, run)
+
+    def _fill(self, log_p: Any, value: float) -> None:
+        if isinstance(log_p, np.ndarray):
+            log_p[:] = value
+        else:
+            self._backend.upload(np.full(log_p.size, value, self._real), log_p)
 
     @abstractmethod
     def _impossible(self) -> bool:
         """Whether no range reading is possible at all."""
 
     @abstractmethod
-    def _prepare_launch(self, scan: PreparedScan) -> Callable[[np.ndarray, np.ndarray, bool], np.ndarray]:
-        """What scores (n, 3) poses into a log-likelihood array and returns (n, M) parts where they are wanted."""
+    def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
+        """What starts to score poses begin to end - 1 of a cloud into a buffer, and returns that of (n, M) parts."""
 
     def _peer_note(self) -> str:
         return "" if self._peer is None else f" with the weights of {self.compat} (no likelihood)"

@@ -65,6 +65,46 @@ def score_beams(
         log_p[begin:end] = sum_terms(flags, term, fixed, temperature)
 
 
+def beam_tiles(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    order: np.ndarray,
+    ray: np.ndarray,
+    first: np.ndarray,
+    reading: np.ndarray,
+    terms: np.ndarray,
+    sensor: np.ndarray,
+    parts: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    rays: int,
+    readings: int,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+    cells: int,
+    per_metre: np.floating,
+    limit: np.floating,
+    resolution: np.floating,
+    range_max: np.floating,
+    across: int,
+    along: int,
+    spread: int,
+) -> None:
+    """What each reading adds, at parts[place * across + k * along], which GPUs find in tiles of particles and rays."""
+    real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
+    score_beams(
+        flags | {"PER_BEAM"}, map_table, pose_cell, pose, ray, first, reading, terms, sensor,
+        np.empty(particles, pose.dtype), each, rows, cols, particles, rays, readings, bins, slack, tolerance, cells,
+        per_metre, limit, resolution, range_max, real(0), real(1),
+    )  # fmt: skip
+    found = each.reshape(particles, readings)[order[:particles] if "ORDERED" in flags else slice(None)]
+    parts[np.arange(particles)[:, None] * across + np.arange(readings) * along] = found
+
+
 def sum_terms(flags: frozenset[str], term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:
     """Sum of (M, K) terms and a fixed one, in the order of the beams, or its logarithm; -inf where one term is.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.reference.beam import sum_terms
-from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
+from gpusense.reference.error_free import BLOCK_TERMS, Pair, pair_product, pair_sum, two_product, two_sum
 
 FIELD_RING = 2
 BLOCK = 1 << 18
@@ -196,3 +196,36 @@ def score_field(
         if "PER_BEAM" in flags:
             parts[begin * readings : some.stop * readings] = term.ravel()
         log_p[some] = sum_terms(flags, term, fixed, temperature)
+
+
+def field_blocks(
+    flags: frozenset[str],
+    table: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    point: np.ndarray,
+    point_low: np.ndarray,
+    terms: np.ndarray,
+    parts: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    readings: int,
+    guard: np.floating,
+    across: int,
+    along: int,
+    spread: int,
+) -> None:
+    """Sums of blocks of readings, at parts[n * across + block * along], which GPUs find one by one."""
+    real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
+    score_field(
+        flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms, np.empty(particles, pose.dtype),
+        each, rows, cols, particles, readings, guard, real(0), real(1),
+    )  # fmt: skip
+    each = each.reshape(particles, readings)
+    for block, first in enumerate(range(0, readings, BLOCK_TERMS)):
+        total = np.zeros(particles, pose.dtype)
+        for k in range(first, min(first + BLOCK_TERMS, readings)):
+            total += each[:, k]
+        parts[np.arange(particles) * across + block * along] = total

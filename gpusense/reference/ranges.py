@@ -46,3 +46,30 @@ def cast_ranges(
         beams = np.tile(ray[:rays], (count, 1))
         t = cast_ray(flags, map_table, rows, cols, *lanes, beams, limit, bins, slack, tolerance)
         ranges[first * rays : some.stop * rays] = expected_range(t, limit, resolution, range_max)
+
+
+def cast_tiles(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    order: np.ndarray,
+    ray: np.ndarray,
+    ranges: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    rays: int,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+    limit: np.floating,
+    resolution: np.floating,
+    range_max: np.floating,
+    spread: int,
+) -> None:
+    """The same, which GPUs do in tiles of particles and rays."""
+    cast_ranges(
+        flags, map_table, pose_cell, pose, ray, ranges, rows, cols, particles, rays, bins, slack, tolerance, limit,
+        resolution, range_max,
+    )  # fmt: skip

@@ -1,6 +1,6 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 // Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
-// requires: error_free caster mixture sensor_table compat
+// requires: error_free caster tiles mixture sensor_table compat
 
 #if !WIDE
 // What one reading adds to the sum.
@@ -122,5 +122,46 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
 #else
     log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
 #endif
+}
+#endif
+
+#if !WIDE
+// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
+kernel void beam_tiles(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
+                       global const int *order, global const real2 *ray, global const int *first,
+                       global const real *reading, global const real *terms, global const real *sensor,
+                       global real *parts, const int rows, const int cols, const int particles, const int rays,
+                       const int readings, const int bins, const real slack, const real tolerance, const int cells,
+                       const real per_metre, const real limit, const real resolution, const real range_max,
+                       const int across, const int along, const int spread) {
+    const int item = get_global_id(0), place = tile_place(item, spread);
+    if (place >= particles) return;
+#if ORDERED
+    const int n = order[place];
+#else
+    const int n = place;
+#endif
+    for (int r = tile_ray(item, spread); r < rays; r += tile_step(spread)) {
+        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
+        const real expected = expected_range(t, limit, resolution, range_max);
+#if SHARED_RAYS
+        for (int k = first[r]; k < first[r + 1]; ++k) {
+#else
+        const int k = r;
+        {
+#endif
+            const real z = reading[k];
+            real term;
+#if ALL_READINGS
+            if (isnan(z))
+                term = 0;
+            else if (isinf(z))
+                term = terms[7];
+            else
+#endif
+                term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max);
+            parts[(long)place * across + (long)k * along] = term;
+        }
+    }
 }
 #endif

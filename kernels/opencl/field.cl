@@ -3,6 +3,8 @@
 // requires: lanes error_free
 
 #define FIELD_RING 2
+// Particles of a work-group of field_blocks.
+#define GROUP 64
 
 // Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
 // squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is beyond.
@@ -23,6 +25,15 @@ int field_cell(const int col, const int row, const int rows, const int cols) {
     const int c = within(col + FIELD_RING, cols + 2 * FIELD_RING - 1);
     const int r = within(row + FIELD_RING, rows + 2 * FIELD_RING - 1);
     return r * (cols + 2 * FIELD_RING) + c;
+}
+
+// The same where no end point of the cloud leaves the table.
+int table_cell(const int col, const int row, const int rows, const int cols) {
+#if INSIDE
+    return (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING;
+#else
+    return field_cell(col, row, rows, cols);
+#endif
 }
 
 #if CAREFUL
@@ -139,6 +150,28 @@ real log_field(const real2 distance, global const real *terms) {
 }
 #endif
 
+// What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or capped
+// distances in metres where it is interpolated.
+real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
+                   const real2 point_low, global const real *terms, const int rows, const int cols, const real guard) {
+#if ALL_READINGS
+    if (isnan(point.x)) return 0;
+    if (isinf(point.x)) return terms[3];
+#endif
+#if BILINEAR
+    const EndPoint end = end_point(pose, low, point, point_low, (real)0.5, guard);
+    return log_field(bilinear(table, origin + end.cell, end, rows, cols), terms);
+#else
+    const EndPoint end = end_point(pose, low, point, point_low, 0, guard);
+    const real value = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, rows, cols)];
+#if LOG_TABLE
+    return value;
+#else
+    return log_field((real2)(value, 0), terms);
+#endif
+#endif
+}
+
 #if WIDE
 // End points of one beam of LANES particles: nearest cells, as indices of the padded table. Lanes next to a cell's edge are
 // found again one by one with twice the digits.
@@ -216,8 +249,7 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     for (int i = 0; i < LANES; ++i) log_p[lane[i]] = x[i];
 }
 #else
-// One work-item a particle. The table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
-// capped distances in metres where it is interpolated.
+// One work-item a particle.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                         global const real *terms, global real *log_p, global real *parts, const int rows,
@@ -232,32 +264,10 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     const real4 low = (real4)(0);
 #endif
     real2 total = (real2)(fixed, 0);
-#if BILINEAR
-    const real shift = (real)0.5;
-#else
-    const real shift = 0;
-#endif
     real block = 0;
     for (int k = 0; k < readings; ++k) {
-        real term;
-#if ALL_READINGS
-        if (isnan(point[k].x))
-            term = 0;
-        else if (isinf(point[k].x))
-            term = terms[3];
-        else
-#endif
-        {
-            const EndPoint end = end_point(pose[n], low, point[k], point_low[k], shift, guard);
-#if BILINEAR
-            term = log_field(bilinear(table, origin + end.cell, end, rows, cols), terms);
-#else
-            term = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, rows, cols)];
-#if !LOG_TABLE
-            term = log_field((real2)(term, 0), terms);
-#endif
-#endif
-        }
+        const real term =
+            reading_value(table, origin, pose[n], low, point[k], point_low[k], terms, rows, cols, guard);
 #if PER_BEAM
         parts[(long)n * readings + k] = term;
 #endif
@@ -273,5 +283,67 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 #else
     log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
 #endif
+}
+#endif
+
+#if !WIDE
+#if QUICK
+// Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. In doubt it grows worst, which
+// is how far the place is off a cell's centre.
+int2 rounded_cell(const real4 lowered, const real2 point, real *worst) {
+    const real x = lowered.x + (lowered.z * point.x - lowered.w * point.y);
+    const real y = lowered.y + (lowered.w * point.x + lowered.z * point.y);
+    const real to_x = x + ROUNDING, to_y = y + ROUNDING;
+    const real off = fmax(fabs(x - (to_x - ROUNDING)), fabs(y - (to_y - ROUNDING)));
+    *worst = fmax(*worst, off);
+    return (int2)(as_int(to_x), as_int(to_y)) - 0x4b400000;
+}
+#endif
+
+// For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
+// parts[n * across + block * along].
+kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
+                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
+                         global const real *terms, global real *parts, const int rows, const int cols,
+                         const int particles, const int readings, const real guard, const int across, const int along,
+                         const int spread) {
+    const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
+    if (n >= particles) return;
+    const int2 origin = pose_cell[n];
+    const real4 own = pose[n];
+#if CAREFUL
+    const real4 low = pose_low[n];
+#else
+    const real4 low = (real4)(0);
+#endif
+    for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < readings; block += 1 << spread) {
+        const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, readings);
+        real sum = 0;
+#if QUICK
+        real worst = 0;
+        const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
+        if (begin + BLOCK_TERMS <= readings) {
+#pragma unroll
+            for (int i = 0; i < BLOCK_TERMS; ++i) {
+                const int2 cell = origin + rounded_cell(lowered, point[begin + i], &worst);
+                sum += table[table_cell(cell.x, cell.y, rows, cols)];
+            }
+        } else {
+            for (int k = begin; k < end; ++k) {
+                const int2 cell = origin + rounded_cell(lowered, point[k], &worst);
+                sum += table[table_cell(cell.x, cell.y, rows, cols)];
+            }
+        }
+        if (worst > (real)0.5 - guard) {
+            sum = 0;
+            for (int k = begin; k < end; ++k)
+                sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard);
+        }
+#else
+        for (int k = begin; k < end; ++k)
+            sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard);
+#endif
+        parts[(long)n * across + (long)block * along] = sum;
+    }
 }
 #endif

@@ -1,5 +1,5 @@
 // Expected ranges of poses and bearings by any caster.
-// requires: caster
+// requires: caster tiles
 
 #if WIDE
 // One work-item a particle and LANES rays.
@@ -33,3 +33,22 @@ kernel void cast_ranges(global const entry *map_table, global const int2 *pose_c
     ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
 }
 #endif
+
+// For GPUs, tiles of particles and rays.
+kernel void cast_tiles(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
+                       global const int *order, global const real2 *ray, global real *ranges, const int rows,
+                       const int cols, const int particles, const int rays, const int bins, const real slack,
+                       const real tolerance, const real limit, const real resolution, const real range_max,
+                       const int spread) {
+    const int item = get_global_id(0), place = tile_place(item, spread);
+    if (place >= particles) return;
+#if ORDERED
+    const int n = order[place];
+#else
+    const int n = place;
+#endif
+    for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
+        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance);
+        ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
+    }
+}

@@ -1,5 +1,6 @@
 // A ray on the grid and the walk along it, which all casters share. Crossing distances are (k + a) * inv with an integer
 // count k of boundaries, never accumulated.
+// requires: error_free
 // Casts and comparisons stand where floor, ceil, fmin and fmax would do: some drivers call those as functions.
 
 // Smallest direction component that is told from zero: its inverse must be finite.
@@ -36,16 +37,6 @@ Ray make_ray(const real4 pose, const real2 ray) {
     r.a_x = r.right ? (real)1 - pose.x : pose.x, r.a_y = r.up ? (real)1 - pose.y : pose.y;
     return r;
 }
-
-// Counts of boundaries are whole real numbers, which spares the conversions: adding and taking off a large number rounds
-// to nearest, and the digits of a sum with one hold the integer.
-#if FLOAT64
-#define ROUNDING ((real)6755399441055744.0)
-int whole_int(const real k) { return (int)k; }
-#else
-#define ROUNDING ((real)12582912)
-int whole_int(const real k) { return as_int(k + (real)8388608) - 0x4b000000; }
-#endif
 
 // Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
 // Rounded to nearest, the place on the axis names the only boundary that can be in doubt.

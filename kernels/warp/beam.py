@@ -13,11 +13,12 @@ from . import ray as ray_file
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
 from .ranges import caster_of
+from .tiles import tile_place, tile_ray, tile_step
 
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_beams specialised by the flags."""
+    """The kernel score_beams or beam_tiles specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
@@ -34,6 +35,7 @@ def make(name, flags):
     ALL_READINGS = "ALL_READINGS" in flags
     PER_BEAM = "PER_BEAM" in flags
     LINEAR = "LINEAR" in flags
+    ORDERED = "ORDERED" in flags
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
@@ -138,4 +140,66 @@ def make(name, flags):
         else:
             log_p[n] = temperature * scan_log(total.x + total.y)
 
-    return {"score_beams": score_beams}[name]
+    # For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
+    @kernel
+    def beam_tiles(
+        map_table: wp.array(dtype=ENTRY),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        order: wp.array(dtype=wp.int32),
+        ray: wp.array(dtype=vec2),
+        first: wp.array(dtype=wp.int32),
+        reading: wp.array(dtype=real),
+        terms: wp.array(dtype=real),
+        sensor: wp.array(dtype=real),
+        parts: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        rays: wp.int32,
+        readings: wp.int32,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+        cells: wp.int32,
+        per_metre: real,
+        limit: real,
+        resolution: real,
+        range_max: real,
+        across: wp.int32,
+        along: wp.int32,
+        spread: wp.int32,
+    ):
+        item = wp.tid()
+        place = tile_place(item, spread)
+        if place >= particles:
+            return
+        n = place
+        if ORDERED:
+            n = order[place]
+        cell = pose_cell[n]
+        own = pose[n]
+        r = tile_ray(item, spread)
+        while r < rays:
+            t = cast_ray(map_table, rows, cols, cell, own, ray[r], limit, bins, slack, tolerance)
+            expected = expected_range(t, limit, resolution, range_max)
+            k = r
+            end = r + 1
+            if SHARED_RAYS:
+                k = first[r]
+                end = first[r + 1]
+            while k < end:
+                z = reading[k]
+                term = real(0.0)
+                known = True
+                if ALL_READINGS:
+                    known = not (wp.isnan(z) or wp.isinf(z))
+                    if wp.isinf(z):
+                        term = terms[7]
+                if known:
+                    term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max)
+                parts[place * across + k * along] = term
+                k += 1
+            r += tile_step(spread)
+
+    return {"score_beams": score_beams, "beam_tiles": beam_tiles}[name]

@@ -14,6 +14,8 @@ from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
 
 FIELD_RING = wp.constant(2)
+# Particles of a work-group of field_blocks.
+GROUP = wp.constant(64)
 
 
 # Index of a cell of the padded table; far cells become ring cells.
@@ -171,7 +173,7 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """The kernel fill_field or score_field specialised by the flags."""
+    """A kernel of this file specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     parts_of = functions(flags)
@@ -185,6 +187,62 @@ def make(name, flags):
     PER_BEAM = "PER_BEAM" in flags
     ZERO = real(0.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
+    QUICK = "QUICK" in flags
+    INSIDE = "INSIDE" in flags
+    HALF = real(0.5)
+    # Adding and taking off 1.5 * 2^23 rounds to nearest.
+    ROUNDING = real(12582912.0)
+    # A constant for loops that Warp shall unroll.
+    WHOLE_BLOCK = 16
+
+    # The same as field_cell where no end point of the cloud leaves the table.
+    @wp.func
+    def table_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+        if INSIDE:
+            return (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
+        else:
+            return field_cell(col, row, rows, cols)
+
+    # What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
+    # capped distances in metres where it is interpolated.
+    @wp.func
+    def reading_value(
+        table: wp.array(dtype=real),
+        origin: wp.vec2i,
+        pose: vec4,
+        low: vec4,
+        point: vec2,
+        point_low: vec2,
+        terms: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        guard: real,
+    ):
+        if ALL_READINGS:
+            if wp.isnan(point.x):
+                return ZERO
+            if wp.isinf(point.x):
+                return terms[3]
+        end = end_point(pose, low, point, point_low, SHIFT, guard)
+        cell = origin + end.cell
+        if BILINEAR:
+            return log_field(bilinear(table, cell, end, rows, cols), terms)
+        else:
+            value = table[field_cell(cell.x, cell.y, rows, cols)]
+            if LOG_TABLE:
+                return value
+            else:
+                return log_field(vec2(value, ZERO), terms)
+
+    # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. How far the place is off
+    # a cell's centre comes second.
+    @wp.func
+    def rounded_cell(lowered: vec4, point: vec2):
+        x = lowered.x + (lowered.z * point.x - lowered.w * point.y)
+        y = lowered.y + (lowered.w * point.x + lowered.z * point.y)
+        whole_x = (x + ROUNDING) - ROUNDING
+        whole_y = (y + ROUNDING) - ROUNDING
+        return wp.vec2i(int(whole_x), int(whole_y)), wp.max(wp.abs(x - whole_x), wp.abs(y - whole_y))
 
     # Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
     # squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is
@@ -215,8 +273,7 @@ def make(name, flags):
             value = density[wp.min(squared[row * cols + col], cap)]
         table[begin + j * stride + i] = value
 
-    # One work-item a particle. The table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
-    # capped distances in metres where it is interpolated.
+    # One work-item a particle.
     @kernel
     def score_field(
         table: wp.array(dtype=real),
@@ -253,23 +310,7 @@ def make(name, flags):
             to_low = vec2()
             if CAREFUL:
                 to_low = point_low[k]
-            term = real(0.0)
-            known = True
-            if ALL_READINGS:
-                known = not (wp.isnan(to.x) or wp.isinf(to.x))
-                if wp.isinf(to.x):
-                    term = terms[3]
-            if known:
-                end = end_point(from_pose, from_low, to, to_low, SHIFT, guard)
-                cell = origin + end.cell
-                if BILINEAR:
-                    term = log_field(bilinear(table, cell, end, rows, cols), terms)
-                else:
-                    term = table[field_cell(cell.x, cell.y, rows, cols)]
-                    if LOG_TABLE:
-                        pass
-                    else:
-                        term = log_field(vec2(term, ZERO), terms)
+            term = reading_value(table, origin, from_pose, from_low, to, to_low, terms, rows, cols, guard)
             if PER_BEAM:
                 parts[n * readings + k] = term
             block += term
@@ -286,4 +327,67 @@ def make(name, flags):
         else:
             log_p[n] = temperature * (total.x + total.y)
 
-    return {"fill_field": fill_field, "score_field": score_field}[name]
+    # For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
+    # parts[n * across + block * along].
+    @kernel
+    def field_blocks(
+        table: wp.array(dtype=real),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2),
+        terms: wp.array(dtype=real),
+        parts: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        readings: wp.int32,
+        guard: real,
+        across: wp.int32,
+        along: wp.int32,
+        spread: wp.int32,
+    ):
+        item = wp.tid()
+        n = ((item // GROUP) >> spread) * GROUP + item % GROUP
+        if n >= particles:
+            return
+        origin = pose_cell[n]
+        own = pose[n]
+        low = vec4()
+        if CAREFUL:
+            low = pose_low[n]
+        lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+        block = (item // GROUP) & ((1 << spread) - 1)
+        while block * BLOCK_TERMS < readings:
+            begin = block * BLOCK_TERMS
+            end = wp.min(begin + BLOCK_TERMS, readings)
+            total = real(0.0)
+            worst = real(1.0)
+            if QUICK:
+                worst = ZERO
+                if begin + BLOCK_TERMS <= readings:
+                    for i in range(WHOLE_BLOCK):
+                        cell, off = rounded_cell(lowered, point[begin + i])
+                        worst = wp.max(worst, off)
+                        total += table[table_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)]
+                else:
+                    k = begin
+                    while k < end:
+                        cell, off = rounded_cell(lowered, point[k])
+                        worst = wp.max(worst, off)
+                        total += table[table_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)]
+                        k += 1
+            if worst > HALF - guard:
+                total = ZERO
+                k = begin
+                while k < end:
+                    to_low = vec2()
+                    if CAREFUL:
+                        to_low = point_low[k]
+                    total += reading_value(table, origin, own, low, point[k], to_low, terms, rows, cols, guard)
+                    k += 1
+            parts[n * across + block * along] = total
+            block += 1 << spread
+
+    return {"fill_field": fill_field, "score_field": score_field, "field_blocks": field_blocks}[name]

@@ -7,6 +7,7 @@ import warp as wp
 from . import bresenham, cddt, dda, lookup, march, raycast
 from . import ray as ray_file
 from .prelude import kernel, precision
+from .tiles import tile_place, tile_ray, tile_step
 
 CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
 
@@ -18,13 +19,14 @@ def caster_of(flags):
 
 @functools.cache
 def make(name, flags):
-    """The kernel cast_ranges specialised by the flags."""
+    """The kernel cast_ranges or cast_tiles specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
     ENTRY = caster.ENTRY
     cast_ray = caster.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
+    ORDERED = "ORDERED" in flags
 
     # One work-item a particle and ray, fewer than 2^31 in a launch.
     @kernel
@@ -51,4 +53,40 @@ def make(name, flags):
         t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance)
         ranges[n * rays + k] = expected_range(t, limit, resolution, range_max)
 
-    return {"cast_ranges": cast_ranges}[name]
+    # For GPUs, tiles of particles and rays.
+    @kernel
+    def cast_tiles(
+        map_table: wp.array(dtype=ENTRY),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        order: wp.array(dtype=wp.int32),
+        ray: wp.array(dtype=vec2),
+        ranges: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        rays: wp.int32,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+        limit: real,
+        resolution: real,
+        range_max: real,
+        spread: wp.int32,
+    ):
+        item = wp.tid()
+        place = tile_place(item, spread)
+        if place >= particles:
+            return
+        n = place
+        if ORDERED:
+            n = order[place]
+        cell = pose_cell[n]
+        own = pose[n]
+        k = tile_ray(item, spread)
+        while k < rays:
+            t = cast_ray(map_table, rows, cols, cell, own, ray[k], limit, bins, slack, tolerance)
+            ranges[n * rays + k] = expected_range(t, limit, resolution, range_max)
+            k += tile_step(spread)
+
+    return {"cast_ranges": cast_ranges, "cast_tiles": cast_tiles}[name]

@@ -1,0 +1,195 @@
+"""Poses of one call on their way to a device: checked, bounded, placed in a window of the map, and put in an order.
+
+NumPy arrays are checked and bounded here; arrays that are on the device already stay there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense import _checks, arrays
+from gpusense.backends.base import Backend, Buffer
+from gpusense.frames import Mount, frame_scalars, place_poses, to_grid
+from gpusense.grid import OccupancyGrid
+from gpusense.models.reachable import ReachableMap
+from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
+from gpusense.region import Region
+from gpusense.workspace import Workspace
+
+_INT = np.dtype(np.int32)
+_BINS = 32768
+_SAMPLES = 256
+_STRETCHES = 1024
+_UNBOUNDED = np.full(7, -(1 << 31), _INT)
+# Particle-beams from which the time that an order saves is more than what it takes, and as many particles.
+LEAST_ORDERED = (1 << 22, 1 << 12)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Sensors in the frame of a window, on the device: cells, poses, and what rounding took from these."""
+
+    cell: Buffer
+    pose: Buffer
+    low: Buffer
+
+
+class Cloud:
+    """(N, 3) poses.
+
+    Args:
+        poses: Numbers, or an array on the device.
+        backend: The device.
+        name: What messages call them.
+
+    Raises:
+        TypeError: not numbers, or an array that this device cannot read.
+        ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
+    """
+
+    def __init__(self, poses: object, backend: Backend, name: str = "poses") -> None:
+        self.host: np.ndarray | None = None
+        self.on_device = arrays.on_device(poses)
+        if self.on_device:
+            self._buffer, self.count, self._single = arrays.adopt_poses(poses, backend, name)
+            return
+        given = arrays.to_host(poses)
+        if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
+            self.host = np.ascontiguousarray(given, np.float64)
+            if not np.isfinite(self.corners(0, len(given))).all():
+                self.host = _checks.array(name, given, ("N", 3))
+        else:
+            self.host = np.ascontiguousarray(_checks.array(name, given, ("N", 3)))
+        self.count, self._single = len(self.host), False
+
+    def __len__(self) -> int:
+        return self.count
+
+    def corners(self, begin: int, end: int) -> np.ndarray:
+        """(4, 3) corners of the box that holds some poses; the corners of no poses are at 0."""
+        assert self.host is not None
+        if begin == end:
+            return np.zeros((4, 3))
+        by_axis = np.ascontiguousarray(self.host[begin:end].T)
+        low, high = by_axis.min(axis=1), by_axis.max(axis=1)
+        return np.array([low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high])
+
+    def ensure(self, table: ReachableMap, begin: int, end: int) -> tuple[Buffer, Region, np.ndarray | None]:
+        """The map's table for some poses, its window, and the corners of these poses where they are known."""
+        if self.host is None:
+            return *table.ensure(None), None
+        corners = self.corners(begin, end)
+        return *table.ensure(corners), corners
+
+    def place(
+        self,
+        backend: Backend,
+        space: Workspace,
+        part: tuple[int, int],
+        frame: tuple[Region, OccupancyGrid, Mount],
+        real: np.dtype,
+        *,
+        careful: bool,
+    ) -> Placed:
+        """Poses part[0] to part[1] - 1 in the frame of a window."""
+        (begin, end), (region, grid, mount) = part, frame
+        count = end - begin
+        if not backend.info.float64:
+            return self._place_on_host(space, part, frame, real, careful)
+        flags = {"FLOAT64"} if real == np.float64 else set()
+        flags |= {"CAREFUL"} if careful else set()
+        if self.host is None:
+            given, flags = self._buffer, flags | ({"POSES_FLOAT32"} if self._single else set())
+            given = backend.part(given, 3 * begin, 3 * count)
+        else:
+            given = space.upload("poses", self.host[begin:end])
+        cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
+        low = space.empty("pose_low", 4 * count if careful else 4, real)
+        verdict = space.empty("verdict", 2, _INT, zero=True)
+        window = (region.col, region.row, region.rows, region.cols)
+        backend.compile("place_poses", frozenset(flags))(
+            (count,), given, cell, pose, low, verdict, *frame_scalars(grid, mount), *window, count
+        )
+        return Placed(cell, pose, low)
+
+    def _place_on_host(
+        self,
+        space: Workspace,
+        part: tuple[int, int],
+        frame: tuple[Region, OccupancyGrid, Mount],
+        real: np.dtype,
+        careful: bool,
+    ) -> Placed:
+        assert self.host is not None
+        region, grid, mount = frame
+        placed = place_poses(self.host[slice(*part)], grid, mount, real)
+        placed.cell[:] -= (region.col, region.row)
+        low = placed.low if careful else placed.low[:1]
+        cell, pose = space.upload("cell", placed.cell), space.upload("pose", placed.pose)
+        return Placed(cell, pose, space.upload("pose_low", low))
+
+    def check_on_device(self, backend: Backend, space: Workspace, name: str = "poses") -> None:
+        """Wait, and raise ValueError if a pose on the device was not finite."""
+        if not self.on_device or self.count == 0:
+            return
+        verdict = backend.download(space.empty("verdict", 2, _INT, zero=True), np.empty(2, _INT))
+        if verdict[0]:
+            space.upload("verdict", np.zeros(2, _INT))
+            raise ValueError(f"{name}: must be finite, got a pose on the device that is not")
+
+
+def extent(corners: np.ndarray, grid: OccupancyGrid, mount: Mount) -> tuple[float, float, float, float]:
+    """Least and largest column and row, in cells, that a sensor of poses within these corners can have."""
+    x, y = to_grid(grid, corners[:, 0] - grid.origin[0], corners[:, 1] - grid.origin[1])
+    margin = float(np.hypot(mount[0], mount[1])) / grid.resolution + 1
+    return x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin
+
+
+def all_within(
+    corners: np.ndarray | None, grid: OccupancyGrid, mount: Mount, region: Region, reach: float, ring: int = 0
+) -> bool:
+    """Whether everything within reach cells of the sensors surely lies in a window and a ring around it."""
+    if corners is None:
+        return False
+    left, right, low, high = extent(corners, grid, mount)
+    return bool(
+        left - reach >= region.col - ring
+        and right + reach <= region.col + region.cols + ring
+        and low - reach >= region.row - ring
+        and high + reach <= region.row + region.rows + ring
+    )
+
+
+def ordered(backend: Backend, space: Workspace, placed: Placed, count: int, rays: int, real: np.dtype) -> Buffer | None:
+    """An order of the particles that makes rays coherent, where that pays; see the kernel file ``order``."""
+    if count * rays < LEAST_ORDERED[0] or count < LEAST_ORDERED[1]:
+        return None
+    flags = frozenset({"FLOAT64"} if real == np.float64 else ())
+    bounds, bins = space.upload("bounds", _UNBOUNDED), space.empty("bins", _BINS, _INT)
+    bin_of, order = space.empty("bin_of", count, _INT), space.empty("order", count, _INT)
+    backend.compile("order_bounds", flags)((_BINS,), placed.cell, placed.pose, bounds, bins, count)
+    backend.compile("order_count", flags)((count,), placed.cell, placed.pose, bounds, bins, bin_of, count)
+    backend.compile("order_starts", flags)((_STRETCHES,), bounds, bins)
+    backend.compile("order_fill", flags)((count,), bin_of, bins, order, count)
+    return order
+
+
+# Work-items that fill any device, and the tiles of the kernel file ``tiles``.
+_ENOUGH = 1 << 19
+
+
+def spread_of(items: int, groups: int) -> int:
+    """By how many powers of two to split the work of some work-items, each with so many groups of readings or rays."""
+    spread = 0
+    while items << spread < _ENOUGH and 1 << spread < groups:
+        spread += 1
+    return spread
+
+
+def tiles_of(count: int, rays: int) -> tuple[int, int]:
+    """Work-items of a launch in tiles of particles and rays, and its spread."""
+    tiles = -(-count // TILE_PARTICLES)
+    spread = spread_of(tiles * TILE, -(-rays // TILE_RAYS))
+    return (tiles << spread) * TILE, spread

@@ -1,0 +1,8 @@
+"""Work-items for GPUs take tiles of neighbouring particles and rays; the reference takes everything at once.
+
+With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays: few particles fill a device, too.
+"""
+
+TILE_RAYS = 4
+TILE_PARTICLES = 16
+TILE = TILE_RAYS * TILE_PARTICLES

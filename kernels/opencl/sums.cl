@@ -1,0 +1,29 @@
+// Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings.
+// requires: error_free
+
+// One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block of
+// them is added plainly, then its sum to a compensated total.
+kernel void sum_parts(global const real *parts, global const int *order, global real *log_p, const int particles,
+                      const int count, const int block, const int across, const int along, const real fixed,
+                      const real temperature) {
+    const int place = get_global_id(0);
+    if (place >= particles) return;
+#if ORDERED
+    const int n = order[place];
+#else
+    const int n = place;
+#endif
+    global const real *part = parts + (long)place * across;
+    real2 total = (real2)(fixed, 0);
+    for (int first = 0; first < count; first += block) {
+        const int last = min(first + block, count);
+        real sum = 0;
+        for (int k = first; k < last; ++k) sum += part[(long)k * along];
+        total = add_term(total, sum);
+    }
+#if CUBES
+    log_p[n] = temperature * log(total.x + total.y);
+#else
+    log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
+#endif
+}

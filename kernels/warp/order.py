@@ -1,0 +1,126 @@
+"""An order of particles in which neighbours have much the same position and heading: then their rays meet the same cells,
+and none waits long for another. Which order it is changes no result.
+"""
+
+import functools
+
+import warp as wp
+
+from . import ray as ray_file
+from .prelude import kernel, precision
+
+# Samples of the particles; bins of rows, of columns and of headings; work-items that count starts.
+SAMPLES = wp.constant(256)
+BINS = wp.constant(32)
+ALL_BINS = wp.constant(32768)
+STRETCH = wp.constant(32)
+
+
+# One work-item a stretch of bins, which lie together: from how many particles each has to where they begin.
+@kernel
+def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
+    stretch = wp.tid()
+    if stretch >= ALL_BINS // STRETCH:
+        return
+    own = stretch * STRETCH
+    total = int(0)
+    i = int(0)
+    while i < STRETCH:
+        total += bins[own + i]
+        i += 1
+    start = int(wp.atomic_add(bounds, 6, total))
+    i = int(0)
+    while i < STRETCH:
+        count = bins[own + i]
+        bins[own + i] = start
+        start += count
+        i += 1
+
+
+# One work-item a particle: it takes the next place of its bin.
+@kernel
+def order_fill(
+    bin_of: wp.array(dtype=wp.int32),
+    bins: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    particles: wp.int32,
+):
+    n = wp.tid()
+    if n >= particles:
+        return
+    order[wp.atomic_add(bins, bin_of[n], 1)] = n
+
+
+@functools.cache
+def make(name, flags):
+    """A kernel of this file specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    turn_of = ray_file.functions(flags).turn_of
+    ZERO, ONE = real(0.0), real(1.0)
+    # Parts of a turn.
+    TURN = real(65536.0)
+    HALF_TURN, WHOLE_TURN = 32768, 65536
+    PARTS = real(32.0)
+
+    # Heading relative to the first particle's, from -TURN / 2 to TURN / 2.
+    @wp.func
+    def relative_turn(pose: vec4, other: vec4):
+        turn = int(turn_of(vec2(pose.z * other.z + pose.w * other.w, pose.w * other.z - pose.z * other.w)) * TURN)
+        return wp.where(turn > HALF_TURN, turn - WHOLE_TURN, turn)
+
+    # One work-item a bin, which it empties; some of them look at a particle each. bounds, which the caller sets to
+    # -2^31, become the largest of minus the smallest and the largest row, column and heading of those, and last 0.
+    @kernel
+    def order_bounds(
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        bounds: wp.array(dtype=wp.int32),
+        bins: wp.array(dtype=wp.int32),
+        particles: wp.int32,
+    ):
+        bin = wp.tid()
+        if bin >= ALL_BINS:
+            return
+        bins[bin] = 0
+        if bin == 0:
+            bounds[6] = 0
+        if bin >= SAMPLES:
+            return
+        n = int(wp.int64(bin) * wp.int64(particles) // wp.int64(SAMPLES))
+        turn = relative_turn(pose[n], pose[0])
+        wp.atomic_max(bounds, 0, -pose_cell[n].y)
+        wp.atomic_max(bounds, 1, pose_cell[n].y)
+        wp.atomic_max(bounds, 2, -pose_cell[n].x)
+        wp.atomic_max(bounds, 3, pose_cell[n].x)
+        wp.atomic_max(bounds, 4, -turn)
+        wp.atomic_max(bounds, 5, turn)
+
+    # Which of BINS equal parts of the bounds; what is beyond them belongs to the outermost.
+    @wp.func
+    def part_of(value: wp.int32, least: wp.int32, most: wp.int32):
+        part = (real(value) - real(least)) * (PARTS / (real(most) - real(least) + ONE))
+        return wp.where(part < ZERO, 0, wp.where(part >= PARTS, BINS - 1, int(part)))
+
+    # One work-item a particle: its bin, which counts it.
+    @kernel
+    def order_count(
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        bounds: wp.array(dtype=wp.int32),
+        bins: wp.array(dtype=wp.int32),
+        bin_of: wp.array(dtype=wp.int32),
+        particles: wp.int32,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        row = part_of(pose_cell[n].y, -bounds[0], bounds[1])
+        col = part_of(pose_cell[n].x, -bounds[2], bounds[3])
+        turn = part_of(relative_turn(pose[n], pose[0]), -bounds[4], bounds[5])
+        bin = (row * BINS + col) * BINS + turn
+        bin_of[n] = bin
+        wp.atomic_add(bins, bin, 1)
+
+    kernels = {"order_bounds": order_bounds, "order_count": order_count}
+    return (kernels | {"order_starts": order_starts, "order_fill": order_fill})[name]

@@ -1,0 +1,61 @@
+"""Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings."""
+
+import functools
+
+import warp as wp
+
+from . import error_free
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel sum_parts specialised by the flags."""
+    types = precision(flags)
+    real, vec2 = types.real, types.vec2
+    add_term = error_free.functions(flags).add_term
+    ORDERED = "ORDERED" in flags
+    CUBES = "CUBES" in flags
+    ZERO = real(0.0)
+
+    # One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block
+    # of them is added plainly, then its sum to a compensated total.
+    @kernel
+    def sum_parts(
+        parts: wp.array(dtype=real),
+        order: wp.array(dtype=wp.int32),
+        log_p: wp.array(dtype=real),
+        particles: wp.int32,
+        count: wp.int32,
+        block: wp.int32,
+        across: wp.int32,
+        along: wp.int32,
+        fixed: real,
+        temperature: real,
+    ):
+        place = wp.tid()
+        if place >= particles:
+            return
+        n = place
+        if ORDERED:
+            n = order[place]
+        part = place * across
+        total = vec2(fixed, ZERO)
+        first = int(0)
+        while first < count:
+            last = wp.min(first + block, count)
+            summed = real(0.0)
+            k = first
+            while k < last:
+                summed += parts[part + k * along]
+                k += 1
+            total = add_term(total, summed)
+            first += block
+        if CUBES:
+            log_p[n] = temperature * wp.log(total.x + total.y)
+        elif wp.isinf(total.x):
+            log_p[n] = total.x
+        else:
+            log_p[n] = temperature * (total.x + total.y)
+
+    return {"sum_parts": sum_parts}[name]

@@ -14,6 +14,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.frames import Mount, frame_scalars, place_poses, to_grid
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
+from gpusense.reference.heading import LIMIT
 from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
 from gpusense.region import Region
 from gpusense.workspace import Workspace
@@ -58,10 +59,12 @@ class Cloud:
         given = arrays.to_host(poses)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
             self.host = np.ascontiguousarray(given, np.float64)
-            if not np.isfinite(self.corners(0, len(given))).all():
+            self._corners = self._bounds(0, len(given))
+            if not np.isfinite(self._corners).all():
                 self.host = _checks.array(name, given, ("N", 3))
         else:
             self.host = np.ascontiguousarray(_checks.array(name, given, ("N", 3)))
+            self._corners = self._bounds(0, len(self.host))
         self.count, self._single = len(self.host), False
 
     def __len__(self) -> int:
@@ -69,6 +72,9 @@ class Cloud:
 
     def corners(self, begin: int, end: int) -> np.ndarray:
         """(4, 3) corners of the box that holds some poses; the corners of no poses are at 0."""
+        return self._corners if end - begin == self.count else self._bounds(begin, end)
+
+    def _bounds(self, begin: int, end: int) -> np.ndarray:
         assert self.host is not None
         if begin == end:
             return np.zeros((4, 3))
@@ -101,10 +107,11 @@ class Cloud:
         flags = {"FLOAT64"} if real == np.float64 else set()
         flags |= {"CAREFUL"} if careful else set()
         if self.host is None:
-            given, flags = self._buffer, flags | ({"POSES_FLOAT32"} if self._single else set())
+            given, flags = self._buffer, flags | {"HUGE_HEADINGS"} | ({"POSES_FLOAT32"} if self._single else set())
             given = backend.part(given, 3 * begin, 3 * count)
         else:
             given = space.upload("poses", self.host[begin:end])
+            flags |= {"HUGE_HEADINGS"} if np.abs(self._corners[:, 2]).max() > LIMIT else set()
         cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
         low = space.empty("pose_low", 4 * count if careful else 4, real)
         verdict = space.empty("verdict", 2, _INT, zero=True)

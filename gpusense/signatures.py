@@ -38,6 +38,7 @@ FLAGS = {
     "LANES_16": "a work-item computes 16 at once",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
+    "HUGE_HEADINGS": "some heading is beyond 2^20 rad",
     "ORDERED": "particles come in an order in which neighbours have much the same position and heading",
     "QUICK": "nearest cells are found by rounding, and again with more digits only where that is in doubt",
     "INSIDE": "no end point of the cloud leaves the field's table",

@@ -29,6 +29,7 @@
 #define C3 -2.7557314179308847e-07
 #define C4 2.087570084339475e-09
 #define C5 -1.1358536585312173e-11
+#if HUGE_HEADINGS
 // The bits of 2/pi in words of 32 after two words of zeros.
 constant uint WORDS[39] = {
     0x00000000, 0x00000000, 0xA2F9836E, 0x4E441529, 0xFC2757D1, 0xF534DDC0, 0xDB629599, 0x3C439041, 0xFE5163AB,
@@ -37,6 +38,7 @@ constant uint WORDS[39] = {
     0x5A0A6D1F, 0x6D367ECF, 0x27CB09B7, 0x4F463F66, 0x9E5FEA2D, 0x7527BAC7, 0xEBE5F17B, 0x3D0739F7, 0x8A5292EA,
     0x6BFB5FB1, 0x1F8D5D08, 0x56033046,
 };
+#endif
 
 // Quarter turns modulo 4, and the rest as the sum of two numbers.
 typedef struct {
@@ -77,6 +79,7 @@ Turn reduce_ordinary(const double theta) {
     return turn;
 }
 
+#if HUGE_HEADINGS
 // For headings above LIMIT, up to the largest there is.
 Turn reduce_huge(const double theta) {
     const ulong bits = as_ulong(fabs(theta));
@@ -111,10 +114,15 @@ Turn reduce_huge(const double theta) {
     turn.rest = theta < 0 ? (double2)(-angle.x, -angle.y) : angle;
     return turn;
 }
+#endif
 
 // (cosine, sine) of a heading; of no meaning, but not NaN, where it is not finite.
 double2 cos_sin(const double theta) {
+#if HUGE_HEADINGS
     const Turn turn = fabs(theta) <= LIMIT ? reduce_ordinary(theta) : reduce_huge(theta);
+#else
+    const Turn turn = reduce_ordinary(theta);
+#endif
     const double r = turn.rest.x, low = turn.rest.y;
     const double z = r * r;
     const double half_z = 0.5 * z;

@@ -111,16 +111,28 @@ kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles,
     global const uchar *run = runs + (long)(quadrant & 1) * band * cols + (long)(row - first) * cols + col;
     global ushort *out = rectangles + (long)quadrant * sectors * (rows + 2) * (cols + 2) + padded(row, col, cols);
     const int room = min(dy > 0 ? rows - row : row + 1, LONGEST);
-    int width = LONGEST, sector = 0;
-    for (int height = 1; sector < sectors; ++height) {
-        const int narrower = height > room ? 0 : min(width, (int)run[(long)(height - 1) * dy * cols]);
-        for (; sector < sectors; ++sector) {
-            const int2 middle = slope(sectors, sector);
-            if (narrower * middle.x >= height * middle.y) break;
+    const long step = (long)dy * cols;
+    int width = LONGEST, sector = 0, height = 1;
+    int2 middle = slope(sectors, 0);
+    while (sector < sectors) {
+        // While no sector can end, four rows between two decisions, so that reads need not wait for one another.
+        if (height + 3 <= room) {
+            global const uchar *next = run + (height - 1) * step;
+            const int four = min(min((int)next[0], (int)next[step]), min((int)next[2 * step], (int)next[3 * step]));
+            if (min(width, four) * middle.x >= (height + 3) * middle.y) {
+                width = min(width, four);
+                height += 4;
+                continue;
+            }
+        }
+        const int narrower = height > room ? 0 : min(width, (int)run[(height - 1) * step]);
+        while (sector < sectors && narrower * middle.x < height * middle.y) {
             const int higher = narrower * middle.x > (height - 1) * middle.y;
             const int found = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : 0;
             out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)found;
+            middle = slope(sectors, ++sector);
         }
         width = narrower;
+        ++height;
     }
 }

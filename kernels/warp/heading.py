@@ -59,10 +59,11 @@ SIGNED_MASK_30, SIGNED_EIGHTH = wp.constant(wp.int64(0x3FFFFFFF)), wp.constant(w
 
 
 @functools.cache
-def functions():
+def functions(flags):
     """reduce_ordinary, reduce_huge and cos_sin, in float64 whatever the precision of a model."""
     transformations = error_free.functions(frozenset({"FLOAT64"}))
     two_sum, pair_product = transformations.two_sum, transformations.pair_product
+    HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
     # Quarter turns modulo 4 and the rest as the sum of two numbers, for headings of at most LIMIT.
     @wp.func
@@ -127,10 +128,13 @@ def functions():
     def cos_sin(theta: wp.float64):
         quadrant = int(0)
         rest = wp.vec2d()
-        if wp.abs(theta) <= LIMIT:
-            quadrant, rest = reduce_ordinary(theta)
+        if HUGE_HEADINGS:
+            if wp.abs(theta) <= LIMIT:
+                quadrant, rest = reduce_ordinary(theta)
+            else:
+                quadrant, rest = reduce_huge(theta)
         else:
-            quadrant, rest = reduce_huge(theta)
+            quadrant, rest = reduce_ordinary(theta)
         r = rest.x
         low = rest.y
         z = r * r

@@ -27,7 +27,7 @@ def make(name, flags):
     """The kernel place_poses specialised by the flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
-    cos_sin = heading.functions().cos_sin
+    cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
     coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
     CAREFUL = "CAREFUL" in flags
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))

@@ -207,11 +207,22 @@ def rectangles_scan(
     width = int(LONGEST)
     height = int(1)
     sector = int(0)
+    middle = slope(sectors, 0)
+    step = dy * cols
     while sector < sectors:
+        # While no sector can end, four rows between two decisions, so that reads need not wait for one another.
+        if height + 3 <= room:
+            first_of = run + (height - 1) * step
+            a = wp.min(int(runs[first_of]), int(runs[first_of + step]))
+            b = wp.min(int(runs[first_of + 2 * step]), int(runs[first_of + 3 * step]))
+            four = wp.min(width, wp.min(a, b))
+            if four * middle[0] >= (height + 3) * middle[1]:
+                width = four
+                height += 4
+                continue
         narrower = int(0)
         if height <= room:
-            narrower = wp.min(width, int(runs[run + (height - 1) * dy * cols]))
-        middle = slope(sectors, sector)
+            narrower = wp.min(width, int(runs[run + (height - 1) * step]))
         while sector < sectors and narrower * middle[0] < height * middle[1]:
             found = wp.where(height > 1, width + 256 * (height - 1), 0)
             if narrower * middle[0] > (height - 1) * middle[1]:

@@ -120,6 +120,8 @@ def prepare_scan(
         max_is_range: Evaluate finite max readings like ranges, at range_max.
         distinct: No two bearings are known to be the same.
     """
+    if specialize and distinct and beams is None and not max_is_range:
+        return _plain_scan(ranges, scanner, vectors, z_max)
     kinds = classify(ranges, scanner)
     if max_is_range:
         kinds[(kinds == Reading.MAX) & np.isfinite(ranges)] = Reading.HIT
@@ -150,6 +152,29 @@ def prepare_scan(
         missing=int(np.count_nonzero(kinds == Reading.MISSING)),
         ignored_max=0 if z_max > 0 else int(np.count_nonzero(kinds == Reading.MAX)),
         thinned=informative - int(np.count_nonzero(used)),
+    )
+
+
+def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float) -> PreparedScan:
+    """``prepare_scan`` where all beams are used and none repeats another: what filters do at every step."""
+    with np.errstate(over="ignore"):
+        nearest, farthest = ranges.dtype.type(scanner.range_min), ranges.dtype.type(scanner.range_max)
+    far = ranges >= farthest
+    near_enough = (ranges >= nearest) & (ranges > 0) if scanner.range_min > 0 else ranges >= 0
+    columns, count = np.flatnonzero(near_enough & ~far), int(np.count_nonzero(far))
+    if len(columns) < len(ranges):
+        ranges, vectors = ranges[columns], vectors[columns]
+    return PreparedScan(
+        columns=columns,
+        readings=ranges.astype(np.float64),
+        vectors=vectors,
+        rays=vectors,
+        first=np.arange(len(columns) + 1, dtype=np.int32),
+        constant=float(count * np.log(z_max)) if count and z_max > 0 else 0.0,
+        max_columns=np.flatnonzero(far) if z_max > 0 else columns[:0],
+        missing=scanner.count - len(columns) - count,
+        ignored_max=0 if z_max > 0 else count,
+        thinned=0,
     )
 
 

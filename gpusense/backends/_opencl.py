@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import warnings
+import weakref
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,10 @@ def _lanes(device: cl.Device) -> int:
     return 16 if device.native_vector_width_float >= 16 else 8
 
 
+class _Buffer(cl.Buffer):  # type: ignore[misc]
+    """A buffer that can be referred to without being kept alive."""
+
+
 class OpenCLBackend(ProcessBound):
     """One OpenCL device: a context, an in-order queue and the programs compiled for it."""
 
@@ -96,7 +101,7 @@ class OpenCLBackend(ProcessBound):
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
             )
         with _driver_errors():
-            buffer = cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+            buffer = _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
             if zero:
                 cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
         return buffer
@@ -161,6 +166,10 @@ class OpenCLBackend(ProcessBound):
             return program.build(self.options, [self._device])
 
 
+def _nothing() -> None:
+    """What an argument is bound to at first."""
+
+
 class _Launch:
     """Binds arguments by the signature table and enqueues."""
 
@@ -173,16 +182,23 @@ class _Launch:
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if float64 else np.float32)
         self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
+        # What the kernel has; most calls change a few of many arguments. Of buffers a weak reference, so that the memory
+        # of one that is given up is free, and another in its place is told from it.
+        self._bound: list[Any] = [_nothing] * len(self._scalars)
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
-        bound = [
-            value if scalar is None else scalar(value) for scalar, value in zip(self._scalars, arguments, strict=True)
-        ]
         group = (self._group, *(1 for _ in size[1:]))
         rounded = (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:])
         # Arguments belong to the kernel object, so two threads must not interleave here.
         with self._lock, _driver_errors():
-            self._kernel.set_args(*bound)
+            for i, (scalar, value, last) in enumerate(zip(self._scalars, arguments, self._bound, strict=True)):
+                if scalar is None:
+                    if last() is not value:
+                        self._kernel.set_arg(i, value)
+                        self._bound[i] = weakref.ref(value)
+                elif last is _nothing or last != value:
+                    self._kernel.set_arg(i, scalar(value))
+                    self._bound[i] = value
             cl.enqueue_nd_range_kernel(self._queue, self._kernel, rounded, group)
 
 

@@ -294,8 +294,8 @@ class ScanModel(ABC):
             with np.errstate(divide="ignore"):
                 self._fill(log_p, self.temperature * (scan.constant if self._peer is None else np.log(self._lead)))
             return
-        hits = scan.columns[np.isfinite(scan.readings)]
-        if len(hits) and self._peer is None and self._impossible():
+        hits = scan.columns[np.isfinite(scan.readings)] if self._peer is None and self._impossible() else ()
+        if len(hits):
             self._fill(log_p, -np.inf)
             if per_beam:
                 parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)

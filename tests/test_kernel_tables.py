@@ -192,6 +192,17 @@ def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> 
                 assert width.max() == min(255, shape[1]) or height.max() == min(255, shape[0])
 
 
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
+    kind: str, as_kind: Callable[[str], Backend]
+) -> None:
+    occupied = np.random.default_rng(27).random((2, 70_000)) < 1e-3
+    for seen in (occupied, np.ascontiguousarray(occupied.T)):
+        expected = planes_of(seen, 2, kind)
+        check_empty(seen, expected)
+        np.testing.assert_array_equal(made(as_kind(kind), seen, 2), expected)
+
+
 @each_grid
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_rectangles_have_the_bits_of_the_reference(

@@ -89,7 +89,7 @@ def free_columns(
 
 # For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle
 # of enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height,
-# each lower than all before it, with their free cells above 16 bits of the column.
+# each lower than all before it, with their free cells above the column's last 16 bits, which tell their distance.
 @kernel
 def rectangles_rows(
     runs: wp.array(dtype=wp.uint8),
@@ -127,13 +127,13 @@ def rectangles_rows(
             here = int(runs[run + col])
             while newest > oldest and (stack[waiting + ((newest - 1) & (STACK - 1))] >> 16) >= here:
                 newest -= 1
-            stack[waiting + (newest & (STACK - 1))] = (here << 16) | col
+            stack[waiting + (newest & (STACK - 1))] = (here << 16) | (col & 65535)
             newest += 1
             height = int(LONGEST)
             width = wp.min(width + 1, LONGEST)
             fits = bool(False)
             while width > 0 and not fits:
-                while dx * ((stack[waiting + (oldest & (STACK - 1))] & 65535) - col) >= width:
+                while ((dx * (stack[waiting + (oldest & (STACK - 1))] - col)) & 65535) >= width:
                     oldest += 1
                 height = stack[waiting + (oldest & (STACK - 1))] >> 16
                 if height * middle[1] >= width * middle[0]:

@@ -127,11 +127,11 @@ def empty_rectangles(
         rectangles = backend.empty(4 * sectors * (rows + 2) * (cols + 2), _SHORT, zero=True)
         changed = Region(0, 0, rows, cols)
     top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
-    # What the rectangles of cells that reach the changed ones may reach on their other side.
-    far = 2 * RECTANGLE_REACH
-    first, begin = max(top - far, 0), max(left - far, 0)
-    end = min(right + far, cols)
-    near = obstacles[first : bottom + far]
+    # Cells that change begin this far before the changed obstacles, and rectangles from the last of these end this far
+    # behind them; the other way round where they grow the other way.
+    first, begin = max(top - RECTANGLE_REACH, 0), max(left - RECTANGLE_REACH, 0)
+    end = min(right + RECTANGLE_REACH, cols)
+    near = obstacles[first : bottom + RECTANGLE_REACH]
     band = len(near)
     runs = backend.empty(2 * band * cols, _BYTE)
     place = (rows, cols, sectors, first, band, top, left, bottom, right)

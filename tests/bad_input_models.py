@@ -155,15 +155,15 @@ MODEL_CASES = [
     ("field-specialize-none", field(specialize=None), TypeError, "specialize: must be True or False, got None"),
     (
         "beam-range-of-too-many-cells",
-        beam(scanner=gs.Scanner([0.0], 4194305.0)),
+        beam(scanner=gs.Scanner([0.0], 1048577.0)),
         ValueError,
-        "range_max: must be at most 4194304 cells of the grid, got 4194305",
+        "range_max: must be at most 1048576 cells of the grid, got 1048577",
     ),
     (
         "beam-range-of-infinitely-many-cells",
         beam(grid=gs.OccupancyGrid([[0]], 1e-10), scanner=gs.Scanner([0.0], 1e308)),
         ValueError,
-        "range_max: must be at most 4194304 cells of the grid, got inf",
+        "range_max: must be at most 1048576 cells of the grid, got inf",
     ),
 ]
 
@@ -242,7 +242,7 @@ CASTER_CASES = [
         "caster-range-of-too-many-cells",
         caster(range_max=1e7),
         ValueError,
-        "range_max: must be at most 4194304 cells of the grid, got 10000000",
+        "range_max: must be at most 1048576 cells of the grid, got 10000000",
     ),
     ("caster-method", caster(method="embree"), ValueError, f"method: must be one of {CASTERS}, got 'embree'"),
     ("caster-method-number", caster(method=3), TypeError, f"method: must be one of {CASTERS}, got 3"),

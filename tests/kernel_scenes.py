@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from gpusense.backends import Backend, get_backend
-from gpusense.prepare import quadrant_squares
+from gpusense.backends._numpy import NumpyBackend
+from gpusense.prepare import empty_rectangles
 from gpusense.signatures import KERNELS
 
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
+UNREACHABLE = (1 << 31) - 1
+SECTORS = (1, 2, 4)
 
 
 def run(
@@ -98,23 +102,37 @@ def scene_flags(real: type, *names: str) -> frozenset[str]:
     return frozenset({*names, *(("FLOAT64",) if real is np.float64 else ())})
 
 
-def planes_of(occupied: np.ndarray) -> np.ndarray:
+def sector_flags(sectors: int) -> frozenset[str]:
+    return frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
+
+
+def planes_of(occupied: np.ndarray, sectors: int = 1, kind: str = "cpu") -> np.ndarray:
+    """(4, sectors, rows + 2, cols + 2) rectangles by the reference's kernels for processors or for GPUs."""
     rows, cols = occupied.shape
-    backend = get_backend("numpy")
-    return backend.download(quadrant_squares(backend, occupied), np.empty((4, rows + 2, cols + 2), np.uint8))
+    # A backend of its own: that of the tests may pretend to be a GPU.
+    backend = NumpyBackend()
+    backend.info = dataclasses.replace(backend.info, kind=kind)
+    planes = np.empty((4, sectors, rows + 2, cols + 2), np.uint16)
+    return backend.download(empty_rectangles(backend, occupied, sectors), planes)
 
 
 def ranges_on_both(
-    device: Backend, occupied: np.ndarray, real: type, flags: frozenset[str], cell: np.ndarray, pose: np.ndarray
+    device: Backend,
+    occupied: np.ndarray,
+    real: type,
+    flags: frozenset[str],
+    cell: np.ndarray,
+    pose: np.ndarray,
+    sectors: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Expected ranges along every kind of bearing, on the reference and on a device."""
+    """Expected ranges along every kind of bearing, by the reference with 1 sector and by a device with any number."""
     ray = directions(real)
     ranges = np.full((len(pose), len(ray)), np.nan, real)
     size, counts = (len(ray), len(pose)), (*occupied.shape, len(pose), len(ray))
-    reference, found = on_both(
-        device, "cast_ranges", flags, size, planes_of(occupied), cell, pose, ray, ranges, *counts, *EXACT, LIMIT,
-        RESOLUTION, LIMIT * RESOLUTION,
-    )  # fmt: skip
+    rest = (cell, pose, ray, ranges, *counts, *EXACT, LIMIT, RESOLUTION, LIMIT * RESOLUTION)
+    reference = run(get_backend("numpy"), "cast_ranges", flags, size, planes_of(occupied), *rest)
+    flags |= sector_flags(sectors)
+    found = run(device, "cast_ranges", flags, size, planes_of(occupied, sectors), *rest)
     return reference["ranges"], found["ranges"]
 
 
@@ -127,6 +145,9 @@ def with_low_parts(terms, real):
 
 
 def squared_distances(occupied: np.ndarray) -> np.ndarray:
+    """SciPy's squared distances; UNREACHABLE without obstacles."""
+    if not occupied.any():
+        return np.full(occupied.shape, UNREACHABLE, np.int32)
     nearest = distance_transform_edt(~occupied, return_distances=False, return_indices=True)
     return ((nearest - np.indices(occupied.shape)) ** 2).sum(axis=0).astype(np.int32)
 

@@ -10,7 +10,8 @@ import numpy as np
 from oracles import Ray, walk
 
 from gpusense.backends import get_backend
-from gpusense.prepare import quadrant_squares
+from gpusense.lanes import widened
+from gpusense.prepare import empty_rectangles
 
 LAST_FLOAT32 = 1 - 2.0**-24
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, LAST_FLOAT32)
@@ -44,8 +45,16 @@ class Scene:
 
 
 @functools.cache
-def cast(scene: Scene, backend: str, precision: str) -> np.ndarray:
-    """The kernel's ranges in cells; poses carry the direction as their heading, the one ray is along it."""
+def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: bool = False) -> np.ndarray:
+    """The kernel's ranges in cells; poses carry the direction as their heading, the one ray is along it.
+
+    Args:
+        scene: Map and rays.
+        backend: Where they are cast.
+        precision: ``"float32"`` or ``"float64"``.
+        sectors: Sectors of a quadrant for which rectangles are made.
+        wide: Whether the kernel is the one for the device's lanes, where there is one.
+    """
     device, real = get_backend(backend), np.dtype(precision)
     rows, cols = scene.occupied.shape
     flags = {"FLOAT64"} if precision == "float64" else set()
@@ -53,11 +62,13 @@ def cast(scene: Scene, backend: str, precision: str) -> np.ndarray:
     flags |= {"ORIGINS_OUTSIDE"} if not ((scene.cell >= 0) & (scene.cell < (cols, rows))).all() else set()
     pose = np.concatenate([scene.frac, scene.direction], axis=1)
     count = len(pose)
-    squares = quadrant_squares(device, scene.occupied)
+    flags |= {f"SECTORS_{sectors}"} if sectors > 1 else set()
+    table = empty_rectangles(device, scene.occupied, sectors)
     cell, pose = device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real))
     rays, ranges = device.upload(np.array([[1.0, 0.0]], real)), device.empty(count, real)
-    device.compile("cast_ranges", frozenset(flags))(
-        (1, count), squares, cell, pose, rays, ranges, rows, cols, count, 1, 0, 0.0, 0.0, scene.limit, 1.0, scene.limit
+    code = widened(device.info, "cast_ranges", flags) if wide else frozenset(flags)
+    device.compile("cast_ranges", code)(
+        (1, count), table, cell, pose, rays, ranges, rows, cols, count, 1, 0, 0.0, 0.0, scene.limit, 1.0, scene.limit
     )
     return device.download(ranges, np.empty(count, real))
 

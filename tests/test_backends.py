@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import stat
 import subprocess
@@ -183,7 +184,12 @@ def test_a_second_process_compiles_nothing(folder, needs):
     assert result.stdout.split() == ["3.5", "2", "2"]
 
 
-def test_a_buffer_beyond_the_device_is_a_memory_error(needs):
-    backend = get_backend(needs("opencl"))
+def test_a_buffer_beyond_the_device_is_a_memory_error(backend, monkeypatch):
+    device = get_backend(backend)
     with pytest.raises(MemoryError, match="cannot hold a buffer of"):
-        backend.empty(backend.info.max_buffer + 1, np.dtype(np.uint8))
+        device.empty(device.info.max_buffer + 1, np.dtype(np.uint8))
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, max_buffer=100))
+    assert device.download(device.upload(np.arange(25, dtype=np.int32)), np.empty(25, np.int32))[24] == 24
+    for make in (lambda: device.empty(26, np.dtype(np.int32)), lambda: device.upload(np.zeros(26, np.int32))):
+        with pytest.raises(MemoryError, match=r"cannot hold a buffer of 104 bytes: its largest is 100 bytes"):
+            make()

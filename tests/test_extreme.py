@@ -10,7 +10,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.prepare import quadrant_squares
+from gpusense.prepare import empty_rectangles
 from gpusense.tolerances import differing, per_scan
 
 PRECISIONS = ("float32", "float64")
@@ -114,7 +114,7 @@ def test_denormal_direction_components_are_zero(backend, precision):
 
     def cast(selection: str, flushed: bool) -> np.ndarray:
         device = get_backend(selection)
-        squares, cells = quadrant_squares(device, obstacles), np.tile(np.array([[5, 3]], np.int32), (len(origins), 1))
+        table, cells = empty_rectangles(device, obstacles, 1), np.tile(np.array([[5, 3]], np.int32), (len(origins), 1))
         found = []
         for pose, ray in headings:
             if flushed:
@@ -122,7 +122,7 @@ def test_denormal_direction_components_are_zero(backend, precision):
             placed = np.concatenate([np.array(origins), np.tile(pose, (len(origins), 1))], axis=1).astype(real)
             out = device.empty(len(origins), real)
             device.compile("cast_ranges", frozenset({"FLOAT64"} if precision == "float64" else ()))(
-                (1, len(origins)), squares, device.upload(cells), device.upload(placed), device.upload(ray[None]), out,
+                (1, len(origins)), table, device.upload(cells), device.upload(placed), device.upload(ray[None]), out,
                 *obstacles.shape, len(origins), 1, 0, 0.0, 0.0, 20.0, 1.0, 20.0,
             )  # fmt: skip
             found.append(device.download(out, np.empty(len(origins), real)))

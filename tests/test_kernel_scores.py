@@ -130,20 +130,6 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
 # ---- the likelihood field
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-def test_the_table_is_filled_inside_its_ring(real: type, device: Backend) -> None:
-    squared = squared_distances(GRIDS["sparse"])
-    rows, cols = squared.shape
-    cap = 50
-    density = np.random.default_rng(19).random(cap + 1).astype(real)
-    table = np.full((rows + 4, cols + 4), -7, real)
-    call = ("fill_field", scene_flags(real), (cols, rows), squared, density, table, rows, cols, cap)
-    reference, found = on_both(device, *call)
-    np.testing.assert_array_equal(found["table"], reference["table"])
-    expected = np.pad(density[np.minimum(squared, cap)], 2, constant_values=-7)
-    np.testing.assert_array_equal(found["table"], expected)
-
-
 # Flags, and whether the table holds distances.
 FIELDS = {
     "log table": ("LOG_TABLE", "LINEAR", "HIT"),

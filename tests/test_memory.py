@@ -28,21 +28,38 @@ if BACKEND.startswith("warp"):
     warp.config.verify_fp = False
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.backends._numpy import NumpyBackend
 from gpusense.casters import CASTERS, Lookup, March
-from gpusense.prepare import quadrant_squares
+from gpusense.prepare import empty_rectangles
+from gpusense.region import Region
 
 rng = np.random.default_rng(0)
 cells = np.zeros((13, 17), int)
 cells[rng.random(cells.shape) < 0.08] = 100
 grid = gs.OccupancyGrid(cells, 0.1, (-0.3, 0.2, 0.3))
 wrong = np.count_nonzero(gs.distance_transform(cells, backend=BACKEND) != gs.distance_transform(cells, backend="numpy"))
-device = get_backend(BACKEND)
-tables = []
+device, numpy = get_backend(BACKEND), NumpyBackend()
+changed, part = cells > 0, Region(4, 0, 3, 5)
+part.cut(changed)[...] = ~part.cut(changed)
+
+
+def pretend(kind):
+    # Processors and GPUs have kernels of their own, and tables of 2 and 4 sectors.
+    for one in (device, numpy):
+        object.__setattr__(one.info, "kind", kind)
+
+
 for kind in ("cpu", "gpu"):
-    object.__setattr__(device.info, "kind", kind)
+    pretend(kind)
     gs.distance_transform(cells, backend=device)
-    tables.append(device.download(quadrant_squares(device, cells > 0), np.empty(4 * 15 * 19, np.uint8)))
-wrong += np.count_nonzero(tables[0] != tables[1])
+    for sectors in (1, 2, 4):
+        tables = []
+        for one in (device, numpy):
+            table = empty_rectangles(one, cells > 0, sectors)
+            tables.append(one.download(table, np.empty(4 * sectors * 15 * 19, np.uint16)))
+            empty_rectangles(one, changed, sectors, table, part)
+            tables.append(one.download(table, np.empty(4 * sectors * 15 * 19, np.uint16)))
+        wrong += np.count_nonzero(tables[0] != tables[2]) + np.count_nonzero(tables[1] != tables[3])
 
 bearings = np.linspace(-3, 3, 7)
 bearings[-1] = bearings[0]
@@ -50,7 +67,8 @@ poses = np.column_stack([rng.uniform(-1, 2, 9), rng.uniform(-0.5, 2, 9), rng.uni
 ranges = rng.uniform(0, 1.1, 7)
 ranges[2] = np.nan
 scanner = gs.Scanner(bearings, 1.0, mount=(0.1, 0.02, 0.1))
-for precision, outside in itertools.product(("float32", "float64"), ("free", "occupied")):
+for kind, precision, outside in itertools.product(("cpu", "gpu"), ("float32", "float64"), ("free", "occupied")):
+    pretend(kind)
     casts = [gs.RayCaster(grid, 1.0, backend=b, precision=precision, outside=outside).cast(poses, bearings)
              for b in (BACKEND, "numpy")]
     wrong += np.count_nonzero(casts[0] != casts[1])
@@ -87,8 +105,9 @@ if BACKEND.startswith("opencl"):
     many, turns = np.tile(poses, (3, 1))[:19], np.linspace(-3, 3, 21)
     several = gs.Scanner(turns, 1.0)
     readings = rng.uniform(0, 0.99, 21)
-    for lanes, outside in itertools.product((8, 16), ("free", "occupied")):
+    for (lanes, kind), outside in itertools.product(((8, "cpu"), (16, "gpu")), ("free", "occupied")):
         results = []
+        object.__setattr__(right_info, "kind", kind)
         for b in (BACKEND, "numpy"):
             device.info = dataclasses.replace(right_info, lanes=lanes)
             models = [kind(grid, several, backend=b, outside=outside)

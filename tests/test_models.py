@@ -411,6 +411,38 @@ def test_whichever_allocation_fails_the_model_goes_on(kind, backend):
         same_bits(model.log_likelihood(poses, z), expected)
 
 
+@pytest.mark.parametrize("kind", [*KINDS, "caster"])
+def test_a_table_that_does_not_fit_is_told_at_once(kind, backend, monkeypatch):
+    """The table is the same for fewer particles: it is tried once, and the message is the device's."""
+    grid, z = room(), scan()
+    poses = cloud(grid, 3000)
+    monkeypatch.setattr(scan_model, "SMALLEST_CHUNK", 1)
+
+    def score(device: Any) -> Any:
+        if kind == "caster":
+            caster = gs.RayCaster(grid, RANGE, backend=device)
+            return caster, lambda: caster.cast(poses, BEARINGS)
+        model = make(kind, grid, device)
+        return model, lambda: model.log_likelihood(poses, z)
+
+    device = FullDevice(backend)
+    owner, call = score(device)
+    (table,) = parts_of_kind(owner, ReachableMap)
+    prepare, tried = table._prepare, []
+
+    def refuse(*arguments):
+        tried.append(arguments)
+        device.largest = 10
+        return prepare(*arguments)
+
+    table._prepare = refuse
+    with pytest.raises(MemoryError, match=r"^no room$"):
+        call()
+    assert len(tried) == device.refused == 1
+    table._prepare, device.largest = prepare, 1 << 60
+    same_bits(call(), score(backend)[1]())
+
+
 def test_a_device_that_holds_nothing(backend):
     """MemoryError, and the same model works once there is room."""
     grid, z = room(), scan()

@@ -56,7 +56,7 @@ def test_launches_keep_no_buffer_alive(warp_backend: Backend) -> None:
     density = warp_backend.upload(np.ones(1, np.float32))
     table = warp_backend.empty(7 * 6, np.dtype(np.float32), zero=True)
     fill = warp_backend.compile("fill_field", frozenset())
-    fill((2, 3), squared, density, table, 3, 2, 0)
+    fill((2, 3), squared, density, table, 3, 2, 0, 0.0, 0, 0, 2, 3, 14, 6)
     alive = [weakref.ref(buffer) for buffer in (squared, density, table)]
     assert warp_backend.download(table, np.empty((7, 6), np.float32)).sum() == 6
     del squared, density, table
@@ -70,10 +70,11 @@ def test_repeated_launches_see_what_changed(warp_backend: Backend) -> None:
     first = warp_backend.upload(squared), warp_backend.upload(density)
     for rows, cols, cap in ((3, 2, 9), (2, 3, 9), (2, 3, 1), (1, 1, 0), (3, 2, 9)):
         table = warp_backend.empty((rows + 4) * (cols + 4), np.dtype(np.float32), zero=True)
-        fill((cols, rows), *first, table, rows, cols, cap)
+        stride = cols + 4
+        fill((cols, rows), *first, table, rows, cols, cap, 0.0, 0, 0, cols, rows, 2 * stride + 2, stride)
         found = warp_backend.download(table, np.empty((rows + 4, cols + 4), np.float32))[2:-2, 2:-2]
         np.testing.assert_array_equal(found, np.minimum(squared[: rows * cols].reshape(rows, cols), cap))
-    fill((0, 3), *first, table, 3, 0, 0)
+    fill((0, 3), *first, table, 3, 0, 0, 0.0, 0, 0, 0, 3, 0, 4)
     with pytest.raises(ValueError, match="zip"):
         fill((2, 3), *first)
 
@@ -82,7 +83,8 @@ def test_a_buffer_of_another_type_is_refused(warp_backend: Backend) -> None:
     doubles = warp_backend.upload(np.zeros(60))
     squared = warp_backend.upload(np.zeros(6, np.int32))
     with pytest.raises(RuntimeError, match="density"):
-        warp_backend.compile("fill_field", frozenset())((2, 3), squared, doubles, doubles, 3, 2, 0)
+        fill = warp_backend.compile("fill_field", frozenset())
+        fill((2, 3), squared, doubles, doubles, 3, 2, 0, 0.0, 0, 0, 2, 3, 0, 6)
 
 
 _QUIET = """
@@ -92,10 +94,10 @@ import warp as wp
 names = [name for name in ("log_level", "quiet", "cache_kernels") if hasattr(wp.config, name)]
 before = {name: getattr(wp.config, name) for name in names}
 backend = get_backend("warp:cpu")
-launch = backend.compile("square_runs", frozenset())
+launch = backend.compile("free_columns", frozenset())
 cells = backend.upload(np.array([0, 0, 1, 0], np.uint8))
 runs = backend.empty(8, np.dtype(np.uint8))
-launch((1, 2), cells, runs, 1, 4)
+launch((1, 2), cells, runs, 4, 1, 0, 1)
 backend.synchronize()
 assert backend.download(runs, np.empty(8, np.uint8)).tolist() == [2, 1, 0, 1, 1, 2, 0, 1]
 assert before == {name: getattr(wp.config, name) for name in before}

@@ -28,13 +28,17 @@ class NumpyBackend:
 
     def upload(self, array: np.ndarray, out: np.ndarray | None = None, *, wait: bool = True) -> np.ndarray:
         """See Backend.upload."""
-        if out is None:
-            return array.ravel().copy()
-        out[: array.size] = array.ravel()
-        return out
+        buffer = self.empty(array.size, array.dtype) if out is None else out
+        buffer[: array.size] = array.ravel()
+        return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> np.ndarray:
         """See Backend.empty."""
+        size = count * np.dtype(dtype).itemsize
+        if size > self.info.max_buffer:
+            raise MemoryError(
+                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
+            )
         return np.zeros(count, dtype) if zero else np.empty(count, dtype)
 
     def download(self, buffer: np.ndarray, out: np.ndarray, *, wait: bool = True) -> np.ndarray:

@@ -124,8 +124,8 @@ class RayCaster:
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every range is that of a caster of the changed grid.
 
-        The exact caster mends its table where squares can hold a changed obstacle, up to 254 cells off; the others make
-        theirs anew with the next cast.
+        The exact caster mends its table where rectangles can hold a changed obstacle, up to 254 cells off; the others
+        make theirs anew with the next cast.
 
         Args:
             cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.

@@ -15,6 +15,10 @@ from gpusense.plan import Omission, share
 from gpusense.region import Region
 
 
+class TableMemoryError(MemoryError):
+    """The device cannot hold a map's table: fewer particles in a piece would not help."""
+
+
 class ReachableMap:
     """Owns a prepared table of the map.
 
@@ -48,14 +52,21 @@ class ReachableMap:
         self.preparations = 0
 
     def ensure(self, poses: np.ndarray | None) -> tuple[Buffer, Region]:
-        """The table and its window, made anew if these (N, 3) poses, N > 0, can reach beyond it; None may be anywhere."""
+        """The table and its window, made anew if these (N, 3) poses, N > 0, can reach beyond it; None may be anywhere.
+
+        Raises:
+            TableMemoryError: the device cannot hold the table.
+        """
         if self._crop and poses is not None:
             wanted = region.choose(self._grid, self.region, poses, self._mount, self._reach)
         else:
             wanted = region.whole(self._grid)
         if wanted != self.region or self._table is None:
             self._table, self.region = None, None
-            self._table = self._prepare(self._backend, wanted.cut(self.obstacles))
+            try:
+                self._table = self._prepare(self._backend, wanted.cut(self.obstacles))
+            except MemoryError as error:
+                raise TableMemoryError(*error.args) from error
             self.region = wanted
             self.preparations += 1
         assert self.region is not None

@@ -17,6 +17,7 @@ from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
+from gpusense.models.reachable import TableMemoryError
 from gpusense.plan import Omission, Plan, share
 from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
 from gpusense.scanner import Scanner
@@ -30,8 +31,9 @@ CHUNK_BYTES = 256 << 20
 CHUNK_WORK = 1 << 24
 # A launch that does not fit is tried with half the particles down to this.
 SMALLEST_CHUNK = 256
-# Above this many cells neighbouring crossing counts could be confused in float32.
-_MOST_CELLS_PER_RANGE = 1 << 22
+# Up to this many cells float32 knows the place of a crossing to 5/16 of a cell; from half a cell on, neighbouring
+# boundaries could be confused.
+_MOST_CELLS_PER_RANGE = 1 << 20
 
 
 def check_poses(poses: object, name: str = "poses") -> np.ndarray:
@@ -49,7 +51,7 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
 
     Raises:
         TypeError: not an OccupancyGrid.
-        ValueError: more than 4 194 304 cells per range_max.
+        ValueError: more than 1 048 576 cells per range_max.
     """
     if not isinstance(grid, OccupancyGrid):
         raise TypeError(f"grid: must be an OccupancyGrid, got {_checks.show(grid)}")
@@ -131,13 +133,17 @@ def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, 
     """Call ``run(begin, end)`` over [0, count) in pieces; pieces that do not fit into memory are halved.
 
     Raises:
-        MemoryError: not even the smallest piece fits. The model still works for smaller calls.
+        MemoryError: not even the smallest piece fits, or not the map's table, which is tried only once. The model still
+            works for smaller calls.
     """
     begin = 0
     while begin < count:
         try:
             run(begin, min(begin + chunk, count))
             begin += chunk
+        except TableMemoryError:
+            workspace.release()
+            raise
         except MemoryError:
             workspace.release()
             tried = min(chunk, count - begin)
@@ -241,7 +247,7 @@ class ScanModel(ABC):
         Raises:
             TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
             ValueError: a wrong shape, or a pose that is not finite; the message names it.
-            MemoryError: the device cannot hold even a few particles.
+            MemoryError: the device cannot hold the map's table, or even a few particles.
         """
         backend = self._backend
         scans = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), self.scanner)

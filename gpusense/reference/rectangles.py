@@ -1,12 +1,13 @@
 """Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells there.
 
-The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one step
-without missing an obstacle; it is the one that the ray in the middle of the sector stays in longest. After anisotropic
-Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares. Planes are padded by a ring of zeros; quadrant q
-grows to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep.
+The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one
+step without missing an obstacle; it is the one that the ray in the middle of the sector stays in longest. After
+anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares. Planes are padded by a ring of
+zeros; quadrant q grows to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from
+flat to steep.
 
-Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then only
-cells whose rectangles can hold one of these are. Occupied cells are known of a band of rows from row first on.
+Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
+only cells whose rectangles can hold one of these are. Occupied cells are known of a band of rows from row first on.
 """
 
 from __future__ import annotations
@@ -28,6 +29,13 @@ def reach_begin(way: int, low: int) -> int:
 def reach_end(way: int, high: int, size: int) -> int:
     """One beyond the last of the cells whose rectangles, growing that way, can hold one before the cell high."""
     return high if way > 0 else min(high + RECTANGLE_REACH, size)
+
+
+def reached(way: int, part: slice, size: int) -> slice:
+    """What the rectangles of a part can hold, growing that way."""
+    if way > 0:
+        return slice(part.start, min(part.stop + RECTANGLE_REACH, size))
+    return slice(max(part.start - RECTANGLE_REACH, 0), part.stop)
 
 
 def slope(sectors: int, sector: int) -> tuple[int, int]:
@@ -105,7 +113,7 @@ def rectangles_rows(
         dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
         row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
         col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
-        seen = slice(col.start, col.stop + RECTANGLE_REACH) if dx > 0 else slice(max(col.start - RECTANGLE_REACH, 0), col.stop)
+        seen = reached(dx, col, cols)
         run = free[quadrant >> 1, row.start - first : row.stop - first, seen][:, ::dx]
         for sector in range(sectors):
             height, width = slope(sectors, sector)
@@ -145,7 +153,7 @@ def rectangles_scan(
         dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
         row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
         col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
-        seen = slice(row.start, min(row.stop + RECTANGLE_REACH, rows)) if dy > 0 else slice(max(row.start - RECTANGLE_REACH, 0), row.stop)
+        seen = reached(dy, row, rows)
         run = free[quadrant & 1, seen.start - first : seen.stop - first, col][::dy].T
         for sector in range(sectors):
             height, width = slope(sectors, sector)

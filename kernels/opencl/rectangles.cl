@@ -49,7 +49,7 @@ kernel void free_columns(global const uchar *occupied, global uchar *runs, const
 
 // For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle
 // of enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height,
-// each lower than all before it, with their free cells above 16 bits of the column.
+// each lower than all before it, with their free cells above the column's last 16 bits, which tell their distance.
 kernel void rectangles_rows(global const uchar *runs, global int *stack, global ushort *rectangles, const int rows,
                             const int cols, const int sectors, const int first, const int band, const int top,
                             const int left, const int bottom, const int right) {
@@ -67,10 +67,10 @@ kernel void rectangles_rows(global const uchar *runs, global int *stack, global 
         for (int i = 0; i < scanned; ++i) {
             const int col = dx > 0 ? begin + scanned - 1 - i : end - scanned + i, here = run[col];
             while (newest > oldest && waiting[(newest - 1) & (STACK - 1)] >> 16 >= here) --newest;
-            waiting[newest++ & (STACK - 1)] = here << 16 | col;
+            waiting[newest++ & (STACK - 1)] = here << 16 | (col & 0xffff);
             int height = LONGEST;
             for (width = min(width + 1, LONGEST); width > 0; --width) {
-                while (dx * ((waiting[oldest & (STACK - 1)] & 0xffff) - col) >= width) ++oldest;
+                while ((dx * (waiting[oldest & (STACK - 1)] - col) & 0xffff) >= width) ++oldest;
                 height = waiting[oldest & (STACK - 1)] >> 16;
                 if (height * middle.y >= width * middle.x) break;
                 height = LONGEST;

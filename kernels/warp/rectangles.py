@@ -1,15 +1,15 @@
 """Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
-the cell at its corner and grows that way; each at most 255, as width + 256 height. A ray may cross it in one step without
-missing an obstacle. Of all such rectangles it is the one that the ray in the middle of the sector stays in longest. After
-anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares.
+the cell at its corner and grows that way; each at most 255, as width + 256 height. A ray may cross it in one step
+without missing an obstacle. Of all such rectangles it is the one that the ray in the middle of the sector stays in
+longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares.
 
-Planes are padded by a ring of zeros, so a walk that leaves the grid stops there. Quadrant q grows to (+x, +y), (-x, +y),
-(+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, a plane each. All planes have fewer
-than 2^31 cells, so indices fit int32.
+Planes are padded by a ring of zeros, so a walk that leaves the grid stops there. Quadrant q grows to (+x, +y),
+(-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, a plane each. All planes
+have fewer than 2^31 cells, so indices fit int32.
 
-Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then only
-cells whose rectangles can hold one of these are. Made at first, all of them have changed. What is known of occupied cells
-is a band of whole rows of the map from row first on.
+Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
+only cells whose rectangles can hold one of these are. Made at first, all of them have changed. What is known of
+occupied cells is a band of whole rows of the map from row first on.
 """
 
 from types import SimpleNamespace
@@ -31,8 +31,8 @@ def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
     return (row + 1) * (cols + 2) + col + 1
 
 
-# Along an axis: the cells whose rectangles, growing to larger (way 1) or smaller (way -1) indices, can hold one of those
-# in [low, high) are those from reach_begin to before reach_end.
+# Along an axis: the cells whose rectangles, growing to larger (way 1) or smaller (way -1) indices, can hold one of
+# those in [low, high) are those from reach_begin to before reach_end.
 @wp.func
 def reach_begin(way: wp.int32, low: wp.int32):
     return wp.where(way > 0, wp.max(low - RECTANGLE_REACH, 0), low)
@@ -87,9 +87,9 @@ def free_columns(
             runs[out + row * cols + col] = wp.uint8(free)
 
 
-# For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle of
-# enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height, each
-# lower than all before it, with their free cells above 16 bits of the column.
+# For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle
+# of enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height,
+# each lower than all before it, with their free cells above the column's last 16 bits, which tell their distance.
 @kernel
 def rectangles_rows(
     runs: wp.array(dtype=wp.uint8),
@@ -115,9 +115,7 @@ def rectangles_rows(
     waiting = (item * 4 + quadrant) * STACK
     begin = reach_begin(dx, left)
     end = reach_end(dx, right, cols)
-    scanned = wp.where(
-        dx > 0, wp.min(end + RECTANGLE_REACH, cols) - begin, end - wp.max(begin - RECTANGLE_REACH, 0)
-    )
+    scanned = wp.where(dx > 0, wp.min(end + RECTANGLE_REACH, cols) - begin, end - wp.max(begin - RECTANGLE_REACH, 0))
     for sector in range(sectors):
         middle = slope(sectors, sector)
         out = (quadrant * sectors + sector) * (rows + 2) * (cols + 2)
@@ -129,13 +127,13 @@ def rectangles_rows(
             here = int(runs[run + col])
             while newest > oldest and (stack[waiting + ((newest - 1) & (STACK - 1))] >> 16) >= here:
                 newest -= 1
-            stack[waiting + (newest & (STACK - 1))] = (here << 16) | col
+            stack[waiting + (newest & (STACK - 1))] = (here << 16) | (col & 65535)
             newest += 1
             height = int(LONGEST)
             width = wp.min(width + 1, LONGEST)
             fits = bool(False)
             while width > 0 and not fits:
-                while dx * ((stack[waiting + (oldest & (STACK - 1))] & 65535) - col) >= width:
+                while ((dx * (stack[waiting + (oldest & (STACK - 1))] - col)) & 65535) >= width:
                     oldest += 1
                 height = stack[waiting + (oldest & (STACK - 1))] >> 16
                 if height * middle[1] >= width * middle[0]:

@@ -34,8 +34,7 @@ FLAGS = {
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
-    "WIDE": "a work-item computes 8 particles or beams at once, for processors whose compilers do not do so",
-    "LANES_16": "a work-item computes 16 at once",
+    "WIDE": "a work-item computes 16 particles or beams at once, for processors whose compilers do not do so",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "HUGE_HEADINGS": "some heading is beyond 2^20 rad",
@@ -116,9 +115,13 @@ class Kernel:
     wide_group: int = 1
 
 
+# Particles or beams of a work-item of such a kernel.
+LANES = 16
+
+
 def lanes_of(flags: frozenset[str]) -> int:
     """How many particles or beams a work-item computes at once."""
-    return (16 if "LANES_16" in flags else 8) if "WIDE" in flags else 1
+    return LANES if "WIDE" in flags else 1
 
 
 def _kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = False, wide_group: int = 1) -> Kernel:
@@ -236,6 +239,6 @@ KERNELS: dict[str, Kernel] = {
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_RESULT, *_MAP, "int particles",
-        "int readings", "real guard", "real fixed", "real temperature", wide=True, wide_group=8,
+        "int readings", "real guard", "real fixed", "real temperature", wide=True,
     ),
 }  # fmt: skip

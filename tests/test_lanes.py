@@ -1,4 +1,4 @@
-"""Kernels that compute 8 or 16 particles or beams at once: the bits of the scalar ones, leftovers included."""
+"""Kernels that compute 16 particles or beams at once: the bits of the scalar ones, leftovers included."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.lanes import widened
-from gpusense.signatures import lanes_of
+from gpusense.signatures import LANES, lanes_of
 from gpusense.tolerances import beam_tolerance, differing
 
 RANGE = 9.0
@@ -54,7 +54,8 @@ def results(device, particles: int, beams: int, outside: str):
     beam = gs.BeamModel(grid, scanner, gs.BeamParameters(0.6, 0.1, 0.1, 0.2, 0.1, 0.3), **options)
     field = gs.LikelihoodFieldModel(grid, scanner, **options)
     found = {"ranges": gs.RayCaster(grid, RANGE, **options).cast(poses, scanner.bearings)}
-    for name, model in (("beam", beam), ("field", field)):
+    smooth = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(interpolation="bilinear"), **options)
+    for name, model in (("beam", beam), ("field", field), ("smooth field", smooth)):
         found[f"{name} log p"], found[f"{name} parts"] = model.log_likelihood(poses, z, per_beam=True)
         assert differing(model.log_likelihood(poses, z), found[f"{name} log p"]) == 0
     return found
@@ -75,44 +76,71 @@ def compiled(device, monkeypatch):
 
 
 @pytest.mark.parametrize("outside", ["free", "occupied"])
-@pytest.mark.parametrize(("particles", "beams"), [(1, 1), (7, 15), (8, 16), (17, 33), (40, 200)])
-@pytest.mark.parametrize("lanes", [8, 16])
-def test_lanes_have_the_bits_of_one(lanes, particles, beams, outside, device, compiled):
+@pytest.mark.parametrize(("particles", "beams"), [(1, 1), (15, 15), (16, 16), (17, 33), (63, 40), (130, 200)])
+def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled):
     one = results(device(1), particles, beams, outside)
     assert all(compiled[kernel] == {1} for kernel in KERNELS)
     compiled.clear()
-    found = results(device(lanes), particles, beams, outside)
-    assert all(compiled[kernel] == {lanes} for kernel in KERNELS)
+    found = results(device(LANES), particles, beams, outside)
+    assert all(compiled[kernel] == {LANES} for kernel in KERNELS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
     # Drivers have elementary functions of their own for vectors.
     allowed = beam_tolerance(np.float32).twice()
-    for name in ("beam parts", "beam log p"):
+    for name in ("beam parts", "beam log p", "smooth field parts", "smooth field log p"):
         assert allowed.difference(found[name], one[name]) <= allowed.value, name
 
 
-@pytest.mark.parametrize("lanes", [8, 16])
-def test_a_particle_does_not_depend_on_its_lane(lanes, device):
-    grid, scanner, poses, z = scene(40, 200)
-    for make in (gs.BeamModel, gs.LikelihoodFieldModel):
-        model = make(grid, scanner, backend=device(lanes))
+def test_a_particle_does_not_depend_on_its_lane(device):
+    grid, scanner, poses, z = scene(140, 200)
+    smooth = gs.LikelihoodFieldParameters(interpolation="bilinear")
+    for make, *parameters in ((gs.BeamModel,), (gs.LikelihoodFieldModel,), (gs.LikelihoodFieldModel, smooth)):
+        model = make(grid, scanner, *parameters, backend=device(LANES))
         together = model.log_likelihood(poses, z)
         assert differing(model.log_likelihood(poses[::-1], z)[::-1], together) == 0
-        assert (
-            differing(np.concatenate([model.log_likelihood(poses[i : i + 3], z) for i in range(0, 40, 3)]), together)
-            == 0
+        pieces = [model.log_likelihood(poses[i : i + 3], z) for i in range(0, len(poses), 3)]
+        assert differing(np.concatenate(pieces), together) == 0
+
+
+@pytest.mark.parametrize("resolution", [1e-5, 1e-3, 0.05, 3.0])
+def test_end_points_next_to_edges_and_far_away(resolution, device):
+    """Readings of up to 2^20 cells, most of them whole, at headings of quarter turns and nearly so."""
+    rng = np.random.default_rng(5)
+    grid = gs.OccupancyGrid(rng.choice([0, 100], (90, 70), p=[0.9, 0.1]), resolution)
+    scanner = gs.Scanner(np.append(np.arange(32) * math.pi / 4, rng.uniform(-3, 3, 50)), (1 << 20) * resolution)
+    poses = rng.uniform((0, 0, -4), (70, 90, 4), (300, 3)) * (resolution, resolution, 1)
+    poses[::2] = np.round(poses[::2] / resolution) * resolution
+    poses[::2, 2] = rng.integers(-4, 5, 150) * math.pi / 4
+    poses[2::8] += rng.normal(0, 1e-9, 3)
+    z = np.concatenate([np.arange(32), rng.integers(0, 60, 20), rng.uniform(0, 1 << 20, 30)]) * resolution
+    for interpolation in ("nearest", "bilinear"):
+        parameters = gs.LikelihoodFieldParameters(
+            sigma_hit=2 * resolution, max_distance=6 * resolution, interpolation=interpolation
         )
+        found = [
+            gs.LikelihoodFieldModel(grid, scanner, parameters, backend=device(lanes)).log_likelihood(
+                poses, z, per_beam=True
+            )
+            for lanes in (1, LANES)
+        ]
+        for one, wide in zip(*found, strict=True):
+            if interpolation == "nearest":
+                assert differing(wide, one) == 0
+            else:
+                allowed = beam_tolerance(np.float32).twice()
+                assert allowed.difference(wide, one) <= allowed.value
 
 
 def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
-    wide = dataclasses.replace(info, lanes=8)
+    wide = dataclasses.replace(info, lanes=LANES)
     assert widened(info, "cast_ranges", set()) == frozenset()
     assert widened(wide, "cast_ranges", set()) == {"WIDE"}
-    assert widened(dataclasses.replace(info, lanes=16), "cast_ranges", set()) == {"WIDE", "LANES_16"}
     for flag in ("FLOAT64", "MARCH", "LOOKUP", "SHARED_RAYS", "SHARP"):
         assert widened(wide, "cast_ranges", {flag}) == {flag}
     assert widened(wide, "score_beams", {"HIT"}) == {"HIT"}
     assert widened(wide, "score_beams", {"HIT", "LINEAR"}) == {"HIT", "LINEAR", "WIDE"}
-    assert widened(wide, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR"}
+    assert widened(wide, "score_field", {"BILINEAR"}) == {"BILINEAR"}
+    assert widened(wide, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
+    assert widened(wide, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
     assert widened(wide, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}

@@ -6,6 +6,8 @@ import gc
 import os
 import subprocess
 import sys
+import threading
+import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
@@ -121,3 +123,102 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
     needs("warp")
     run_quietly(tmp_path, GPUSENSE_CACHE="off")
     assert not list(tmp_path.rglob("*.o"))
+
+
+@pytest.fixture
+def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
+    """A launcher of the field's scores that three threads share, and what runs a launcher on some particles."""
+    from gpusense.backends import _warp
+
+    monkeypatch.setattr(_warp, "_threads", lambda: 3)
+    _warp._pool.cache_clear()
+    monkeypatch.setattr(_warp, "_PIECE_WORK", 50)
+    rng = np.random.default_rng(0)
+    particles, readings, rows, cols = 61, 20, 30, 40
+    angles = rng.uniform(-4, 4, particles)
+    pose = np.concatenate([rng.uniform(0, 1, (particles, 2)), np.cos(angles)[:, None], np.sin(angles)[:, None]], axis=1)
+    arrays = (
+        rng.normal(size=(rows + 4) * (cols + 4)).astype(np.float32),
+        rng.integers(0, 30, (particles, 2)).astype(np.int32),
+        pose.astype(np.float32),
+        np.zeros((particles, 4), np.float32),
+        rng.uniform(-15, 15, (readings, 2)).astype(np.float32),
+        np.zeros((readings, 2), np.float32),
+        np.zeros(6, np.float32),
+    )
+    backend = _warp.WarpBackend(warp_backend.info, "cpu")
+    flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
+    launch = backend.compile("score_field", flags)
+    assert isinstance(launch, _warp._Pieces)
+    inputs = [backend.upload(array) for array in arrays]
+    scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5)
+    real = np.dtype(np.float32)
+
+    def run(target: Callable[..., None], count: int = particles) -> tuple[np.ndarray, np.ndarray]:
+        log_p, parts = backend.empty(particles, real, zero=True), backend.empty(particles * readings, real, zero=True)
+        target((count,), *inputs, log_p, parts, rows, cols, count, *scalars[3:])
+        found = np.empty(particles, real), np.empty((particles, readings), real)
+        return backend.download(log_p, found[0]), backend.download(parts, found[1])
+
+    yield launch, run
+    _warp._pool.cache_clear()
+
+
+@pytest.mark.parametrize("count", [1, 4, 5, 6, 60, 61])
+def test_pieces_of_a_launch_are_the_whole(field_launch, count: int) -> None:
+    launch, run = field_launch
+    sizes = []
+    one = launch._launch
+
+    def record(size: tuple[int, ...], *arguments: object) -> None:
+        sizes.append(size[0])
+        one(size, *arguments)
+
+    launch._launch = record
+    found = run(launch, count)
+    assert sum(sizes) == count
+    assert len(sizes) == (6 if count >= 60 else 2 if count > 4 else 1)
+    for cut, whole in zip(found, run(one, count), strict=True):
+        np.testing.assert_array_equal(cut, whole)
+        assert not cut[count:].any()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_nothing_runs_on_after_an_interrupted_launch(field_launch, error: type[BaseException]) -> None:
+    launch, run = field_launch
+    one, busy, owner = launch._launch, [], threading.current_thread()
+    begun = threading.Event()
+
+    def fail(size: tuple[int, ...], *arguments: object) -> None:
+        if threading.current_thread() is owner:
+            begun.wait(10)
+            raise error
+        busy.append(size)
+        begun.set()
+        time.sleep(0.05)
+        one(size, *arguments)
+        busy.pop()
+
+    launch._launch = fail
+    with pytest.raises(error):
+        run(launch)
+    assert not busy
+    launch._launch = one
+    np.testing.assert_array_equal(run(launch)[0], run(one)[0])
+
+
+def test_an_error_in_another_thread_is_raised(field_launch) -> None:
+    launch, run = field_launch
+    one, owner = launch._launch, threading.current_thread()
+    failed = threading.Event()
+
+    def fail(size: tuple[int, ...], *arguments: object) -> None:
+        if threading.current_thread() is not owner:
+            failed.set()
+            raise MemoryError("no more")
+        failed.wait(10)
+        one(size, *arguments)
+
+    launch._launch = fail
+    with pytest.raises(MemoryError, match="no more"):
+        run(launch)

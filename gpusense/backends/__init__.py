@@ -20,7 +20,7 @@ from gpusense.backends.base import Backend, BackendInfo, ProcessBound
 __all__ = ["Backend", "BackendInfo", "Device", "devices", "get_backend"]
 
 # Measured speed classes, best first, of (backend, kind): see bench/RESULTS.md. A GPU beats any processor here; of the
-# two ways to drive one, OpenCL starts launches sooner. Warp's processor device uses a single thread.
+# two ways to drive one, OpenCL starts launches sooner. Warp has no vectors on processors.
 SPEED_CLASSES = (("opencl", "gpu"), ("warp", "gpu"), ("opencl", "cpu"), ("warp", "cpu"), ("numpy", "cpu"))
 
 _INSTALL_OPENCL = "pip install pyopencl pocl-binary-distribution"

@@ -1,13 +1,19 @@
-"""Warp backend: NVIDIA GPUs through CUDA, and the processor with one thread.
+"""Warp backend: NVIDIA GPUs through CUDA, and the processor.
 
 Warp's last thread index runs fastest, a signature row's first axis does: launches pass their size reversed, and the
 kernels unpack ``wp.tid()`` in that order.
+
+Warp runs a launch on the processor in the calling thread. Large launches over particles are therefore cut into pieces,
+each with its own part of the arrays, that threads of ours run side by side: Warp releases Python's lock while a kernel
+runs, and its kernels keep no state. A particle's result does not depend on the piece.
 """
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import functools
+import math
 import os
 import tempfile
 import threading
@@ -39,6 +45,10 @@ _VECTORS = {
     (wp.float64, 4): wp.vec4d,
 }
 _MOST_NUMBERS = (1 << 31) - 1
+# Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: threads
+# that others hold up take fewer.
+_PIECE_WORK = 1 << 16
+_PIECES = 2
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 # Guards Warp's settings, which belong to the process.
 _LOCK = threading.RLock()
@@ -76,8 +86,8 @@ class WarpBackend(ProcessBound):
         self.info = info
         self._device = wp.get_device(device)
         # By the flags that change code, and by those that were asked for.
-        self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
-        self._asked: dict[tuple[str, frozenset[str]], _Launch] = {}
+        self._launchers: dict[tuple[str, frozenset[str]], Launcher] = {}
+        self._asked: dict[tuple[str, frozenset[str]], Launcher] = {}
 
     def upload(self, array: np.ndarray, out: wp.array | None = None, *, wait: bool = True) -> wp.array:
         """See Backend.upload."""
@@ -143,7 +153,7 @@ class WarpBackend(ProcessBound):
         if self._device.is_cuda:
             wp.synchronize_stream(self._device)
 
-    def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> _Launch:
+    def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launcher:
         group = row.group if self._device.is_cuda else 1
         with _settings():
             made = warp_module(row.file).make(kernel, flags)
@@ -151,7 +161,10 @@ class WarpBackend(ProcessBound):
                 wp.load_module(made.module, device=self._device, block_dim=group)
             except Exception as error:
                 raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
-        return _Launch(self._device, made, row, group)
+        launch = _Launch(self._device, made, row, group)
+        if self._device.is_cuda or _threads() == 1 or not _independent(row):
+            return launch
+        return _Pieces(launch, row)
 
 
 class _Launch:
@@ -186,6 +199,118 @@ class _Launch:
                     command.set_param_at_index(i, self._binds[i](arguments[i]))
         command.launch()
         self._thread.recorded = (command, size, keys)
+
+
+def _per_particle(argument: Argument) -> bool:
+    """Whether an argument has one row a particle."""
+    return argument.shape is not None and argument.shape.split(" ")[0] == "particles"
+
+
+def _independent(row: Kernel) -> bool:
+    """Whether a kernel writes to nothing but the rows of its own particles."""
+    outputs = [argument for argument in row.arguments if argument.output]
+    return "particle" in row.launch and all(_per_particle(argument) for argument in outputs)
+
+
+@functools.cache
+def _threads() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
+    """The threads of a process, all launches'; the calling thread works as well."""
+    return concurrent.futures.ThreadPoolExecutor(_threads() - 1, "gpusense")
+
+
+class _Pieces:
+    """A launch over particles, cut into pieces that several threads take one after the other."""
+
+    def __init__(self, launch: _Launch, row: Kernel) -> None:
+        self._launch, self._row = launch, row
+        self._axis = row.launch.index("particle")
+        self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == "particles")
+        self._work = [i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings")]
+
+    def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
+        particles = size[self._axis]
+        work = particles * max((int(arguments[i]) for i in self._work), default=1)
+        count = min(_PIECES * _threads(), work // _PIECE_WORK, particles)
+        if count < 2:
+            self._launch(size, *arguments)
+            return
+        step = -(-particles // count)
+        rows = self._rows(arguments)
+        begins = iter(range(0, particles, step))
+        lock = threading.Lock()
+
+        def pieces() -> None:
+            while True:
+                with lock:
+                    begin = next(begins, None)
+                if begin is None:
+                    return
+                count = min(step, particles - begin)
+                self._launch(
+                    (*size[: self._axis], count, *size[self._axis + 1 :]), *self._piece(arguments, rows, begin, count)
+                )
+
+        helpers = []
+        # Where there are no more threads to be had, those that there are do the work.
+        with contextlib.suppress(RuntimeError):
+            for _ in range(min(_threads(), count) - 1):
+                helpers.append(_pool(os.getpid()).submit(pieces))
+        try:
+            pieces()
+        finally:
+            # Whatever happened, nobody may still write when this returns: what has not begun never does.
+            with lock:
+                begins = iter(())
+            _finish(helpers)
+        for helper in helpers:
+            if not helper.cancelled():
+                helper.result()
+
+    def _rows(self, arguments: tuple[Any, ...]) -> list[tuple[int, int]]:
+        """The arrays that hold something of every particle, and how many numbers of each."""
+        named = {argument.name: value for argument, value in zip(self._row.arguments, arguments, strict=True)}
+        found = []
+        for i, argument in enumerate(self._row.arguments):
+            if argument.shape is not None and _per_particle(argument):
+                factors = argument.shape.split(" * ")[1:]
+                each = math.prod(int(factor) if factor.isdigit() else int(named[factor]) for factor in factors)
+                if arguments[i].size >= argument.width * each * arguments[self._count]:
+                    found.append((i, argument.width * each))
+        return found
+
+    def _piece(self, arguments: tuple[Any, ...], rows: list[tuple[int, int]], begin: int, count: int) -> list[Any]:
+        """The arguments of a launch of some particles."""
+        cut = list(arguments)
+        cut[self._count] = count
+        for i, each in rows:
+            cut[i] = _slice(arguments[i], begin * each, count * each)
+        return cut
+
+
+def _finish(helpers: list[concurrent.futures.Future[None]]) -> None:
+    """Wait for all helpers, interrupted or not; those that have not begun are cancelled."""
+    interrupted: BaseException | None = None
+    for helper in helpers:
+        helper.cancel()
+    while any(not helper.done() for helper in helpers):
+        try:
+            concurrent.futures.wait(helpers)
+        except KeyboardInterrupt as error:
+            interrupted = error
+    if interrupted is not None:
+        raise interrupted
+
+
+def _slice(buffer: wp.array, begin: int, count: int) -> wp.array:
+    """Numbers of a buffer, without a copy; the caller keeps it alive."""
+    start = buffer.ptr + begin * wp.types.type_size_in_bytes(buffer.dtype)
+    return wp.array(ptr=start, dtype=buffer.dtype, shape=(count,), device=buffer.device)
 
 
 def _binding(argument: Argument) -> Callable[[Any], Any]:

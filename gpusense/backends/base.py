@@ -28,7 +28,7 @@ class BackendInfo:
         memory: Bytes of device memory.
         max_buffer: Bytes of the largest buffer.
         float64: Whether float64 kernels exist on it.
-        lanes: How many particles or beams a work-item should compute at once; 1 leaves that to the compiler.
+        lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
     """
 
     selection: str

@@ -1,27 +1,31 @@
-// Several particles or beams at once in one work-item, in vector types, for processors whose compilers do not make such
-// code of scalar kernels. The width is the device's. float32 only.
+// 16 particles or beams at once in one work-item, in vector types, for processors whose compilers do not make such code of
+// scalar kernels. Where the processor's vectors are shorter, two of them wait for memory side by side. float32 only.
+// PoCL calls any, fabs, fmax, min and max as functions, which an inner loop cannot bear: comparisons and masks stand there.
 
 #if WIDE
-#if LANES_16
 typedef float16 lanes;
 typedef int16 ilanes;
 #define LANES 16
 #define to_lanes convert_float16
 #define to_ilanes convert_int16_rtz
+#define as_ilanes as_int16
 #define load_lanes vload16
 #define store_lanes vstore16
 #define GATHER(type, table, i)                                                                                           \
     ((type)(table[i.s0], table[i.s1], table[i.s2], table[i.s3], table[i.s4], table[i.s5], table[i.s6], table[i.s7],      \
             table[i.s8], table[i.s9], table[i.sa], table[i.sb], table[i.sc], table[i.sd], table[i.se], table[i.sf]))
-#else
-typedef float8 lanes;
-typedef int8 ilanes;
-#define LANES 8
-#define to_lanes convert_float8
-#define to_ilanes convert_int8_rtz
-#define load_lanes vload8
-#define store_lanes vstore8
-#define GATHER(type, table, i)                                                                                           \
-    ((type)(table[i.s0], table[i.s1], table[i.s2], table[i.s3], table[i.s4], table[i.s5], table[i.s6], table[i.s7]))
-#endif
+// The same with indices in memory, which is faster where they are computed well before.
+#define GATHER_AT(type, table, i)                                                                                        \
+    ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]],      \
+            table[i[8]], table[i[9]], table[i[10]], table[i[11]], table[i[12]], table[i[13]], table[i[14]], table[i[15]]))
+
+// Whether a comparison holds in any lane.
+int some(const ilanes holds) {
+    const int8 eight = holds.lo | holds.hi;
+    const long2 two = as_long2(eight.lo | eight.hi);
+    return (two.x | two.y) != 0;
+}
+
+// Bits of the sizes of numbers, which have the order of the sizes.
+ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
 #endif

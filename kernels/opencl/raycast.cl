@@ -92,8 +92,8 @@ lanes cast_rays(global const entry *map_table, const int rows, const int cols, c
     for (;;) {
         const ilanes at = going ? origin + step_x * to_ilanes(k_x) + step_y * to_ilanes(k_y) : (ilanes)0;
         const ilanes sides = GATHER(ilanes, map_table, at);
-        const ilanes stopped = going && sides == 0;
-        if (any(stopped)) {
+        const ilanes stopped = going & (sides == 0);
+        if (some(stopped)) {
 #if OUTSIDE_OCCUPIED
             found = stopped ? t : found;
 #else
@@ -101,19 +101,19 @@ lanes cast_rays(global const entry *map_table, const int rows, const int cols, c
             const ilanes col = cell.x + (right ? x : -x), row = cell.y + (up ? y : -y);
             found = stopped && col >= 0 && col < cols && row >= 0 && row < rows ? t : found;
 #endif
-            going = going && sides != 0;
-            if (!any(going)) return found;
+            going &= sides != 0;
+            if (!some(going)) return found;
         }
         const lanes far_x = k_x + to_lanes((sides & 255) - 1), far_y = k_y + to_lanes((sides >> 8) - 1);
         const lanes t_x = (far_x + a_x) * inv_x, t_y = (far_y + a_y) * inv_y;
         const ilanes by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
-        going = going && t < limit;
-        if (!any(going)) return found;
+        going &= t < limit;
+        if (!some(going)) return found;
         const lanes a = by_x ? a_y : a_x, inv = by_x ? inv_y : inv_x;
         const lanes place = ((t * (by_x ? speed_y : speed_x) - a) + ROUNDING) - ROUNDING;
         const lanes k = place > 0 ? place : (lanes)0, here = (k + a) * inv;
-        const ilanes more = by_x ? here < t : here <= t;
+        const ilanes more = (here < t) | (~by_x & (here == t));
         const lanes aside = more ? k + 1 : k;
         k_x = by_x ? far_x + 1 : aside;
         k_y = by_x ? aside : far_y + 1;

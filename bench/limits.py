@@ -15,7 +15,6 @@ import argparse
 import json
 import shlex
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -124,14 +123,15 @@ def measure(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
         for kind in (gs.LikelihoodFieldModel, gs.BeamModel):
             name = "beam model" if kind is gs.BeamModel else "field"
             model, readings, poses = kind(grid, small, backend=device), scan(small), clouds["tracking"](count)
-            bench.add(f"{name}, tracking, {count} x 60", count * 60, lambda m=model, p=poses, r=readings: m.log_likelihood(p, r))
+            what = f"{name}, tracking, {count} x 60"
+            bench.add(what, count * 60, lambda m=model, p=poses, r=readings: m.log_likelihood(p, r))
             if device.info.backend == "warp" and device.info.kind == "gpu":
                 import warp as wp
 
                 there = wp.array(poses, dtype=wp.float64, device=device.info.selection.removeprefix("warp:"))
                 out = wp.empty(count, dtype=wp.float32, device=there.device)
                 bench.add(
-                    f"{name}, tracking, {count} x 60, poses and result on the device", count * 60,
+                    f"{what}, poses and result on the device", count * 60,
                     lambda m=model, p=there, r=readings, o=out: m.log_likelihood(p, r, out=o),
                 )  # fmt: skip
     for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
@@ -158,7 +158,7 @@ def measure(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", action="append", required=True, help="selection string; may be given more than once")
+    parser.add_argument("--backend", action="append", required=True, help="selection string; more than once for more")
     parser.add_argument("--particles", type=int, default=4096)
     parser.add_argument("--beams", type=int, default=360)
     parser.add_argument("--map", type=Path, help="a map_server YAML instead of the built-in building")

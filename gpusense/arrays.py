@@ -132,7 +132,8 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, given: object
         found = to_host(out)
         if not isinstance(found, np.ndarray):
             raise TypeError(f"out: must be an array, got {show(out)}")
-        dtype, contiguous, writeable, found_shape = found.dtype, found.flags.c_contiguous, found.flags.writeable, found.shape
+        dtype, found_shape = found.dtype, found.shape
+        contiguous, writeable = found.flags.c_contiguous, found.flags.writeable
     if dtype != real:
         raise TypeError(f"out: must hold {real.name}, got {dtype.name}")
     if tuple(found_shape) != shape:

@@ -64,7 +64,7 @@ def _lanes(device: cl.Device) -> int:
     return 16 if device.native_vector_width_float >= 16 else 8
 
 
-class _Buffer(cl.Buffer):  # type: ignore[misc]
+class _Buffer(cl.Buffer):
     """A buffer that can be referred to without being kept alive."""
 
 
@@ -182,8 +182,8 @@ class _Launch:
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if float64 else np.float32)
         self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
-        # What the kernel has; most calls change a few of many arguments. Of buffers a weak reference, so that the memory
-        # of one that is given up is free, and another in its place is told from it.
+        # What the kernel has; most calls change a few of many arguments. Of buffers a weak reference, so that one that is
+        # given up is free, and another in its place is told from it.
         self._bound: list[Any] = [_nothing] * len(self._scalars)
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:

@@ -152,8 +152,8 @@ class RayCaster:
         """Expected ranges.
 
         Args:
-            poses: (N, 3) ray origins and headings in the world [m, m, rad]. Arrays of other libraries are used where they
-                are, and ranges come back in the same library; see ``BeamModel.log_likelihood``.
+            poses: (N, 3) ray origins and headings in the world [m, m, rad]. Arrays of other libraries are used where
+                they are, and ranges come back in the same library; see ``BeamModel.log_likelihood``.
             bearings: (K,) directions relative to the heading [rad].
             out: Where to write the ranges: (N, K) in the caster's precision, C-contiguous, where the poses are.
 

@@ -219,8 +219,8 @@ class LikelihoodFieldModel(ScanModel):
                 parts = space.empty("parts", count * blocks, real)
                 spread = spread_of(count, blocks)
                 backend.compile("field_blocks", flags)(
-                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, parts, region.rows, region.cols, count, readings,
-                    guard, 1, count, spread,
+                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, parts, region.rows, region.cols, count,
+                    readings, guard, 1, count, spread,
                 )  # fmt: skip
                 backend.compile("sum_parts", flags)(
                     (count,), parts, self._none, result, count, blocks, 1, 1, count, *scalars

@@ -253,7 +253,7 @@ class ScanModel(ABC):
         scans = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), self.scanner)
         single = scans.ndim == 1
         clouds = [Cloud(poses, backend)] if single else clouds_of(poses, len(scans), backend)
-        count = clouds[0].count if clouds else np.shape(poses)[1]
+        count = clouds[0].count if clouds else np.asarray(poses).shape[1]
         shape = (count,) if single else (len(scans), count)
         given = arrays.check_out(out, shape, self._real, poses, backend)
         flat: Any
@@ -309,7 +309,8 @@ class ScanModel(ABC):
             return
         launch = self._prepare_launch(scan)
         space, backend = self._workspace, self._backend
-        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize if per_beam or backend.info.kind == "gpu" else 0)
+        several = per_beam or backend.info.kind == "gpu"
+        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize if several else 0)
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:

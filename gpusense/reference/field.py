@@ -220,8 +220,8 @@ def field_blocks(
     """Sums of blocks of readings, at parts[n * across + block * along], which GPUs find one by one."""
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_field(
-        flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms, np.empty(particles, pose.dtype),
-        each, rows, cols, particles, readings, guard, real(0), real(1),
+        flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms,
+        np.empty(particles, pose.dtype), each, rows, cols, particles, readings, guard, real(0), real(1),
     )  # fmt: skip
     each = each.reshape(particles, readings)
     for block, first in enumerate(range(0, readings, BLOCK_TERMS)):

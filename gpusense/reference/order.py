@@ -28,7 +28,7 @@ def relative_turn(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
 def order_bounds(
     flags: frozenset[str], pose_cell: np.ndarray, pose: np.ndarray, bounds: np.ndarray, bins: np.ndarray, particles: int
 ) -> None:
-    """Empty the bins. bounds become the largest of minus the smallest and the largest row, column and heading, and 0."""
+    """Empty the bins; bounds become the largest of minus the smallest and the largest row, column and heading."""
     bins[:ALL_BINS] = 0
     some = np.arange(SAMPLES) * particles // SAMPLES
     turn = relative_turn(pose[some], pose[0])

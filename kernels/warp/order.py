@@ -1,5 +1,5 @@
-"""An order of particles in which neighbours have much the same position and heading: then their rays meet the same cells,
-and none waits long for another. Which order it is changes no result.
+"""An order of particles in which neighbours have much the same position and heading: then their rays meet the same
+cells, and none waits long for another. Which order it is changes no result.
 """
 
 import functools

@@ -1,6 +1,6 @@
-"""Work-items for GPUs: a work-group takes a tile of neighbouring particles and rays, so that its rays take much the same
-way. With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays: few particles fill a device,
-too. Particles come in the order of the kernel file order where that was made.
+"""Work-items for GPUs: a work-group takes a tile of neighbouring particles and rays, so that its rays take much the
+same way. With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays: few particles fill a
+device, too. Particles come in the order of the kernel file order where that was made.
 """
 
 import warp as wp

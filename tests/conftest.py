@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,20 @@ def on_every_backend(*, on_warp: Callable[..., bool], **cases: Iterable[object])
 def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backend:
     """The backend of each kernel language in turn."""
     return get_backend(needs(request.param))
+
+
+@pytest.fixture
+def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
+    """Each tested backend in turn; called with True it pretends to be a GPU, with False it is itself again."""
+    device = get_backend(backend)
+    before = device.info
+
+    def pretend(gpu: bool = True) -> Backend:
+        device.info = dataclasses.replace(before, kind="gpu", lanes=1) if gpu else before
+        return device
+
+    yield pretend
+    device.info = before
 
 
 @pytest.fixture(scope="session")

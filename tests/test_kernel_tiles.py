@@ -1,0 +1,277 @@
+"""Kernels for GPUs agree with the reference: tiles of particles and rays, and sums of their parts."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from kernel_scenes import (
+    EXACT,
+    GRIDS,
+    LIMIT,
+    PRECISIONS,
+    RESOLUTION,
+    SECTORS,
+    adversarial_poses,
+    assert_near,
+    directions,
+    on_both,
+    planes_of,
+    run,
+    scene_flags,
+    sector_flags,
+)
+from test_kernel_scores import FIELDS, MIXTURES, field_scene, mixture, scan
+
+from gpusense.backends import Backend, get_backend
+from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.tiles import TILE, TILE_PARTICLES
+from gpusense.tolerances import differing, per_beam
+
+SPREADS = range(6)
+COUNTS = (1, 15, 16, 17, 777)
+RAYS = (1, 3, 4, 5, 53)
+WAYS = ("particles", "readings", "gaps")
+OCCUPIED = GRIDS["rooms"]
+RANGE = LIMIT * RESOLUTION
+
+
+def items(count: int, spread: int, group: int = TILE_PARTICLES, each: int = TILE) -> tuple[int]:
+    """The size of a launch whose groups have so many particles and work-items each."""
+    return ((-(-count // group) << spread) * each,)
+
+
+def poses(count: int, real: type) -> tuple[np.ndarray, np.ndarray]:
+    cell, pose = adversarial_poses(OCCUPIED, real, outside=True)
+    some = np.resize(np.arange(len(cell)), count)
+    return cell[some], pose[some]
+
+
+def rays_of(count: int, real: type) -> np.ndarray:
+    return np.resize(directions(real), (count, 2))
+
+
+def an_order(count: int) -> np.ndarray:
+    return np.random.default_rng(count).permutation(count).astype(np.int32)
+
+
+def strides(count: int, each: int, way: str) -> tuple[int, int]:
+    """(across, along): parts of a particle, or of a reading, lie together; or with gaps between them."""
+    return {"particles": (1, count), "readings": (each, 1), "gaps": (2 * each + 3, 2)}[way]
+
+
+def parts_at(parts: np.ndarray, count: int, each: int, way: str) -> np.ndarray:
+    across, along = strides(count, each, way)
+    return parts[np.arange(count)[:, None] * across + np.arange(each) * along]
+
+
+def room_for(count: int, each: int, way: str, real: type) -> np.ndarray:
+    across, along = strides(count, each, way)
+    return np.full(max(count * across + each * along, 1), -77, real)
+
+
+# ---- ranges
+
+
+def cast_tiles(device: Backend, real: type, count: int, rays: int, spread: int, names: tuple[str, ...] = ()) -> Any:
+    """Ranges of the reference's cast_ranges and of a device's cast_tiles."""
+    (cell, pose), ray = poses(count, real), rays_of(rays, real)
+    order = an_order(count) if "ORDERED" in names else np.zeros(1, np.int32)
+    flags = scene_flags(real, "ORIGINS_OUTSIDE", *names)
+    ranges = np.full((count, rays), np.nan, real)
+    rest = (*OCCUPIED.shape, count, rays, *EXACT, LIMIT, RESOLUTION, RANGE)
+    planes, numpy = planes_of(OCCUPIED), get_backend("numpy")
+    expected = run(numpy, "cast_ranges", flags, (rays, count), planes, cell, pose, ray, ranges, *rest)["ranges"]
+    found = [
+        run(one, "cast_tiles", flags, items(count, spread), planes, cell, pose, order, ray, ranges, *rest, spread)
+        for one in (numpy, device)
+    ]
+    assert differing(found[0]["ranges"], expected) == 0
+    return found[1]["ranges"], expected
+
+
+@pytest.mark.parametrize("names", [(), ("ORDERED",)])
+@pytest.mark.parametrize("count", COUNTS)
+def test_tiles_of_ranges(count: int, names: tuple[str, ...], device: Backend) -> None:
+    for rays, spread in itertools.product(RAYS, SPREADS):
+        found, expected = cast_tiles(device, np.float32, count, rays, spread, names)
+        assert differing(found, expected) == 0
+
+
+@pytest.mark.parametrize("spread", SPREADS)
+def test_tiles_of_ranges_in_float64(spread: int, device: Backend) -> None:
+    found, expected = cast_tiles(device, np.float64, 37, 53, spread, ("ORDERED",))
+    assert differing(found, expected) == 0
+
+
+@pytest.mark.parametrize("sectors", SECTORS)
+def test_tiles_of_ranges_in_sectors(sectors: int, device: Backend) -> None:
+    real, count, rays = np.float32, 777, 53
+    (cell, pose), ray = poses(count, real), rays_of(rays, real)
+    ranges, none = np.full((count, rays), np.nan, real), np.zeros(1, np.int32)
+    rest = (ray, ranges, *OCCUPIED.shape, count, rays, *EXACT, LIMIT, RESOLUTION, RANGE)
+    flags, numpy = scene_flags(real, "ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"), get_backend("numpy")
+    expected = run(numpy, "cast_ranges", flags, (rays, count), planes_of(OCCUPIED), cell, pose, *rest)
+    flags |= sector_flags(sectors)
+    planes = planes_of(OCCUPIED, sectors, "gpu")
+    found = run(device, "cast_tiles", flags, items(count, 1), planes, cell, pose, none, *rest, 1)
+    assert differing(found["ranges"], expected["ranges"]) == 0
+
+
+def test_launches_of_no_particles_write_nothing(device: Backend) -> None:
+    (cell, pose), ranges, none = poses(1, np.float32), np.full(8, 5, np.float32), np.zeros(1, np.int32)
+    found = run(
+        device, "cast_tiles", scene_flags(np.float32), (TILE,), planes_of(OCCUPIED), cell, pose, none,
+        rays_of(4, np.float32), ranges, *OCCUPIED.shape, 0, 4, *EXACT, LIMIT, RESOLUTION, RANGE, 0,
+    )  # fmt: skip
+    assert (found["ranges"] == 5).all()
+
+
+# ---- the beam model
+
+
+def beam_tiles(
+    device: Backend, name: str, real: type, count: int, rays: int, spread: int, way: str, names: tuple[str, ...] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """What each reading adds, in the order's places, by a device's tiles and by the reference."""
+    (cell, pose), ray = poses(count, real), rays_of(rays, real)
+    flags, terms = mixture(name, real, z_max=0.05)
+    flags = scene_flags(real, "ORIGINS_OUTSIDE", *flags, *names)
+    repeats = np.full(rays, 1)
+    if "SHARED_RAYS" in names:
+        repeats[::3], repeats[1::5] = 3, 0
+    first = np.append(0, np.cumsum(repeats)).astype(np.int32)
+    reading = scan(np.linspace(0, RANGE, first[-1]), real, all_readings="ALL_READINGS" in names)
+    readings, order = len(reading), an_order(count)
+    expected, found = on_both(
+        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), cell, pose, order, ray, first, reading,
+        terms, np.zeros(1, real), room_for(count, readings, way, real), *OCCUPIED.shape, count, rays, readings, *EXACT,
+        0, 0.0, LIMIT, RESOLUTION, RANGE, *strides(count, readings, way), spread,
+    )  # fmt: skip
+    untouched = np.count_nonzero(expected["parts"] == -77)
+    assert np.count_nonzero(found["parts"] == -77) == untouched
+    return parts_at(found["parts"], count, readings, way), parts_at(expected["parts"], count, readings, way)
+
+
+@pytest.mark.parametrize("names", [(), ("ORDERED",)])
+@pytest.mark.parametrize("way", WAYS)
+def test_tiles_of_beams(way: str, names: tuple[str, ...], device: Backend) -> None:
+    for count, rays, spread in itertools.product((1, 17), RAYS, SPREADS):
+        found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, way, names)
+        assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, np.float32))
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+@pytest.mark.parametrize("names", [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")])
+@pytest.mark.parametrize("name", ["book", "hit", "short", "hardly any rand"])
+def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
+    assert name in MIXTURES
+    found, expected = beam_tiles(device, name, real, 777, 53, 2, "particles", names)
+    assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, real))
+
+
+# ---- sums
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+@pytest.mark.parametrize("names", [(), ("ORDERED",), ("CUBES",)])
+@pytest.mark.parametrize("way", WAYS)
+def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Backend) -> None:
+    sizes = ((1, 1), (17, BLOCK_TERMS), (777, BLOCK_TERMS))
+    for each, (count, block) in itertools.product((0, 1, 15, 16, 17, 53), sizes):
+        rng = np.random.default_rng([count, each])
+        parts = room_for(count, each, way, real)
+        parts[:] = rng.uniform(0.1, 3, parts.size) if "CUBES" in names else rng.normal(-3, 9, parts.size)
+        if "CUBES" not in names and each:
+            parts[:: 3 * each] = -np.inf
+        reference, found = on_both(
+            device, "sum_parts", scene_flags(real, *names), (count,), parts, an_order(count),
+            np.full(count, 77, real), count, each, block, *strides(count, each, way), 1.25, 0.75,
+        )  # fmt: skip
+        if "CUBES" in names:
+            eps = np.finfo(real).eps
+            np.testing.assert_allclose(found["log_p"], reference["log_p"], rtol=4 * eps, atol=4 * eps)
+        else:
+            assert differing(found["log_p"], reference["log_p"]) == 0
+        order = an_order(count) if "ORDERED" in names else np.arange(count)
+        own = parts_at(parts, count, each, way).astype(np.float64)
+        truth = own.sum(axis=1) + 1.25
+        truth = 0.75 * (np.log(truth) if "CUBES" in names else truth)
+        np.testing.assert_allclose(found["log_p"][order], truth, rtol=2e-5, atol=2e-4)
+
+
+# ---- the likelihood field
+
+CAREFUL = [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")]
+# float64 needs no second look.
+BLOCKED = [*itertools.product(FIELDS, CAREFUL, PRECISIONS), ("log table", ("CAREFUL", "QUICK"), np.float32)]
+
+
+def field_blocks(
+    device: Backend, name: str, real: type, names: tuple[str, ...], spread: int, way: str, readings: int, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums of blocks by a device and by the reference, and the reference's blocks of magnitudes."""
+    flags = scene_flags(real, *FIELDS[name], *names)
+    scene = field_scene(name, real, all_readings="ALL_READINGS" in names)
+    some = np.resize(np.arange(150), count)
+    scene |= {key: scene[key][some] for key in ("pose_cell", "pose", "pose_low")}
+    scene |= {key: scene[key][:readings] for key in ("point", "point_low")}
+    (rows, cols), blocks = scene["table"].shape, -(-readings // BLOCK_TERMS)
+    finite = scene["point"][np.isfinite(scene["point"])]
+    guard = 8 * np.finfo(real).eps * (np.abs(finite).max(initial=0.0) + 2)
+    given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
+    sizes = (rows - 4, cols - 4, count, readings, guard)
+    reference, found = on_both(
+        device, "field_blocks", flags, items(count, spread, 64, 64), *given, room_for(count, blocks, way, real), *sizes,
+        *strides(count, blocks, way), spread,
+    )  # fmt: skip
+    untouched = np.count_nonzero(reference["parts"] == -77)
+    assert np.count_nonzero(found["parts"] == -77) == untouched
+    flags |= {"PER_BEAM"}
+    parts = np.empty((count, readings), real)
+    log_p = np.empty(count, real)
+    numpy = get_backend("numpy")
+    parts = run(numpy, "score_field", flags, (count,), *given, log_p, parts, *sizes, 0.0, 1.0)["parts"]
+    bound = 2 * per_beam(parts, real) + 16 * np.finfo(real).eps * np.abs(np.where(np.isfinite(parts), parts, 0))
+    bound = np.stack([bound[:, i : i + BLOCK_TERMS].sum(axis=1) for i in range(0, readings, BLOCK_TERMS)], axis=1)
+    return parts_at(found["parts"], count, blocks, way), parts_at(reference["parts"], count, blocks, way), bound
+
+
+@pytest.mark.parametrize(("name", "names", "real"), BLOCKED)
+def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
+    found, expected, bound = field_blocks(device, name, real, names, 1, "particles", 77, 150)
+    if name == "log table":
+        assert differing(found, expected) == 0
+    assert_near(found, expected.astype(np.float64), bound)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("names", [("CAREFUL",), ("CAREFUL", "QUICK")])
+def test_blocks_of_fields(names: tuple[str, ...], way: str, device: Backend) -> None:
+    for count, readings, spread in itertools.product((1, 64, 65), (1, 16, 17, 53), SPREADS):
+        found, expected, _ = field_blocks(device, "log table", np.float32, names, spread, way, readings, count)
+        assert differing(found, expected) == 0
+
+
+@pytest.mark.parametrize("readings", [16, 53])
+def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
+    rng = np.random.default_rng(31)
+    scene = field_scene("log table", np.float32, all_readings=False)
+    count, (rows, cols) = 150, OCCUPIED.shape
+    angle = rng.uniform(-4, 4, readings)
+    point = np.round(rng.uniform(0, 12, (readings, 1)) * 4) / 4 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    scene["pose_cell"] = rng.integers((14, 14), (cols - 14, rows - 14), (count, 2)).astype(np.int32)
+    high = point.astype(np.float32)
+    given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low")]
+    given += [high, (point - high).astype(np.float32), scene["terms"]]
+    blocks, found = -(-readings // BLOCK_TERMS), []
+    for names in (("CAREFUL",), ("CAREFUL", "QUICK"), ("CAREFUL", "QUICK", "INSIDE")):
+        flags = scene_flags(np.float32, *FIELDS["log table"], *names)
+        both = on_both(
+            device, "field_blocks", flags, items(count, 0, 64, 64), *given, np.empty(count * blocks, np.float32), rows,
+            cols, count, readings, 8 * np.finfo(np.float32).eps * 14, 1, count, 0,
+        )  # fmt: skip
+        found += [one["parts"] for one in both]
+    assert all(differing(one, found[0]) == 0 for one in found)

@@ -95,11 +95,19 @@ def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int
     return found.flatten(), found.shape[0], found.dtype == wp.float32
 
 
+def blank(backend: Backend, count: int, real: np.dtype) -> Buffer:
+    """A buffer for a result of exactly so many numbers, or none."""
+    buffer = backend.empty(count, real)
+    return buffer if count else backend.part(buffer, 0, 0)
+
+
 def result_for(given: object, buffer: Buffer) -> object:
     """A result on the device as an array of the library that the poses came from."""
     library = sys.modules.get(type(given).__module__.partition(".")[0])
-    if library is None or library.__name__ == "warp":
+    if library is None:
         return buffer
+    if library.__name__ == "warp":
+        return library.array(buffer, copy=False, device="cpu") if isinstance(buffer, np.ndarray) else buffer
     if library.__name__.startswith("jax"):
         library = sys.modules["jax.numpy"]
     convert = getattr(library, "from_dlpack", None)
@@ -132,6 +140,10 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, given: object
         found = to_host(out)
         if not isinstance(found, np.ndarray):
             raise TypeError(f"out: must be an array, got {show(out)}")
+        if not found.flags.writeable and found is not out:
+            # Exporters of the first DLPack cannot say that memory may be written; NumPy's own protocols can.
+            plain = np.asarray(out)
+            found = plain if plain.ctypes.data == found.ctypes.data else found
         dtype, found_shape = found.dtype, found.shape
         contiguous, writeable = found.flags.c_contiguous, found.flags.writeable
     if dtype != real:

@@ -44,7 +44,7 @@ class Workspace:
         self._backend.synchronize()
         self._busy.clear()
 
-    def release(self) -> None:
-        """Wait, and give the memory back; the next call allocates anew."""
+    def release(self, keep: str = "") -> None:
+        """Wait, and give the memory back, but for that of one name; the next call allocates anew."""
         self.wait()
-        self._buffers.clear()
+        self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}

@@ -258,7 +258,7 @@ class MapCaster:
         given = arrays.check_out(out, (cloud.count, rays), self.real, poses, self.backend)
         ranges: Any
         if cloud.on_device:
-            ranges = self.backend.empty(cloud.count * rays, self.real) if given is None else given
+            ranges = arrays.blank(self.backend, cloud.count * rays, self.real) if given is None else given
         else:
             ranges = np.empty((cloud.count, rays), self.real) if given is None else given
         if cloud.count * rays:

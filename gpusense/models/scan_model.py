@@ -19,6 +19,7 @@ from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import TableMemoryError
 from gpusense.plan import Omission, Plan, share
+from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
 from gpusense.scanner import Scanner
 from gpusense.workspace import Workspace
@@ -145,10 +146,12 @@ def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, 
             workspace.release()
             raise
         except MemoryError:
-            workspace.release()
             tried = min(chunk, count - begin)
             if tried <= SMALLEST_CHUNK:
+                workspace.release()
                 raise
+            # What is known of the poses of earlier pieces stays.
+            workspace.release(keep="verdict")
             chunk = max(tried // 2, SMALLEST_CHUNK)
 
 
@@ -253,16 +256,16 @@ class ScanModel(ABC):
         scans = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), self.scanner)
         single = scans.ndim == 1
         clouds = [Cloud(poses, backend)] if single else clouds_of(poses, len(scans), backend)
-        count = clouds[0].count if clouds else np.asarray(poses).shape[1]
+        count = clouds[0].count if clouds else np.shape(poses)[1]  # type: ignore[arg-type]
         shape = (count,) if single else (len(scans), count)
         given = arrays.check_out(out, shape, self._real, poses, backend)
         flat: Any
         if arrays.on_device(poses):
-            flat = backend.empty(math.prod(shape), self._real) if given is None else given
+            flat = arrays.blank(backend, math.prod(shape), self._real) if given is None else given
         else:
             flat = (np.empty(shape, self._real) if given is None else given).reshape(-1)
         parts = np.zeros((*shape, self.scanner.count if per_beam else 0), self._real)
-        each_parts = parts.reshape(len(clouds), count, -1) if clouds else parts
+        each_parts = parts.reshape(len(clouds), count, parts.shape[-1])
         with self._lock:
             for i, cloud in enumerate(clouds):
                 own = (i * count, (i + 1) * count)
@@ -299,10 +302,12 @@ class ScanModel(ABC):
         if len(scan.readings) == 0:
             with np.errstate(divide="ignore"):
                 self._fill(log_p, self.temperature * (scan.constant if self._peer is None else np.log(self._lead)))
+            self._look_at(cloud)
             return
         hits = scan.columns[np.isfinite(scan.readings)] if self._peer is None and self._impossible() else ()
         if len(hits):
             self._fill(log_p, -np.inf)
+            self._look_at(cloud)
             if per_beam:
                 parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)
                 parts[:, hits] = -np.inf
@@ -325,6 +330,12 @@ class ScanModel(ABC):
                 parts[begin:end, scan.columns] = backend.download(each, np.empty(shape, self._real))
 
         in_chunks(cloud.count, chunk, space, run)
+
+    def _look_at(self, cloud: Cloud) -> None:
+        """Place poses on the device for nothing but to learn whether they are finite."""
+        if cloud.on_device and cloud.count:
+            frame = (Region(0, 0, *self.grid.shape), self.grid, self.scanner.mount)
+            cloud.place(self._backend, self._workspace, (0, cloud.count), frame, self._real, careful=False)
 
     def _fill(self, log_p: Any, value: float) -> None:
         if isinstance(log_p, np.ndarray):

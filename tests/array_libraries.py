@@ -1,0 +1,54 @@
+"""A library of arrays that is none: what it exports and imports is NumPy's or Warp's."""
+
+from __future__ import annotations
+
+import sys
+import types
+from typing import Any
+
+import numpy as np
+
+CPU, CUDA = 1, 2
+
+
+class Array:
+    """Delegates DLPack to another array; ``device`` is what it says of its memory."""
+
+    def __init__(self, held: Any, device: int = CPU) -> None:
+        self.held, self.device = held, device
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.held.shape)
+
+    def __getitem__(self, i: int) -> Array:
+        return Array(self.held[i], self.device)
+
+    def __dlpack__(self, **options: Any) -> Any:
+        return self.held.__dlpack__(**options)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return self.device, 0
+
+
+class OldArray(Array):
+    """One of the first version, which cannot say whether memory may be written."""
+
+    def __dlpack__(self, stream: Any = None) -> Any:
+        return self.held.__dlpack__()
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        return self.held
+
+
+def from_dlpack(held: Any) -> Array:
+    return Array(held)
+
+
+def installed(monkeypatch: Any) -> None:
+    """The module ``fakelib`` with its ``from_dlpack`` and its arrays."""
+    module = types.ModuleType("fakelib")
+    module.from_dlpack, module.Array = from_dlpack, Array
+    monkeypatch.setitem(sys.modules, "fakelib", module)
+    monkeypatch.setattr(Array, "__module__", "fakelib")
+    monkeypatch.setattr(OldArray, "__module__", "fakelib")

@@ -197,7 +197,7 @@ def ordered(backend: Backend, space: Workspace, placed: Placed, count: int, rays
 
 
 # Work-items that fill any device, and the tiles of the kernel file ``tiles``.
-_ENOUGH = 1 << 19
+_ENOUGH = 1 << 21
 
 
 def spread_of(items: int, groups: int) -> int:

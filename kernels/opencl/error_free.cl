@@ -34,18 +34,12 @@ real2 pair_product(const real2 a, const real2 b) {
     return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x));
 }
 
-// Whole real numbers spare conversions: adding and taking off a large number rounds to nearest, and the bits of the sum
-// are those of the integer and a constant.
+// Adding and taking off this large number rounds to nearest.
 #if FLOAT64
 #define ROUNDING ((real)6755399441055744.0)
-#define WHOLE_ZERO 0u
-uint whole_bits(const real k) { return (uint)(int)k; }
 #else
 #define ROUNDING ((real)12582912)
-#define WHOLE_ZERO 0x4b400000u
-uint whole_bits(const real k) { return as_uint(k + ROUNDING); }
 #endif
-int whole_int(const real k) { return (int)(whole_bits(k) - WHOLE_ZERO); }
 
 // Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of
 // compensating every term, at nearly the cost of none.

@@ -39,33 +39,29 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
 #endif
 #endif
     const Walk start = start_walk(r, cell, rows, cols, limit);
-    // Boundaries crossed so far but one, as whole real numbers.
-    real k_x = (real)(start.k_x - 1), k_y = (real)(start.k_y - 1), t = start.t;
+    real k_x = (real)start.k_x, k_y = (real)start.k_y, t = start.t;
     if (t >= limit) return limit;
     const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
-    // An index is the sum of this, step_x k_x and step_y k_y, where the constants of the bits of k_x and k_y cancel.
-    const uint step_x = (uint)r.step_x, step_y = (uint)(r.up ? cols + 2 : -(cols + 2));
-    const uint origin = (uint)(plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols)) -
-                        (step_x + step_y) * (WHOLE_ZERO - 1u);
+    const int origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols);
+    const int step_y = r.step_y * (cols + 2);
     for (;;) {
-        const uint sides = map_table[origin + step_x * whole_bits(k_x) + step_y * whole_bits(k_y)];
+        const uint sides = map_table[origin + r.step_x * (int)k_x + step_y * (int)k_y];
         if (sides == 0) {
 #if OUTSIDE_OCCUPIED
             return t;
 #else
-            const int col = cell.x + r.step_x * (whole_int(k_x) + 1), row = cell.y + r.step_y * (whole_int(k_y) + 1);
+            const int col = cell.x + r.step_x * (int)k_x, row = cell.y + r.step_y * (int)k_y;
             return off_grid(col, row, rows, cols) ? limit : t;
 #endif
         }
-        const real far_x = k_x + (real)(int)(sides & 255), far_y = k_y + (real)(int)(sides >> 8);
+        const real far_x = k_x + (real)(int)((sides & 255) - 1), far_y = k_y + (real)(int)((sides >> 8) - 1);
         const real t_x = (far_x + r.a_x) * r.inv_x, t_y = (far_y + r.a_y) * r.inv_y;
         const int by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
         if (t >= limit) return limit;
-        const real speed = by_x ? r.speed_y : r.speed_x, a = by_x ? r.a_y : r.a_x, inv = by_x ? r.inv_y : r.inv_x;
-        const real aside = crossed(t, speed, a, inv, !by_x) - 1;
-        k_x = by_x ? far_x : aside;
-        k_y = by_x ? aside : far_y;
+        const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x, !by_x);
+        k_x = by_x ? far_x + 1 : aside;
+        k_y = by_x ? aside : far_y + 1;
     }
 }
 

@@ -33,18 +33,6 @@ def functions(flags):
     ZERO, ONE = real(0.0), real(1.0)
     FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
 
-    # Whole real numbers spare conversions: the bits of the sum with 1.5 * 2^23 are those of the integer and a constant.
-    FLOAT64 = "FLOAT64" in flags
-    ROUNDING = real(12582912.0)
-    LAST = wp.uint32(0xFFFFFFFF if FLOAT64 else 0x4B3FFFFF)
-
-    @wp.func
-    def whole_bits(k: real):
-        if FLOAT64:
-            return wp.uint32(int(k))
-        else:
-            return wp.cast(k + ROUNDING, wp.uint32)
-
     # Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
     @wp.func
     def sector_of(speed_x: real, speed_y: real):
@@ -76,29 +64,25 @@ def functions(flags):
             if off_grid(cell.x, cell.y, rows, cols):
                 return ZERO
         start = start_walk(r, cell, rows, cols, limit)
-        # Boundaries crossed so far but one, as whole real numbers.
-        k_x = real(start.k_x - 1)
-        k_y = real(start.k_y - 1)
+        k_x = real(start.k_x)
+        k_y = real(start.k_y)
         t = real(start.t)
         if t >= limit:
             return limit
         plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
-        # An index is the sum of this, step_x k_x and step_y k_y, where the constants of the bits of k_x and k_y cancel.
-        step_x = wp.uint32(r.step_x)
-        step_y = wp.uint32(wp.where(r.up, cols + 2, -(cols + 2)))
-        origin = wp.uint32(plane * (rows + 2) * (cols + 2) + padded(cell.y, cell.x, cols))
-        origin -= (step_x + step_y) * LAST
+        origin = plane * (rows + 2) * (cols + 2) + padded(cell.y, cell.x, cols)
+        step_y = r.step_y * (cols + 2)
         while True:
-            sides = int(map_table[int(origin + step_x * whole_bits(k_x) + step_y * whole_bits(k_y))])
+            sides = int(map_table[origin + r.step_x * int(k_x) + step_y * int(k_y)])
             if sides == 0:
                 if OUTSIDE_OCCUPIED:
                     return t
                 else:
-                    col = cell.x + r.step_x * (int(k_x) + 1)
-                    row = cell.y + r.step_y * (int(k_y) + 1)
+                    col = cell.x + r.step_x * int(k_x)
+                    row = cell.y + r.step_y * int(k_y)
                     return wp.where(off_grid(col, row, rows, cols), limit, t)
-            far_x = k_x + real(sides & 255)
-            far_y = k_y + real(sides >> 8)
+            far_x = k_x + real((sides & 255) - 1)
+            far_y = k_y + real((sides >> 8) - 1)
             t_x = (far_x + r.a_x) * r.inv_x
             t_y = (far_y + r.a_y) * r.inv_y
             by_x = t_x <= t_y
@@ -107,8 +91,8 @@ def functions(flags):
                 return limit
             speed = wp.where(by_x, r.speed_y, r.speed_x)
             a = wp.where(by_x, r.a_y, r.a_x)
-            aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x) - ONE
-            k_x = wp.where(by_x, far_x, aside)
-            k_y = wp.where(by_x, aside, far_y)
+            aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x)
+            k_x = wp.where(by_x, far_x + ONE, aside)
+            k_y = wp.where(by_x, aside, far_y + ONE)
 
     return SimpleNamespace(cast_ray=cast_ray)

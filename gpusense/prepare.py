@@ -100,7 +100,8 @@ def sectors_of(backend: Backend, rows: int, cols: int) -> int:
     GPUs gain most, since neighbouring rays wait for the slowest; kernels count cells of all planes in 32 bits.
     """
     wanted = {"gpu": 4, "cpu": 2}[backend.info.kind] if backend.info.backend != "numpy" else 1
-    while wanted > 1 and 4 * wanted * (rows + 4) * (cols + 4) >= 1 << 31:
+    planes = 4 * (rows + 4) * (cols + 4)
+    while wanted > 1 and (planes * wanted >= 1 << 31 or 2 * planes * wanted > backend.info.max_buffer):
         wanted //= 2
     return wanted
 

@@ -233,8 +233,9 @@ KERNELS: dict[str, Kernel] = {
     ),
     "field_blocks": _kernel(
         "field", "item", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]",
-        "out real parts [particles * readings]", *_MAP, "int particles", "int readings", "real guard", "int across", "int along", "int spread",
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "real guard [readings]",
+        "out real parts [particles * readings]", *_MAP, "int particles", "int readings", "int across", "int along",
+        "int spread",
     ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",

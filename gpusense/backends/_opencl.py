@@ -182,8 +182,8 @@ class _Launch:
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if float64 else np.float32)
         self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
-        # What the kernel has; most calls change a few of many arguments. Of buffers a weak reference, so that one that is
-        # given up is free, and another in its place is told from it.
+        # What the kernel has; most calls change a few of many arguments. Of buffers a weak reference, so that one that
+        # is given up is free, and another in its place is told from it.
         self._bound: list[Any] = [_nothing] * len(self._scalars)
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:

@@ -33,6 +33,8 @@ from gpusense.scanner import Scanner
 # The table's ring, and the work-group of ``field_blocks``: the kernel file ``field`` has the same numbers.
 _RING = 2
 _GROUP = 64
+# In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.
+_GUARD = 3.25
 
 
 class LikelihoodFieldModel(ScanModel):
@@ -197,7 +199,12 @@ class LikelihoodFieldModel(ScanModel):
         high[~finite] = cells[~finite, None]
         point, point_low = space.upload("point", high), space.upload("point_low", low)
         longest = np.max(cells, initial=0.0, where=finite)
-        guard = 8 * np.finfo(real).eps * (longest + 2)
+        # What products of rounded factors and their sums can be off: 3.12 eps of the longest reading, and 1.5 eps.
+        guard = _GUARD * np.finfo(real).eps * (longest + 2)
+        if backend.info.kind == "gpu":
+            firsts = np.arange(0, len(cells), BLOCK_TERMS)
+            longest_each = np.maximum.reduceat(np.where(finite, cells, 0.0), firsts)
+            guards = space.upload("guards", (_GUARD * np.finfo(real).eps * (longest_each + 2)).astype(real))
         readings = len(scan.readings)
 
         careful = "CAREFUL" in self._flags
@@ -219,8 +226,8 @@ class LikelihoodFieldModel(ScanModel):
                 parts = space.empty("parts", count * blocks, real)
                 spread = spread_of(count, blocks)
                 backend.compile("field_blocks", flags)(
-                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, parts, region.rows, region.cols, count,
-                    readings, guard, 1, count, spread,
+                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, guards, parts, region.rows, region.cols,
+                    count, readings, 1, count, spread,
                 )  # fmt: skip
                 backend.compile("sum_parts", flags)(
                     (count,), parts, self._none, result, count, blocks, 1, 1, count, *scalars

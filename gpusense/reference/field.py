@@ -207,12 +207,12 @@ def field_blocks(
     point: np.ndarray,
     point_low: np.ndarray,
     terms: np.ndarray,
+    guard: np.ndarray,
     parts: np.ndarray,
     rows: int,
     cols: int,
     particles: int,
     readings: int,
-    guard: np.floating,
     across: int,
     along: int,
     spread: int,
@@ -221,7 +221,7 @@ def field_blocks(
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_field(
         flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms,
-        np.empty(particles, pose.dtype), each, rows, cols, particles, readings, guard, real(0), real(1),
+        np.empty(particles, pose.dtype), each, rows, cols, particles, readings, real(0), real(0), real(1),
     )  # fmt: skip
     each = each.reshape(particles, readings)
     for block, first in enumerate(range(0, readings, BLOCK_TERMS)):

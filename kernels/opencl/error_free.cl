@@ -34,14 +34,11 @@ real2 pair_product(const real2 a, const real2 b) {
     return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x));
 }
 
-// Whole real numbers spare conversions: adding and taking off a large number rounds to nearest, and the digits of the sum
-// with one hold the integer.
+// Adding and taking off this large number rounds to nearest.
 #if FLOAT64
 #define ROUNDING ((real)6755399441055744.0)
-int whole_int(const real k) { return (int)k; }
 #else
 #define ROUNDING ((real)12582912)
-int whole_int(const real k) { return as_int(k + (real)8388608) - 0x4b000000; }
 #endif
 
 // Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of

@@ -426,24 +426,23 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 
 #if !WIDE
 #if QUICK
-// Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. In doubt it grows worst, which
-// is how far the place is off a cell's centre.
-int2 rounded_cell(const real4 lowered, const real2 point, real *worst) {
+// Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. off is how far the place is
+// off the cell's centre, along the axis where it is farther.
+int2 rounded_cell(const real4 lowered, const real2 point, real *off) {
     const real x = lowered.x + (lowered.z * point.x - lowered.w * point.y);
     const real y = lowered.y + (lowered.w * point.x + lowered.z * point.y);
     const real to_x = x + ROUNDING, to_y = y + ROUNDING;
-    const real off = fmax(fabs(x - (to_x - ROUNDING)), fabs(y - (to_y - ROUNDING)));
-    *worst = fmax(*worst, off);
+    *off = fmax(fabs(x - (to_x - ROUNDING)), fabs(y - (to_y - ROUNDING)));
     return (int2)(as_int(to_x), as_int(to_y)) - 0x4b400000;
 }
 #endif
 
 // For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-// parts[n * across + block * along].
+// parts[n * across + block * along]. Each block has its own guard.
 kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                         global const real *terms, global real *parts, const int rows, const int cols,
-                         const int particles, const int readings, const real guard, const int across, const int along,
+                         global const real *terms, global const real *guard, global real *parts, const int rows,
+                         const int cols, const int particles, const int readings, const int across, const int along,
                          const int spread) {
     const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
     if (n >= particles) return;
@@ -458,28 +457,34 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, readings);
         real sum = 0;
 #if QUICK
-        real worst = 0;
+        real worst = 0, off;
         const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
+        const real sure = (real)0.5 - guard[block];
         if (begin + BLOCK_TERMS <= readings) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) {
-                const int2 cell = origin + rounded_cell(lowered, point[begin + i], &worst);
+                const int2 cell = origin + rounded_cell(lowered, point[begin + i], &off);
+                worst = fmax(worst, off);
                 sum += table[table_cell(cell.x, cell.y, rows, cols)];
             }
         } else {
             for (int k = begin; k < end; ++k) {
-                const int2 cell = origin + rounded_cell(lowered, point[k], &worst);
+                const int2 cell = origin + rounded_cell(lowered, point[k], &off);
+                worst = fmax(worst, off);
                 sum += table[table_cell(cell.x, cell.y, rows, cols)];
             }
         }
-        if (worst > (real)0.5 - guard) {
+        if (worst > sure) {
             sum = 0;
-            for (int k = begin; k < end; ++k)
-                sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard);
+            for (int k = begin; k < end; ++k) {
+                int2 cell = rounded_cell(lowered, point[k], &off);
+                if (off > sure) cell = end_point(own, low, point[k], point_low[k], 0, guard[block]).cell;
+                sum += table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)];
+            }
         }
 #else
         for (int k = begin; k < end; ++k)
-            sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard);
+            sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard[block]);
 #endif
         parts[(long)n * across + (long)block * along] = sum;
     }

@@ -74,7 +74,8 @@ real log_density(const real z, const real expected, global const real *terms) {
     real p = 0;
 #if HIT
     const real2 exponent = hit_exponent(z, expected, terms);
-    p += terms[0] * exp(-exponent.x) * (1 - exponent.y) / hit_mass(expected, terms[2], terms[6]);
+    const real hit = terms[0] * exp(-exponent.x) * (1 - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
+    p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT
     if (z <= expected && expected > 0) {

@@ -66,10 +66,10 @@ Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, co
         if (!(t >= 0 && t < limit)) return walk;
         if (enter_t_x > enter_t_y) {
             walk.k_x = enter_x;
-            walk.k_y = whole_int(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
+            walk.k_y = (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 0);
         } else {
             walk.k_y = enter_y;
-            walk.k_x = whole_int(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
+            walk.k_x = (int)crossed(t, r.speed_x, r.a_x, r.inv_x, 1);
         }
         if (!off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols)) walk.t = t;
     }

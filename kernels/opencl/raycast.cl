@@ -42,15 +42,15 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     real k_x = (real)start.k_x, k_y = (real)start.k_y, t = start.t;
     if (t >= limit) return limit;
     const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
-    global const entry *table = map_table + plane * ((rows + 2) * (cols + 2));
-    const int origin = padded(cell.y, cell.x, cols), step_y = r.up ? cols + 2 : -(cols + 2);
+    const int origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols);
+    const int step_y = r.step_y * (cols + 2);
     for (;;) {
-        const uint sides = table[origin + r.step_x * whole_int(k_x) + step_y * whole_int(k_y)];
+        const uint sides = map_table[origin + r.step_x * (int)k_x + step_y * (int)k_y];
         if (sides == 0) {
 #if OUTSIDE_OCCUPIED
             return t;
 #else
-            const int col = cell.x + r.step_x * whole_int(k_x), row = cell.y + r.step_y * whole_int(k_y);
+            const int col = cell.x + r.step_x * (int)k_x, row = cell.y + r.step_y * (int)k_y;
             return off_grid(col, row, rows, cols) ? limit : t;
 #endif
         }

@@ -328,7 +328,7 @@ def make(name, flags):
             log_p[n] = temperature * (total.x + total.y)
 
     # For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-    # parts[n * across + block * along].
+    # parts[n * across + block * along]. Each block has its own guard.
     @kernel
     def field_blocks(
         table: wp.array(dtype=real),
@@ -338,12 +338,12 @@ def make(name, flags):
         point: wp.array(dtype=vec2),
         point_low: wp.array(dtype=vec2),
         terms: wp.array(dtype=real),
+        guard: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         rows: wp.int32,
         cols: wp.int32,
         particles: wp.int32,
         readings: wp.int32,
-        guard: real,
         across: wp.int32,
         along: wp.int32,
         spread: wp.int32,
@@ -363,9 +363,10 @@ def make(name, flags):
             begin = block * BLOCK_TERMS
             end = wp.min(begin + BLOCK_TERMS, readings)
             total = real(0.0)
-            worst = real(1.0)
+            own_guard = guard[block]
             if QUICK:
-                worst = ZERO
+                sure = HALF - own_guard
+                worst = real(0.0)
                 if begin + BLOCK_TERMS <= readings:
                     for i in range(WHOLE_BLOCK):
                         cell, off = rounded_cell(lowered, point[begin + i])
@@ -378,14 +379,23 @@ def make(name, flags):
                         worst = wp.max(worst, off)
                         total += table[table_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)]
                         k += 1
-            if worst > HALF - guard:
-                total = ZERO
+                if worst > sure:
+                    total = ZERO
+                    k = begin
+                    while k < end:
+                        cell, off = rounded_cell(lowered, point[k])
+                        if off > sure:
+                            exact = end_point(own, low, point[k], point_low[k], ZERO, own_guard)
+                            cell = exact.cell
+                        total += table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)]
+                        k += 1
+            else:
                 k = begin
                 while k < end:
                     to_low = vec2()
                     if CAREFUL:
                         to_low = point_low[k]
-                    total += reading_value(table, origin, own, low, point[k], to_low, terms, rows, cols, guard)
+                    total += reading_value(table, origin, own, low, point[k], to_low, terms, rows, cols, own_guard)
                     k += 1
             parts[n * across + block * along] = total
             block += 1 << spread

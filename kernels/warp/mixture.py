@@ -69,7 +69,12 @@ def functions(flags):
         p = real(0.0)
         if HIT:
             exponent = hit_exponent(z, expected, terms)
-            p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y) / hit_mass(expected, terms[2], terms[6])
+            hit = terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
+            mass = hit_mass(expected, terms[2], terms[6])
+            if mass == ONE:
+                p += hit
+            else:
+                p += hit / mass
         if SHORT:
             if z <= expected and expected > ZERO:
                 x = terms[4] * expected

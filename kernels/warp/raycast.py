@@ -70,15 +70,16 @@ def functions(flags):
         if t >= limit:
             return limit
         plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
-        table = plane * (rows + 2) * (cols + 2)
+        origin = plane * (rows + 2) * (cols + 2) + padded(cell.y, cell.x, cols)
+        step_y = r.step_y * (cols + 2)
         while True:
-            col = cell.x + r.step_x * int(k_x)
-            row = cell.y + r.step_y * int(k_y)
-            sides = int(map_table[table + padded(row, col, cols)])
+            sides = int(map_table[origin + r.step_x * int(k_x) + step_y * int(k_y)])
             if sides == 0:
                 if OUTSIDE_OCCUPIED:
                     return t
                 else:
+                    col = cell.x + r.step_x * int(k_x)
+                    row = cell.y + r.step_y * int(k_y)
                     return wp.where(off_grid(col, row, rows, cols), limit, t)
             far_x = k_x + real((sides & 255) - 1)
             far_y = k_y + real((sides >> 8) - 1)

@@ -31,7 +31,7 @@ FIELD = {
     "bilinear": gs.LikelihoodFieldParameters(interpolation="bilinear"),
 }
 OPTIONS = [*itertools.product(("free", "occupied"), ("float32", "float64"), (True, False))]
-# Warp compiles each set of flags anew.
+# Kernels are compiled for each set of flags.
 FEW = [("free", "float32", True), ("occupied", "float64", False)]
 
 
@@ -88,7 +88,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
 @pytest.mark.parametrize("kind", ["all over", "inside"])
 def test_models(kind, ordered, as_gpu, backend):
     grid, scanner, z = world()
-    some = FEW[:1] if ordered else FEW if backend.startswith("warp") else OPTIONS
+    some = FEW[:1] if ordered else OPTIONS if backend == "numpy" else FEW
     for outside, precision, specialize in some:
         options = dict(precision=precision, outside=outside, specialize=specialize)
         cases = [(gs.BeamModel, p) for p in BEAM.values()] + [(gs.LikelihoodFieldModel, p) for p in FIELD.values()]

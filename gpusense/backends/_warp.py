@@ -128,7 +128,7 @@ class WarpBackend(ProcessBound):
 
     def part(self, buffer: wp.array, first: int, count: int) -> wp.array:
         """See Backend.part."""
-        return buffer[first : first + count]
+        return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""

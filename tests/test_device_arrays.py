@@ -1,0 +1,268 @@
+"""Arrays on a device, of which Warp's processor stands in for a GPU, and of real frameworks where there is one."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from array_libraries import Array, installed
+from conftest import skip_or_fail
+
+import gpusense as gs
+from gpusense import arrays
+from gpusense.backends import get_backend
+from gpusense.models import scan_model
+from gpusense.tolerances import differing
+from gpusense.workspace import Workspace
+
+BEAMS, COUNT, RANGE = 21, 300, 5.0
+RNG = np.random.default_rng(12)
+GRID = gs.OccupancyGrid(np.where(RNG.random((60, 70)) < 0.04, 100, 0).astype(np.int8), 0.1)
+SCANNER = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, mount=(0.1, 0.0, 0.2))
+POSES = np.column_stack([RNG.uniform(-1, 7, (COUNT, 2)), RNG.uniform(-4, 4, COUNT)])
+SCAN = RNG.uniform(0, 5.5, BEAMS)
+METHODS = ("log_likelihood", "field", "expected_ranges", "cast")
+
+
+@pytest.fixture
+def device(as_gpu, backend, monkeypatch):
+    """Warp's processor as a GPU that holds Warp's arrays and those of ``fakelib`` in its own memory."""
+    if backend != "warp:cpu":
+        pytest.skip("stands in for a GPU on warp:cpu alone")
+    import warp as wp
+
+    installed(monkeypatch)
+    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
+    return as_gpu()
+
+
+def to_device(array: np.ndarray):
+    import warp as wp
+
+    dtype = {"float32": wp.float32, "float64": wp.float64}.get(array.dtype.name, wp.int32)
+    return wp.array(array, dtype=dtype, device="cpu")
+
+
+def call_of(method: str, backend, scan=SCAN):
+    """What takes poses and out=, and the shape of its result."""
+    if method == "cast":
+        caster = gs.RayCaster(GRID, RANGE, backend=backend)
+        return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options), (COUNT, BEAMS)
+    model = (gs.LikelihoodFieldModel if method == "field" else gs.BeamModel)(GRID, SCANNER, backend=backend)
+    if method == "expected_ranges":
+        return model.expected_ranges, (COUNT, BEAMS)
+    return lambda poses, **options: model.log_likelihood(poses, scan, **options), (COUNT,)
+
+
+@pytest.fixture
+def copies(monkeypatch):
+    """Sizes of what goes to the device and comes back, by the names of buffers."""
+    import warp  # noqa: F401
+
+    from gpusense.backends._warp import WarpBackend
+
+    seen = []
+    upload, download = WarpBackend.upload, WarpBackend.download
+
+    def up(self, array, out=None, *, wait=True):
+        seen.append(("up", array.nbytes))
+        return upload(self, array, out, wait=wait)
+
+    def down(self, buffer, out, *, wait=True):
+        seen.append(("down", out.nbytes))
+        return download(self, buffer, out, wait=wait)
+
+    monkeypatch.setattr(WarpBackend, "upload", up)
+    monkeypatch.setattr(WarpBackend, "download", down)
+    return seen
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("method", METHODS)
+def test_poses_on_the_device_stay_there(method, real, device, copies):
+    call, shape = call_of(method, device)
+    poses = POSES.astype(real)
+    expected = call(poses)
+    for given in (to_device(poses), Array(to_device(poses))):
+        call(given)
+        copies.clear()
+        found = call(given)
+        held = found.held if isinstance(given, Array) else found
+        assert type(found) is type(given) and tuple(held.shape) == shape
+        assert differing(held.numpy(), expected) == 0
+        # Rays and readings go there, and two numbers that tell whether all is finite come back.
+        assert all(size <= 16 * BEAMS for _, size in copies)
+        assert [size for way, size in copies if way == "down"] == [8]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_out_on_the_device(method, device, copies):
+    call, shape = call_of(method, device)
+    expected, poses = call(POSES), to_device(POSES)
+    for wrap in (lambda array: array, Array):
+        room = to_device(np.full(shape, 7, np.float32))
+        out, address = wrap(room), room.ptr
+        copies.clear()
+        assert call(wrap(poses), out=out) is out
+        assert room.ptr == address and differing(room.numpy(), expected) == 0
+        assert all(size <= 16 * BEAMS or size == 4 * 8192 for way, size in copies)
+
+
+@pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
+def test_batches_on_the_device(kind, device):
+    model = kind(GRID, SCANNER, backend=device)
+    several, scans = np.stack([POSES, POSES + 0.1]), np.stack([SCAN, np.full(BEAMS, np.nan)])
+    expected, expected_parts = model.log_likelihood(several, scans, per_beam=True)
+    given, out = to_device(several), to_device(np.zeros((2, COUNT), np.float32))
+    assert differing(model.log_likelihood(given, scans).numpy(), expected) == 0
+    assert model.log_likelihood(Array(given), scans, out=out) is out
+    assert differing(out.numpy(), expected) == 0
+    found, parts = model.log_likelihood(given, to_device(scans), per_beam=True)
+    assert differing(found.numpy(), expected) == 0 and differing(parts, expected_parts) == 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_in_pieces_on_the_device(method, device, monkeypatch):
+    call, _ = call_of(method, device)
+    expected = call(POSES)
+    monkeypatch.setattr(scan_model, "CHUNK", 77)
+    assert differing(call(to_device(POSES)).numpy(), expected) == 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_no_particles_on_the_device(method, device):
+    call, shape = call_of(method, device)
+    assert tuple(call(to_device(np.empty((0, 3)))).shape) == (0, *shape[1:])
+
+
+@pytest.mark.parametrize("scan", [SCAN, np.full(BEAMS, np.nan)], ids=["readings", "no reading"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_pose_on_the_device_that_is_not_finite(value, scan, device):
+    message = "^poses: must be finite, got a pose on the device that is not$"
+    for method in METHODS:
+        if method in ("expected_ranges", "cast") and scan is not SCAN:
+            continue
+        call, _ = call_of(method, device, scan)
+        bad = POSES.copy()
+        bad[17, 1] = value
+        expected = call(POSES)
+        with pytest.raises(ValueError, match=message):
+            call(to_device(bad))
+        # It is told once.
+        assert differing(call(to_device(POSES)).numpy(), expected) == 0
+
+
+def test_a_pose_that_is_not_finite_is_told_after_memory_ran_out(device, monkeypatch):
+    """The first piece has it; the second is tried again in halves."""
+    model = gs.BeamModel(GRID, SCANNER, backend=device)
+    poses = np.tile(POSES, (4, 1))
+    model.log_likelihood(to_device(poses), SCAN)
+    poses[3, 0] = np.nan
+    monkeypatch.setattr(scan_model, "CHUNK", 600)
+    before, calls = Workspace.empty, []
+
+    def empty(self, name, count, dtype, *, zero=False):
+        calls.append(name)
+        if calls.count("parts") == 2 and name == "parts":
+            raise MemoryError("none left")
+        return before(self, name, count, dtype, zero=zero)
+
+    monkeypatch.setattr(Workspace, "empty", empty)
+    with pytest.raises(ValueError, match="poses: must be finite"):
+        model.log_likelihood(to_device(poses), SCAN)
+    assert calls.count("parts") >= 4
+
+
+ON_DEVICE_WRONG = {
+    "a shape": (lambda: to_device(POSES[:, :2].copy()), ValueError, f"poses: shape must be (N, 3), got ({COUNT}, 2)"),
+    "an axis": (lambda: to_device(POSES[0]), ValueError, "poses: shape must be (N, 3), got (3,)"),
+    "integers": (lambda: to_device(np.zeros((4, 3), np.int32)), TypeError,
+                 "poses: must hold float32 or float64, got int32"),
+    "strides": (lambda: to_device(POSES)[::2], ValueError, "poses: must be C-contiguous on the device, got strides"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ON_DEVICE_WRONG)
+@pytest.mark.parametrize("method", METHODS)
+def test_poses_on_the_device_that_cannot_be_used(method, name, device):
+    make, error, message = ON_DEVICE_WRONG[name]
+    call, _ = call_of(method, device)
+    with pytest.raises(error, match="^" + re.escape(message)):
+        call(make())
+
+
+OUT_WRONG = {
+    "on the host": (lambda shape: np.empty(shape, np.float32), TypeError,
+                    "out: must be in the memory where the poses are, got one that is not"),
+    "a precision": (lambda shape: to_device(np.empty(shape)), TypeError, "out: must hold float32, got float64"),
+    "strides": (lambda shape: to_device(np.empty((2 * shape[0], *shape[1:]), np.float32))[::2], ValueError,
+                "out: must be C-contiguous and writable, got one that is not"),
+    "a shape": (lambda shape: to_device(np.empty((3, *shape), np.float32)), ValueError, "out: shape must be ("),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OUT_WRONG)
+@pytest.mark.parametrize("method", METHODS)
+def test_out_on_the_device_that_cannot_be_written(method, name, device):
+    make, error, message = OUT_WRONG[name]
+    call, shape = call_of(method, device)
+    with pytest.raises(error, match="^" + re.escape(message)):
+        call(to_device(POSES), out=make(shape))
+
+
+# ---- frameworks on a real GPU
+
+
+def framework(name: str, needs):
+    """A GPU's backend, and what makes an array there, what copies one back, and where it lies."""
+    module = pytest.importorskip(name)
+    cuda = next((d.selection for d in gs.devices() if d.available and d.selection.startswith("warp:cuda")), None)
+    if cuda is None:
+        skip_or_fail("cuda", "there is no CUDA device")
+    if name == "torch":
+        return (cuda, lambda array: module.from_numpy(array.copy()).to(cuda.removeprefix("warp:")),
+                lambda array: array.cpu().numpy(), lambda array: array.data_ptr())  # fmt: skip
+    if name == "cupy":
+        return cuda, module.asarray, module.asnumpy, lambda array: array.data.ptr
+    module.config.update("jax_enable_x64", True)
+    return (cuda, lambda array: module.device_put(array, module.devices("gpu")[0]), np.asarray,
+            lambda array: array.unsafe_buffer_pointer())  # fmt: skip
+
+
+each_framework = pytest.mark.parametrize("name", ["torch", "cupy", "jax"])
+
+
+@each_framework
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("method", METHODS)
+def test_frameworks(method, real, name, needs):
+    cuda, there, back, _ = framework(name, needs)
+    call, shape = call_of(method, cuda)
+    poses = POSES.astype(real)
+    given = there(poses)
+    found = call(given)
+    assert type(found) is type(given) and tuple(found.shape) == shape
+    assert differing(back(found), call(poses)) == 0
+    bad = poses.copy()
+    bad[5, 2] = np.nan
+    with pytest.raises(ValueError, match="poses: must be finite"):
+        call(there(bad))
+    with pytest.raises(TypeError, match="poses: must be in host memory for numpy"):
+        call_of(method, "numpy")[0](given)
+
+
+@pytest.mark.parametrize("name", ["torch", "cupy"])
+@pytest.mark.parametrize("method", METHODS)
+def test_frameworks_that_may_be_written(method, name, needs):
+    cuda, there, back, address = framework(name, needs)
+    call, shape = call_of(method, cuda)
+    out = there(np.full(shape, 7, np.float32))
+    place = address(out)
+    assert call(there(POSES), out=out) is out
+    assert address(out) == place and differing(back(out), call(POSES)) == 0
+    with pytest.raises(ValueError, match="poses: must be C-contiguous on the device"):
+        call(there(np.repeat(POSES, 2, axis=0))[::2])
+    with pytest.raises(TypeError, match="poses: must be in host memory for opencl"):
+        call_of(method, needs("opencl"))[0](there(POSES))
+    assert get_backend(cuda).info.kind == "gpu"

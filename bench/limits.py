@@ -124,7 +124,11 @@ def measure(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
         for kind in (gs.LikelihoodFieldModel, gs.BeamModel):
             name = "beam model" if kind is gs.BeamModel else "field"
             model, readings, poses = kind(grid, small, backend=device), scan(small), clouds["tracking"](count)
-            bench.add(f"{name}, tracking, {count} x 60", count * 60, lambda m=model, p=poses, r=readings: m.log_likelihood(p, r))
+            bench.add(
+                f"{name}, tracking, {count} x 60",
+                count * 60,
+                lambda m=model, p=poses, r=readings: m.log_likelihood(p, r),
+            )
             if device.info.backend == "warp" and device.info.kind == "gpu":
                 import warp as wp
 
@@ -158,7 +162,9 @@ def measure(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", action="append", required=True, help="selection string; may be given more than once")
+    parser.add_argument(
+        "--backend", action="append", required=True, help="selection string; may be given more than once"
+    )
     parser.add_argument("--particles", type=int, default=4096)
     parser.add_argument("--beams", type=int, default=360)
     parser.add_argument("--map", type=Path, help="a map_server YAML instead of the built-in building")

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import get_backend
+from gpusense.workspace import Workspace
 
 LOOK_UPS, ADDITIONS, WORDS = 64, 1024, 8
 # Bytes of a table that the nearest cache of most devices holds.
@@ -29,6 +30,7 @@ _NEAR = 1 << 14
 
 _OPENCL = """
 typedef NUMBER number;
+typedef PLACES places;
 
 kernel void nothing(global float *out) {}
 
@@ -45,17 +47,19 @@ kernel void issue(global float *out, const float step) {
 }
 
 // Multiplying by 2^32 over the golden ratio spreads numbers evenly; the upper bits name a place.
-kernel void gather(global const float *table, global float *out, const int shift, const uint keep, const int share) {
-    const uint first = get_global_id(0) * WIDTH;
+kernel void gather(global const float *table, global float *out, const uint shift, const uint keep, const uint share) {
+    places item = (places)(get_global_id(0) * WIDTH);
+    for (int l = 0; l < WIDTH; ++l) ((uint *)&item)[l] += l;
+    const places start = (item >> (places)share) * LOOK_UPS, own = item & ~(places)keep;
     float sum[WIDTH];
     for (int l = 0; l < WIDTH; ++l) sum[l] = 0;
-#pragma unroll 8
-    for (uint j = 0; j < LOOK_UPS; ++j)
-        for (int l = 0; l < WIDTH; ++l) {
-            const uint place = ((((first + l) >> share) * LOOK_UPS + j) * 2654435761u) >> shift;
-            sum[l] += table[(place & keep) | ((first + l) & ~keep)];
-        }
-    for (int l = 0; l < WIDTH; ++l) out[first + l] = sum[l];
+#pragma unroll 4
+    for (uint j = 0; j < LOOK_UPS; ++j) {
+        const places place = ((((start + j) * 2654435761u) >> (places)shift) & (places)keep) | own;
+        const uint *at = (const uint *)&place;
+        for (int l = 0; l < WIDTH; ++l) sum[l] += table[at[l]];
+    }
+    for (int l = 0; l < WIDTH; ++l) out[get_global_id(0) * WIDTH + l] = sum[l];
 }
 
 typedef VECTOR words;
@@ -129,9 +133,10 @@ def probe(selection: str, quick: bool = False) -> Figures:
     kernels = {"opencl": _OpenCL, "warp": _Warp, "numpy": _NumPy}[info.backend](info, 1 << 8 if quick else 0)
     many = kernels.threads
     array = np.zeros((1 << 16 if quick else 1 << 25) // 4, np.float32)
-    buffer = backend.upload(array)
-    up, down = best(lambda: backend.upload(array, buffer)), best(lambda: backend.download(buffer, array))
-    del buffer
+    space = Workspace(backend)
+    up = best(lambda: (space.upload("probe", array), space.wait()))
+    down = best(lambda: backend.download(space.empty("probe", array.size, array.dtype), array))
+    space.release()
     launch, round_trip = kernels.nothing()
     return Figures(
         source=f"{kernels.name} on {info.name}, {info.driver}" + (f", one thread times {many}" if many > 1 else ""),
@@ -179,7 +184,8 @@ class _OpenCL:
         self._additions = float(ADDITIONS * WORDS * words)
         values = {
             "WIDTH": self._width, "VECTOR": "float16" if self._cpu else "float4", "LAST": words - 1,
-            "NUMBER": f"float{words}" if words > 1 else "float", "ADDITIONS": ADDITIONS, "LOOK_UPS": LOOK_UPS,
+            "NUMBER": f"float{words}" if words > 1 else "float", "PLACES": "uint16" if self._cpu else "uint",
+            "ADDITIONS": ADDITIONS, "LOOK_UPS": LOOK_UPS,
         }  # fmt: skip
         program = cl.Program(self._context, _OPENCL).build([f"-D{name}={value}" for name, value in values.items()])
         self._kernels = {name: cl.Kernel(program, name) for name in ("nothing", "issue", "gather", "copy")}
@@ -215,7 +221,7 @@ class _OpenCL:
     def gather(self, size: int, together: bool) -> float:
         """Look-ups per second in a table of that size."""
         table, keep = self._buffer(size), np.uint32(0xFFFFFFE0 if together else 0xFFFFFFFF)
-        shift, share = np.int32(32 - (size // 4).bit_length() + 1), np.int32(5 if together else 0)
+        shift, share = np.uint32(33 - (size // 4).bit_length()), np.uint32(5 if together else 0)
         seconds = self._time("gather", self._items, table, self._out, shift, keep, share)
         return self._items * self._width * LOOK_UPS / seconds
 
@@ -320,7 +326,7 @@ class _NumPy:
 
     def __init__(self, info: Any, items: int) -> None:
         self.threads = threads()
-        self._items = items or 1 << 16
+        self._items = max(items, 1 << 14)
 
     def nothing(self) -> tuple[float, float]:
         """Seconds of an addition of no numbers."""

@@ -3,14 +3,16 @@
     python bench/scaling.py --backend opencl:0:0 --backend warp:cuda:0 --output bench/results/scaling_h200
     python bench/scaling.py --backend opencl --seconds 0.2 --total 60             # a processor
 
-Three curves of rays, beam model and likelihood field (nearest), float32, 30 m of range at 5 cm: N particles with 60 beams,
-K beams with 10 000 particles, and the side of the map with 360 beams and 100 000 particles (4096 on processors). Maps are
-the built-in building; above 2000 cells it stands side by side with itself, since a building is not drawn larger. The cloud
-is uniform over the free cells but for the first particles, which are near one pose: float64 NumPy finds these on a part of
-the map, and their largest difference from it is a point's error (of ranges as well: rays that graze an obstacle differ).
+Three curves of rays, beam model and likelihood field (nearest), float32, 30 m of range at 5 cm: N particles with 60
+beams, K beams with 10 000 particles, and the side of the map with 360 beams and 100 000 particles (4096 on processors).
+Maps are the built-in building; above 2000 cells it stands side by side with itself, since a building is not drawn
+larger. The cloud is uniform over the free cells but for the first particles, which are near one pose: float64 NumPy
+finds these on a part of the map, and their largest difference from it is a point's error (of ranges as well: rays that
+graze an obstacle differ).
 
-A *call* has NumPy arrays in and out. *Launches* are the kernels of that call again, one after the other, with everything
-on the device. Points that take too long (--seconds, --total) or too much memory are left out and listed with the reason.
+A *call* has NumPy arrays in and out. *Launches* are the kernels of that call again, one after the other, with
+everything on the device. Points that take too long (--seconds, --total) or too much memory are left out and listed with
+the reason.
 
 The floor. bench/probes.py measures what the device does at most: launches, round trip, additions/s (issue), look-ups/s,
 bytes/s of copies, up and down. With E particle-beams, N particles and L launches
@@ -22,21 +24,21 @@ bytes/s of copies, up and down. With E particle-beams, N particles and L launche
     look-ups    field E;             rays and beam model reads * E
     bytes       24 N in, 4 N out (rays 4 E); these alone go up and down
 
-and *nearest* is the rate of look-ups in a table that the nearest cache holds. The upper edge of the band that is drawn on
-top of the floor has the rate of look-ups at random places of a table as large as the model's instead: a cloud whose
-neighbours share nothing. A cloud's end points share cache lines, so the upper edge can be beaten; the floor cannot, as far
-as the probes are good: where a time is below it the report says so.
+and *nearest* is the rate of look-ups in a table that the nearest cache holds. The upper edge of the band that is drawn
+on top of the floor has the rate of look-ups at random places of a table as large as the model's instead: a cloud whose
+neighbours share nothing. A cloud's end points share cache lines, so the upper edge can be beaten; the floor cannot, as
+far as the probes are good: where a time is below it the report says so.
 
 Operations are counted in kernels/opencl, as the fewest instructions: a multiplication is not merged with an addition
 (ranges have the same bits everywhere), sizes and signs are free, a rounded division is 8, exp 8, log 15.
 
-    field.cl, rounded_cell and table_cell: 8 of the rotation, 2 of rounding, 4 of the distance from the middle, 2 maxima,
-        2 of the cell, 1 of the index, 1 address, 1 load, 1 addition                                               22
-    raycast.cl, a step: 4 of the two counts and 2 of the index, 1 load, 1 branch; 8 of the sides; 4 crossing distances,
-        2 to choose, 2 of the limit; 3 selections, 10 of crossed, 4 of the new counts                               41
-    raycast.cl and ray.cl, a ray: 6 of the rotation, 4 of TINY, 16 of two divisions, 4 of a_x and a_y, 2 signs, 8 of the
-        plane, 3 of the origin, 3 of expected_range                                                                 46
-    mixture.cl, hit and uniform part alone: 1 difference, 2 and exp 8, 5 of hit_mass, 2 and a division 8, log 15, 1     42
+    field.cl, rounded_cell and table_cell: 8 of the rotation, 2 of rounding, 4 of the distance from the middle,
+        2 maxima, 2 of the cell, 1 of the index, 1 address, 1 load, 1 addition                                      22
+    raycast.cl, a step: 4 of the two counts and 2 of the index, 1 load, 1 branch; 8 of the sides; 4 of the crossing
+        distances, 2 to choose, 2 of the limit; 3 selections, 10 of crossed, 4 of the new counts                    41
+    raycast.cl and ray.cl, a ray: 6 of the rotation, 4 of TINY, 16 of two divisions, 4 of a_x and a_y, 2 signs,
+        8 of the plane, 3 of the origin, 3 of expected_range                                                        46
+    mixture.cl, hit and uniform part alone: 1 difference, 2 and exp 8, 5 of hit_mass, 2 and a division 8, log 15, 1 42
     placement.cl, a particle: cosine and sine 40, cell and fraction 20                                              60
 
 Steps and reads per ray are counted: gpusense.reference casts some rays of the cloud in the table that the device makes.
@@ -48,7 +50,6 @@ import argparse
 import dataclasses
 import json
 import os
-import shlex
 import sys
 import time
 from collections.abc import Callable
@@ -58,7 +59,7 @@ from typing import Any
 
 import numpy as np
 from probes import Figures, probe, rate
-from speed import Recorder, best, machine
+from speed import Recorder, best, command_line, machine
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -197,6 +198,7 @@ class Device:
         self.backend = Recorder(get_backend(self.selection))
         self.info = self.backend.info
         self.figures = probe(self.selection, self.arguments.quick)
+        self.failed = False
         self.reads: dict[int, tuple[float, float]] = {}
         self.cloud: tuple[tuple[int, int], np.ndarray] = ((0, 0), np.empty((0, 3)))
         # Work and seconds of the last point of each curve.
@@ -227,6 +229,8 @@ class Device:
                             continue
                         except MemoryError as error:
                             why = f"out of memory: {error}"
+                        except (RuntimeError, ValueError) as error:
+                            self.failed, why = True, f"failed: {error}"
                     self.left_out.append(f"{kind}, {axis} {value} ({n} x {k}, {side} x {side} cells): {why}")
                     note(f"{self.info.selection}: left out: {self.left_out[-1]}")
 
@@ -386,6 +390,8 @@ def draw(device: dict[str, Any], path: Path) -> None:
     for ax, axis in zip(figure.subplots(1, 3, sharey=True), AXES, strict=True):
         for kind in KINDS:
             rows = [row for row in device["rows"] if row["axis"] == axis and row["what"] == kind]
+            if not rows:
+                continue
             x = [row["value"] for row in rows]
             y = {
                 name: [1e9 * row[name] / (row["particles"] * row["beams"]) for row in rows]
@@ -397,10 +403,15 @@ def draw(device: dict[str, Any], path: Path) -> None:
             ax.plot(x, y["floor_call_s"], "-.", color=colours[kind], lw=0.8)
             ax.fill_between(x, y["floor_launch_s"], y["scattered_s"], color=colours[kind], alpha=0.12, lw=0)
         fixed = [row for row in device["rows"] if row["axis"] == axis][:1]
-        told = {"particles": "{beams} beams, map of {side} cells", "beams": "{particles} particles, map of {side} cells",
-                "side": "{particles} particles, {beams} beams"}[axis]  # fmt: skip
-        ax.set(xscale="log", yscale="log", xlabel=AXES[axis])
-        ax.set_title(told.format(**fixed[0]) if fixed else "no point", loc="left", fontsize="medium")
+        told = {
+            "particles": "{beams} beams, map of {side} cells",
+            "beams": "{particles} particles, map of {side} cells",
+            "side": "{particles} particles, {beams} beams",
+        }[axis]
+        ax.set(xlabel=AXES[axis])
+        if fixed:
+            ax.set(xscale="log", yscale="log")
+        ax.set_title(told.format(**fixed[0]) if fixed else "every point left out", loc="left", fontsize="medium")
         ax.grid(True, which="major", color="#e3e7ed", lw=0.6)
     figure.axes[0].set_ylabel("time per ray or particle-beam [ns]")
     _legend(figure, colours)
@@ -452,17 +463,17 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="path without ending for the .json, .md and .png files")
     arguments = parser.parse_args()
     scenes: dict[int, Scene] = {}
-    devices = []
+    devices, failed = [], False
     for selection in arguments.backend:
         device = Device(selection, arguments, scenes)
         device.run()
+        failed |= device.failed
         devices.append({
             "backend": device.info.selection, "device": device.info.name, "driver": device.info.driver,
             "figures": dataclasses.asdict(device.figures), "rows": device.rows, "left_out": device.left_out,
             "seconds": time.perf_counter() - device.start,
         })  # fmt: skip
-    words = [Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:]]
-    command, host = shlex.join(["python", "bench/scaling.py", *words]), machine(arguments.commit)
+    command, host = command_line("bench/scaling.py"), machine(arguments.commit)
     described = ", ".join(f"{name} {value}" for name, value in host.items())
     table = "\n".join(map(figures_markdown, devices)) + f"\nMachine: {described}. Command: `{command}`.\n"
     print(table)
@@ -474,7 +485,7 @@ def main() -> int:
         base.with_suffix(".md").write_text(table)
         for device in devices:
             draw(device, base.with_name(f"{base.name}_{device['backend'].replace(':', '_')}.png"))
-    return 0
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ _NEAR = 1 << 14
 _OPENCL = """
 typedef NUMBER number;
 typedef PLACES places;
+typedef FOUND found;
 
 kernel void nothing(global float *out) {}
 
@@ -51,15 +52,14 @@ kernel void gather(global const float *table, global float *out, const uint shif
     places item = (places)(get_global_id(0) * WIDTH);
     for (int l = 0; l < WIDTH; ++l) ((uint *)&item)[l] += l;
     const places start = (item >> (places)share) * LOOK_UPS, own = item & ~(places)keep;
-    float sum[WIDTH];
-    for (int l = 0; l < WIDTH; ++l) sum[l] = 0;
+    found sum = 0;
 #pragma unroll 4
     for (uint j = 0; j < LOOK_UPS; ++j) {
         const places place = ((((start + j) * 2654435761u) >> (places)shift) & (places)keep) | own;
         const uint *at = (const uint *)&place;
-        for (int l = 0; l < WIDTH; ++l) sum[l] += table[at[l]];
+        sum += LOOK_UP;
     }
-    for (int l = 0; l < WIDTH; ++l) out[get_global_id(0) * WIDTH + l] = sum[l];
+    for (int l = 0; l < WIDTH; ++l) out[get_global_id(0) * WIDTH + l] = ((const float *)&sum)[l];
 }
 
 typedef VECTOR words;
@@ -185,6 +185,8 @@ class _OpenCL:
         values = {
             "WIDTH": self._width, "VECTOR": "float16" if self._cpu else "float4", "LAST": words - 1,
             "NUMBER": f"float{words}" if words > 1 else "float", "PLACES": "uint16" if self._cpu else "uint",
+            "FOUND": "float16" if self._cpu else "float",
+            "LOOK_UP": f"(found)({','.join(f'table[at[{lane}]]' for lane in range(self._width))})",
             "ADDITIONS": ADDITIONS, "LOOK_UPS": LOOK_UPS,
         }  # fmt: skip
         program = cl.Program(self._context, _OPENCL).build([f"-D{name}={value}" for name, value in values.items()])

@@ -52,7 +52,6 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -112,7 +111,8 @@ def make_scene(side: int) -> Scene:
     # All that the first particles can see, so that float64 NumPy need not prepare the whole map.
     reach = int((RANGE_MAX + 5) / resolution)
     col, row = (max(int(place / resolution) - reach, 0) for place in pose[:2])
-    near = grid.cells[row : row + 2 * reach + reach, col : col + 2 * reach + reach]
+    right, top = (int(place / resolution) + reach for place in pose[:2])
+    near = grid.cells[row:top, col:right]
     part = gs.OccupancyGrid(np.ascontiguousarray(near), resolution, (col * resolution, row * resolution, 0.0))
     return Scene(grid, pose, part, time.perf_counter() - start)
 
@@ -190,6 +190,7 @@ class Device:
     selection: str
     arguments: argparse.Namespace
     scenes: dict[int, Scene]
+    truths: dict[tuple[Any, ...], np.ndarray]
     rows: list[dict[str, Any]] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
 
@@ -198,13 +199,14 @@ class Device:
         self.backend = Recorder(get_backend(self.selection))
         self.info = self.backend.info
         self.figures = probe(self.selection, self.arguments.quick)
-        self.failed = False
+        self.failed, self.until = False, 0.0
         self.reads: dict[int, tuple[float, float]] = {}
         self.cloud: tuple[tuple[int, int], np.ndarray] = ((0, 0), np.empty((0, 3)))
         # Work and seconds of the last point of each curve.
         self.last: dict[tuple[str, str], tuple[float, float]] = {}
-        self.truths: dict[tuple[Any, ...], np.ndarray] = {}
+        self.models: dict[str, tuple[Any, Any]] = {}
         note(f"{self.info.selection}: probes took {time.perf_counter() - self.start:.1f} s")
+        self.start = time.perf_counter()
 
     def scene(self, side: int) -> Scene:
         """The scene of a map, shared by devices."""
@@ -216,7 +218,9 @@ class Device:
         """All curves."""
         a = self.arguments
         many = a.map_particles or (100_000 if self.info.kind == "gpu" else 4096)
-        for axis, values in (("particles", a.particles), ("beams", a.beams), ("side", a.sides)):
+        for place, (axis, values) in enumerate((("particles", a.particles), ("beams", a.beams), ("side", a.sides))):
+            # A third of the time for each curve, and what the ones before left.
+            self.until = a.total * (place + 1) / 3
             for value in values:
                 n = value if axis == "particles" else a.beam_particles if axis == "beams" else many
                 k = value if axis == "beams" else a.particle_beams if axis == "particles" else a.map_beams
@@ -237,8 +241,10 @@ class Device:
     def refused(self, axis: str, kind: str, n: int, k: int, side: int) -> str:
         """Why a point is not to be tried; empty where it is."""
         spent = time.perf_counter() - self.start
-        if spent > self.arguments.total:
-            return f"{spent:.0f} s of the device's {self.arguments.total:.0f} s are used up"
+        if spent > self.until:
+            return (
+                f"{spent:.0f} s are used up, of {self.until:.0f} s of the device's {self.arguments.total:.0f} s so far"
+            )
         sectors = sectors_of(self.backend, side, side)
         table = (8 * sectors if kind != "field" else 4) * side**2
         device = 1.5 * table + 8 * side**2 + min(100 * n + 4 * n * k, 1 << 30)
@@ -249,7 +255,8 @@ class Device:
             return f"needs some {host / 1e9:.2g} GB of the host and {device / 1e9:.2g} GB of the device"
         work, seconds = self.last.get((axis, kind), (1.0, 0.0))
         size = side**2 if axis == "side" else n * k
-        if (foreseen := seconds * size / work) > self.arguments.longest:
+        # A first call, one that is looked at, and launches alone.
+        if (foreseen := 3 * seconds * size / work) > self.arguments.longest:
             return f"would take some {foreseen:.2g} s, more than the {self.arguments.longest:g} s of a point"
         return ""
 
@@ -268,7 +275,17 @@ class Device:
                 scene.pose[None], scanner.bearings
             )
             self.truths[key] = np.minimum(scan[0], RANGE_MAX - 0.1)
-        model, call = self.model(kind, scene, scanner, self.truths[key], n)
+        model = self.model(kind, side, scanner)
+        if kind == "rays":
+            out = np.empty((n, k), np.float32)
+
+            def call(poses: np.ndarray) -> np.ndarray:
+                return model.cast(poses, scanner.bearings, out=out)
+        else:
+
+            def call(poses: np.ndarray) -> np.ndarray:
+                return model.log_likelihood(poses, self.truths[key])
+
         start = time.perf_counter()
         call(poses)
         first = time.perf_counter() - start
@@ -286,33 +303,39 @@ class Device:
             self.backend.synchronize()
 
         alone, _ = best(again, self.arguments.repeats, seconds)
+        # They hold the call's buffers.
+        launches_of_call = len(launches)
+        launches.clear()
+        self.backend.launches.clear()
         error = self.error(kind, scene, scanner, poses, result, side)
-        floor = floor_of(kind, n, k, len(launches), model.table_bytes, self.reads[side], self.figures)
+        floor = floor_of(kind, n, k, launches_of_call, model.table_bytes, self.reads[side], self.figures)
         grown = side**2 if axis == "side" else n * k
         # The first calls of small maps are mostly compilation.
         self.last[axis, kind] = (grown, max(least, first if axis == "side" and side >= 1000 else 0.0))
         row = {
             "backend": self.info.selection, "device": self.info.name, "axis": axis, "value": value, "what": kind,
             "particles": n, "beams": k, "side": side, "first_s": first, "call_s": least, "median_s": median,
-            "launches": len(launches), "launch_s": alone, "table_bytes": model.table_bytes, "error": error,
+            "launches": launches_of_call, "launch_s": alone, "table_bytes": model.table_bytes, "error": error,
             "reads": self.reads[side][0], "steps": self.reads[side][1], "floor_call_s": floor.call,
             "floor_launch_s": floor.launches, "scattered_s": floor.scattered, "cause": floor.cause,
         }  # fmt: skip
         self.rows.append(row)
         note(table_line(row))
 
-    def model(self, kind: str, scene: Scene, scanner: gs.Scanner, z: np.ndarray, n: int) -> tuple[Any, Callable]:
-        """A model of the device, and its call with the poses."""
-        if kind == "rays":
-            caster, out = (
-                gs.RayCaster(scene.grid, RANGE_MAX, backend=self.backend),
-                np.empty((n, scanner.count), np.float32),
-            )
-            return caster, lambda poses: caster.cast(poses, scanner.bearings, out=out)
-        made = (gs.BeamModel if kind == "beam model" else gs.LikelihoodFieldModel)(
-            scene.grid, scanner, backend=self.backend
-        )
-        return made, lambda poses: made.log_likelihood(poses, z)
+    def model(self, kind: str, side: int, scanner: gs.Scanner) -> Any:
+        """A model of the device, kept while map and beams stay the same."""
+        key = (side, 0 if kind == "rays" else scanner.count)
+        if self.models.get(kind, (None, None))[0] != key:
+            # What the old one holds on the device is free before there is a new one.
+            self.models.pop(kind, None)
+            grid = self.scene(side).grid
+            if kind == "rays":
+                made: Any = gs.RayCaster(grid, RANGE_MAX, backend=self.backend)
+            else:
+                model = gs.BeamModel if kind == "beam model" else gs.LikelihoodFieldModel
+                made = model(grid, scanner, backend=self.backend)
+            self.models[kind] = (key, made)
+        return self.models[kind][1]
 
     def error(
         self, kind: str, scene: Scene, scanner: gs.Scanner, poses: np.ndarray, result: np.ndarray, side: int
@@ -456,16 +479,19 @@ def main() -> int:
     parser.add_argument("--side", type=int, default=2000, help="of the map while particles or beams vary [cells]")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--seconds", type=float, default=0.15, help="longest time of the repeats of one point")
-    parser.add_argument("--longest", type=float, default=3.0, help="a call that would take longer is left out [s]")
-    parser.add_argument("--total", type=float, default=42.0, help="longest time of one device; what is left is listed")
+    parser.add_argument("--longest", type=float, default=4.0, help="a point that would take longer is left out [s]")
+    parser.add_argument(
+        "--total", type=float, default=36.0, help="time of one device after its probes [s]; what is left is listed"
+    )
     parser.add_argument("--quick", action="store_true", help="probes of small arrays, to try the script")
     parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
     parser.add_argument("--output", type=Path, help="path without ending for the .json, .md and .png files")
     arguments = parser.parse_args()
     scenes: dict[int, Scene] = {}
+    truths: dict[tuple[Any, ...], np.ndarray] = {}
     devices, failed = [], False
     for selection in arguments.backend:
-        device = Device(selection, arguments, scenes)
+        device = Device(selection, arguments, scenes, truths)
         device.run()
         failed |= device.failed
         devices.append({

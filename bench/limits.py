@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, best, machine
+from speed import Recorder, best, command_line, machine
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -80,7 +79,7 @@ def measure(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
     """All rows of one device."""
     bench = Bench(backend, arguments)
     device, rng = bench.device, np.random.default_rng(arguments.seed)
-    grid = gs.read_map(arguments.map) if arguments.map else building(0, (100.0, 100.0))
+    grid = gs.read_map(arguments.map) if arguments.map else building(0, (arguments.size,) * 2)
     pose = free_pose(grid, rng, 0.3)
     clouds = {
         "global": lambda n: cloud_uniform(grid, n, rng),
@@ -162,6 +161,7 @@ def main() -> int:
     parser.add_argument("--particles", type=int, default=4096)
     parser.add_argument("--beams", type=int, default=360)
     parser.add_argument("--map", type=Path, help="a map_server YAML instead of the built-in building")
+    parser.add_argument("--size", type=float, default=100.0, help="side of the built-in building in metres")
     parser.add_argument("--large", action="store_true", help="a million particles, and a map of 20 000 x 20 000 cells")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--seconds", type=float, default=3.0, help="longest time of the repeats of one row")
@@ -170,7 +170,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
     arguments = parser.parse_args()
     rows = [row for backend in arguments.backend for row in measure(backend, arguments)]
-    command, host = shlex.join(["python", "bench/limits.py", *sys.argv[1:]]), machine(arguments.commit)
+    command, host = command_line("bench/limits.py"), machine(arguments.commit)
     described = ", ".join(f"{name} {value}" for name, value in host.items())
     table = f"{to_markdown(rows)}\n\nMachine: {described}. Command: `{command}`.\n"
     print(table)

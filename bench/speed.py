@@ -141,6 +141,12 @@ def to_markdown(rows: list[dict]) -> str:
     return "\n".join([head, *lines])
 
 
+def command_line(script: str) -> str:
+    """The command as typed, absolute paths by their last part."""
+    words = [Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:]]
+    return shlex.join(["python", script, *words])
+
+
 def machine(commit: str) -> dict[str, str]:
     """What the figures depend on beside the device; the commit is asked of git where it is not given."""
     commit = commit or subprocess.run(
@@ -186,7 +192,7 @@ def main() -> int:
     for backend in arguments.backend or present:
         rows += rows_of(backend, clouds, (grid, scanner, ranges), arguments)
     scene = f"{arguments.map.name if arguments.map else 'built-in building'}, {grid.shape[0]} x {grid.shape[1]} cells"
-    command = shlex.join(["python", "bench/speed.py", *sys.argv[1:]])
+    command = command_line("bench/speed.py")
     host = machine(arguments.commit)
     report = {"command": command, "scene": scene, "machine": host, "rows": rows}
     described = ", ".join(f"{name} {value}" for name, value in host.items())

@@ -216,6 +216,8 @@ def built_in_scene(seed: int = 0) -> Scene:
 
 
 Results = dict[str, tuple[np.ndarray, Tolerance]]
+# So often a GPU scores the scene's poses at once, which is often enough for them to be put in an order.
+_REPEATS = 192
 
 
 def chosen_backends(selections: Sequence[str] = ()) -> list[Backend]:
@@ -260,6 +262,7 @@ def own_results(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     results: Results = {exact.name: (squared, exact), "empty squares": (sides, TOLERANCES["empty squares"])}
     checks = [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]
     launches: dict[str, Launch] = {}
+    same_bits = TOLERANCES["batching, order, repetition"]
     for precision in ("float32", "float64")[: 1 + backend.info.float64]:
         caster = RayCaster(scene.grid, scene.scanner.range_max, backend=backend, precision=precision)
         ranges = TOLERANCES[f"{precision} ranges"]
@@ -274,11 +277,16 @@ def own_results(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
             launches[key] = launch
             true_log_p, true_parts = replay(launch)
             _, unspecialized = _score(model, scene, backend, precision, specialize=False)
+            repeats = _REPEATS if backend.info.kind == "gpu" else 1
+            alone = _model(model, scene, backend, precision).log_likelihood(
+                np.tile(scene.poses, (repeats, 1)), scene.ranges
+            )
             loose = TOLERANCES[f"specialize=False, {precision}"]
             checks += [
                 Check.of(name, "truth", f"{key}, scans", launch.values["log_p"], true_log_p, scan),
                 Check.of(name, "truth", f"{key}, beams", launch.parts, true_parts, beam),
                 Check.of(name, "specialize=False", f"{key}, beams", unspecialized, parts, loose),
+                Check.of(name, "per_beam=True", f"{key}, scans alone", alone, np.tile(log_p, repeats), same_bits),
             ]
     if backend.info.float64:
         single = launches["float32 field, nearest"].parts
@@ -289,11 +297,14 @@ def own_results(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     return results, checks
 
 
-def _score(model: str, scene: Scene, backend: Any, precision: str, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+def _model(model: str, scene: Scene, backend: Any, precision: str, **options: Any) -> BeamModel | LikelihoodFieldModel:
     make, parameters = _MODELS[model]
-    made = make(scene.grid, scene.scanner, parameters, backend=backend, precision=precision, **options)
-    log_p, parts = made.log_likelihood(scene.poses, scene.ranges, per_beam=True)
-    return log_p, parts
+    return make(scene.grid, scene.scanner, parameters, backend=backend, precision=precision, **options)
+
+
+def _score(model: str, scene: Scene, backend: Any, precision: str, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    made = _model(model, scene, backend, precision, **options)
+    return made.log_likelihood(scene.poses, scene.ranges, per_beam=True)
 
 
 def scipy_squares(obstacles: np.ndarray) -> np.ndarray:

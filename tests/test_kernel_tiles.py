@@ -26,6 +26,7 @@ from kernel_scenes import (
 from test_kernel_scores import FIELDS, MIXTURES, field_scene, mixture, scan
 
 from gpusense.backends import Backend, get_backend
+from gpusense.models.field import _GUARD
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.tiles import TILE, TILE_PARTICLES
 from gpusense.tolerances import differing, per_beam
@@ -209,6 +210,13 @@ CAREFUL = [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")]
 BLOCKED = [*itertools.product(FIELDS, CAREFUL, PRECISIONS), ("log table", ("CAREFUL", "QUICK"), np.float32)]
 
 
+def guards_of(point: np.ndarray) -> np.ndarray:
+    """How near to an edge an end point of each block of readings may be."""
+    length = np.where(np.isfinite(point[:, 0]), np.hypot(*point.T), 0.0)
+    longest = np.maximum.reduceat(length, np.arange(0, len(point), BLOCK_TERMS))
+    return (_GUARD * np.finfo(point.dtype).eps * (longest + 2)).astype(point.dtype)
+
+
 def field_blocks(
     device: Backend, name: str, real: type, names: tuple[str, ...], spread: int, way: str, readings: int, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -219,13 +227,12 @@ def field_blocks(
     scene |= {key: scene[key][some] for key in ("pose_cell", "pose", "pose_low")}
     scene |= {key: scene[key][:readings] for key in ("point", "point_low")}
     (rows, cols), blocks = scene["table"].shape, -(-readings // BLOCK_TERMS)
-    finite = scene["point"][np.isfinite(scene["point"])]
-    guard = 8 * np.finfo(real).eps * (np.abs(finite).max(initial=0.0) + 2)
+    guards = guards_of(scene["point"])
     given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
-    sizes = (rows - 4, cols - 4, count, readings, guard)
+    sizes = (rows - 4, cols - 4, count, readings)
     reference, found = on_both(
-        device, "field_blocks", flags, items(count, spread, 64, 64), *given, room_for(count, blocks, way, real), *sizes,
-        *strides(count, blocks, way), spread,
+        device, "field_blocks", flags, items(count, spread, 64, 64), *given, guards,
+        room_for(count, blocks, way, real), *sizes, *strides(count, blocks, way), spread,
     )  # fmt: skip
     untouched = np.count_nonzero(reference["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -233,7 +240,7 @@ def field_blocks(
     parts = np.empty((count, readings), real)
     log_p = np.empty(count, real)
     numpy = get_backend("numpy")
-    parts = run(numpy, "score_field", flags, (count,), *given, log_p, parts, *sizes, 0.0, 1.0)["parts"]
+    parts = run(numpy, "score_field", flags, (count,), *given, log_p, parts, *sizes, guards.max(), 0.0, 1.0)["parts"]
     bound = 2 * per_beam(parts, real) + 16 * np.finfo(real).eps * np.abs(np.where(np.isfinite(parts), parts, 0))
     bound = np.stack([bound[:, i : i + BLOCK_TERMS].sum(axis=1) for i in range(0, readings, BLOCK_TERMS)], axis=1)
     return parts_at(found["parts"], count, blocks, way), parts_at(reference["parts"], count, blocks, way), bound
@@ -270,8 +277,8 @@ def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
     for names in (("CAREFUL",), ("CAREFUL", "QUICK"), ("CAREFUL", "QUICK", "INSIDE")):
         flags = scene_flags(np.float32, *FIELDS["log table"], *names)
         both = on_both(
-            device, "field_blocks", flags, items(count, 0, 64, 64), *given, np.empty(count * blocks, np.float32), rows,
-            cols, count, readings, 8 * np.finfo(np.float32).eps * 14, 1, count, 0,
+            device, "field_blocks", flags, items(count, 0, 64, 64), *given, guards_of(high),
+            np.empty(count * blocks, np.float32), rows, cols, count, readings, 1, count, 0,
         )  # fmt: skip
         found += [one["parts"] for one in both]
     assert all(differing(one, found[0]) == 0 for one in found)

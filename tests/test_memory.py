@@ -27,9 +27,11 @@ if BACKEND.startswith("warp"):
     warp.config.mode = "debug"
     warp.config.verify_fp = False
 import gpusense as gs
+import gpusense.cloud
 from gpusense.backends import get_backend
 from gpusense.backends._numpy import NumpyBackend
 from gpusense.casters import CASTERS, Lookup, March
+from gpusense.frames import frame_scalars
 from gpusense.prepare import empty_rectangles
 from gpusense.region import Region
 
@@ -51,7 +53,10 @@ def pretend(kind):
 
 for kind in ("cpu", "gpu"):
     pretend(kind)
-    gs.distance_transform(cells, backend=device)
+    # The second is taller than the block that a search for the nearest row looks at.
+    for map_ in (cells, np.where(rng.random((70, 9)) < 0.02, 100, 0)):
+        wrong += np.count_nonzero(gs.distance_transform(map_, backend=device)
+                                  != gs.distance_transform(map_, backend=numpy))
     for sectors in (1, 2, 4):
         tables = []
         for one in (device, numpy):
@@ -61,6 +66,25 @@ for kind in ("cpu", "gpu"):
             tables.append(one.download(table, np.empty(4 * sectors * 15 * 19, np.uint16)))
         wrong += np.count_nonzero(tables[0] != tables[2]) + np.count_nonzero(tables[1] != tables[3])
 
+# Poses that are no numbers, off the window, and of huge headings, as arrays on a device may be.
+pretend("cpu")
+odd = np.array([[0.1, 0.2, 3e7], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e300, -1e300, 1e300],
+                [0.3, 0.3, -9]])
+for dtype, careful in itertools.product((np.float32, np.float64), ((), ("CAREFUL",))):
+    with np.errstate(over="ignore"):
+        poses = np.ascontiguousarray(odd.astype(dtype))
+    flags = frozenset({"HUGE_HEADINGS", *careful, *(("POSES_FLOAT32",) if dtype == np.float32 else ())})
+    results = []
+    for one in (device, numpy):
+        outs = [one.upload(np.zeros(n, t)) for n, t in
+                ((12, np.int32), (24, np.float32), (24 if careful else 4, np.float32), (2, np.int32))]
+        one.compile("place_poses", flags)(
+            (6,), one.upload(poses), *outs, *frame_scalars(grid, (0.1, 0.02, 0.0)), 1, 2, 13, 17, 6)
+        results.append(np.concatenate([one.download(outs[0], np.empty(12, np.int32)),
+                                       one.download(outs[1], np.empty(24, np.float32)),
+                                       one.download(outs[3], np.empty(2, np.int32))]))
+    wrong += np.count_nonzero(results[0] != results[1])
+
 bearings = np.linspace(-3, 3, 7)
 bearings[-1] = bearings[0]
 poses = np.column_stack([rng.uniform(-1, 2, 9), rng.uniform(-0.5, 2, 9), rng.uniform(-9, 9, 9)])
@@ -69,9 +93,24 @@ ranges[2] = np.nan
 scanner = gs.Scanner(bearings, 1.0, mount=(0.1, 0.02, 0.1))
 for kind, precision, outside in itertools.product(("cpu", "gpu"), ("float32", "float64"), ("free", "occupied")):
     pretend(kind)
+    gpusense.cloud.LEAST_ORDERED = (1, 1) if outside == "free" else (1 << 22, 1 << 12)
     casts = [gs.RayCaster(grid, 1.0, backend=b, precision=precision, outside=outside).cast(poses, bearings)
              for b in (BACKEND, "numpy")]
     wrong += np.count_nonzero(casts[0] != casts[1])
+# Tiles, orders, sums and blocks, which GPUs have: scans alone are scans with parts. Changed maps are mended.
+for order, (kind, options) in itertools.product(((1, 1), (1 << 22, 1 << 12)), (
+    (gs.BeamModel, {}), (gs.BeamModel, dict(specialize=False)), (gs.LikelihoodFieldModel, {}),
+    (gs.LikelihoodFieldModel, dict(specialize=False)), (gs.LikelihoodFieldModel, dict(compat="amcl")),
+)):
+    gpusense.cloud.LEAST_ORDERED = order
+    model = kind(grid, scanner, backend=device, **options)
+    for some in (poses, poses[:1] * 0.1 + 0.7):
+        wrong += np.count_nonzero(model.log_likelihood(some, ranges)
+                                  != model.log_likelihood(some, ranges, per_beam=True)[0])
+    model.update_map(np.full((2, 3), 100), (5, 6))
+    anew = kind(model.grid, scanner, backend=device, **options)
+    wrong += np.count_nonzero(model.log_likelihood(poses, ranges) != anew.log_likelihood(poses, ranges))
+pretend("cpu")
 # The other casters; a table of rays in bins, and marching so far that a limit ends it.
 for method, outside in itertools.product((*CASTERS, March(0.5, "centre"), Lookup(5)), ("free", "occupied")):
     casts = [gs.RayCaster(grid, 1.0, method=method, backend=b, outside=outside).cast(poses, bearings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import selftest, stiff
+from gpusense import cloud, selftest, stiff
 from gpusense.backends import get_backend
+from gpusense.backends._numpy import NumpyBackend
 from gpusense.cli import main
-from gpusense.reference import beam, distance, mixture, ranges
+from gpusense.reference import beam, distance, mixture, order, ranges, sums
 from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
 
 EPS = float(np.finfo(np.float32).eps)
@@ -222,6 +224,12 @@ def densities_of_another_mixture(flags, z, expected, terms):
     return np.where(z < 1, found + 1e-3, found).astype(terms.dtype) if terms.dtype == np.float32 else found
 
 
+def add_without_parts(flags, *arguments):
+    score_beams(flags, *arguments)
+    if "PER_BEAM" not in flags:
+        arguments[8][:] = np.nextafter(arguments[8], np.inf)
+
+
 reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
@@ -234,6 +242,7 @@ score_beams, log_density = beam.score_beams, mixture.log_density
         (beam, "score_beams", add_to_scan, "float32 beam model, scans"),
         (beam, "score_beams", add_to_beam, "float32 beam model, beams"),
         (beam, "log_density", densities_of_another_mixture, "float32 beam model, beams"),
+        (beam, "score_beams", add_without_parts, "float32 beam model, scans alone"),
     ],
 )
 def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantity):
@@ -248,6 +257,30 @@ def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantit
         code, out, _ = run(capsys, "--backend", "numpy", "--backend", partner)
         assert code == 1
         assert "BREACH" in out
+
+
+@pytest.mark.parametrize("kernel", [None, "sum_parts", "order_fill"])
+def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
+    """Tiles, orders and sums, which only GPUs have; the reference pretends to be one."""
+    backend = NumpyBackend()
+    backend.info = dataclasses.replace(backend.info, kind="gpu")
+    monkeypatch.setattr(selftest, "_REPEATS", 2)
+    monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
+    module = {"sum_parts": sums, "order_fill": order, None: None}[kernel]
+    if module is not None:
+        right = getattr(module, kernel)
+
+        def wrong(flags, first, second, third, *rest):
+            right(flags, first, second, third, *rest)
+            third[0] = third[1] if kernel == "order_fill" else third[0] + 1
+
+        monkeypatch.setattr(module, kernel, wrong)
+    whole = selftest.built_in_scene()
+    scene = dataclasses.replace(whole, poses=whole.poses[::9])
+    _, checks = selftest.own_results(backend, scene)
+    failed = {check.quantity for check in checks if not check.passed}
+    assert ("float32 beam model, scans alone" in failed) == (kernel is not None)
+    assert failed <= {check.quantity for check in checks if check.quantity.endswith("alone")}
 
 
 def test_an_absent_backend_is_an_error_only_when_named(capsys):

@@ -60,12 +60,12 @@ class Meter:
         self._held, self._bytes = [self._held[i] for i in kept], [self._bytes[i] for i in kept]
         return sum(self._bytes)
 
-    def upload(self, array: np.ndarray, out: Buffer | None = None) -> Buffer:
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
         if out is None:
             self._room(array.nbytes)
         begin = time.perf_counter()
-        buffer = self._backend.upload(array, out)
+        buffer = self._backend.upload(array, out, wait=wait)
         if self._on:
             self._backend.synchronize()
             self.seconds["upload"] += time.perf_counter() - begin

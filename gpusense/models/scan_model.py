@@ -6,7 +6,7 @@ import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, overload
+from typing import Any, Literal, cast, overload
 
 import numpy as np
 
@@ -256,7 +256,7 @@ class ScanModel(ABC):
         scans = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), self.scanner)
         single = scans.ndim == 1
         clouds = [Cloud(poses, backend)] if single else clouds_of(poses, len(scans), backend)
-        count = clouds[0].count if clouds else np.asarray(poses).shape[1]
+        count = clouds[0].count if clouds else np.shape(cast(Any, poses))[1]
         shape = (count,) if single else (len(scans), count)
         given = arrays.check_out(out, shape, self._real, poses, backend)
         flat: Any

@@ -44,7 +44,7 @@ def place_poses(
     below_one = np.nextafter(real(1), real(0))
     origin, mount = np.array([[origin_x], [origin_y]]), (mount_x, mount_y)
     first, size = np.array([[first_col], [first_row]], np.int32), np.array([[cols], [rows]], np.int32)
-    given = poses.reshape(-1, 3)[:particles]
+    given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3)
     for begin in range(0, particles, BLOCK):
         block = slice(begin, min(begin + BLOCK, particles))
         x_y_theta = given[block].T.astype(np.float64, order="C")

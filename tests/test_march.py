@@ -127,7 +127,7 @@ def test_a_march_of_a_million_cells_ends(backend):
     """There the tolerance is less than the least difference of two float32 numbers, and a step must still advance."""
     cells = np.zeros((3, 60), int)
     cells[[0, 2]] = cells[1, -1] = 100
-    caster = gs.RayCaster(gs.OccupancyGrid(cells, 1.0), 1e6, method=March(0.001), backend=backend)
+    caster = gs.RayCaster(gs.OccupancyGrid(cells, 1.0), 1_040_000, method=March(0.001), backend=backend)
     for far in (1e3, 1e5, 1e6):
         found = caster.cast([[-far, 1.5, 0.0]], [0.0])[0, 0] - far
         assert -far * 2.0**-23 <= found - 59 <= 0.001 + 2 * far * LEAST_PART

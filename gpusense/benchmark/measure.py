@@ -83,10 +83,10 @@ class Meter:
         self._bytes.append(size)
         return buffer
 
-    def download(self, buffer: Buffer, out: np.ndarray) -> np.ndarray:
-        """See Backend.download."""
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download; while it measures, this one always waits."""
         if not self._on:
-            return self._backend.download(buffer, out)
+            return self._backend.download(buffer, out, wait=wait)
         begin = time.perf_counter()
         self._backend.synchronize()
         arrived = time.perf_counter()

@@ -20,6 +20,7 @@ from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import TableMemoryError
 from gpusense.plan import Omission, Plan, share
 from gpusense.region import Region
+from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
 from gpusense.scanner import Scanner
 from gpusense.workspace import Workspace
@@ -27,7 +28,7 @@ from gpusense.workspace import Workspace
 # Particles of one launch: enough to fill a device, few enough for its memory (44 bytes each).
 CHUNK = 1 << 20
 # Most bytes of a result with a number per particle and beam.
-CHUNK_BYTES = 256 << 20
+CHUNK_BYTES = 320 << 20
 # Most particle-beams of one launch on a processor: it can be interrupted between launches, a few seconds apart.
 CHUNK_WORK = 1 << 24
 # A launch that does not fit is tried with half the particles down to this.
@@ -120,11 +121,11 @@ def log_weight(weight: float) -> float:
     return math.log(weight) if weight > 0 else -math.inf
 
 
-def chunk_of(backend: Backend, beams: int, itemsize: int = 0) -> int:
+def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
     """Particles of one launch of so many beams, with a result of ``itemsize`` bytes per particle-beam."""
     chunk = CHUNK
     if itemsize:
-        chunk = min(chunk, CHUNK_BYTES // (beams * itemsize))
+        chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
     if backend.info.kind == "cpu":
         chunk = min(chunk, CHUNK_WORK // beams)
     return max(chunk, 1)
@@ -181,6 +182,8 @@ class ScanModel(ABC):
         self._peer = compat_module.choose(compat)
         # What the sum over beams begins with, and whether readings are end points.
         self._lead, self._end_points = 0.0, end_points
+        # Numbers that GPUs keep for each reading until they are summed.
+        self._kept_parts = 1 / BLOCK_TERMS if end_points else 1.0
         self.compat = compat
         self.unknown = _checks.choice("unknown", "free" if unknown is None else unknown, ("free", "occupied"))
         self.outside = _checks.choice("outside", "free" if outside is None else outside, ("free", "occupied"))
@@ -314,8 +317,8 @@ class ScanModel(ABC):
             return
         launch = self._prepare_launch(scan)
         space, backend = self._workspace, self._backend
-        several = per_beam or backend.info.kind == "gpu"
-        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize if several else 0)
+        kept = 1.0 if per_beam else self._kept_parts if backend.info.kind == "gpu" else 0.0
+        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize * kept)
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:

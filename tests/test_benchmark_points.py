@@ -38,7 +38,7 @@ def test_costs_of_a_caster():
     assert 0 < cost.launch_min_s <= cost.launch_median_s
     rows, cols = scene.grid.shape
     # The table of the map, and poses, bearings and ranges beside it.
-    assert cost.table_bytes == 4 * (rows + 2) * (cols + 2)
+    assert cost.table_bytes == 8 * (rows + 2) * (cols + 2)
     assert cost.table_bytes + 4 * 20 * 9 < cost.device_bytes <= cost.peak_bytes
     assert cost.device_bytes < cost.table_bytes + 20_000
 

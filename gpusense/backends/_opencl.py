@@ -19,6 +19,7 @@ from gpusense.sources import assemble, relevant, uses_double, with_places
 SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
 _LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
 _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+_FILLED = 1 << 30
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
@@ -103,7 +104,10 @@ class OpenCLBackend(ProcessBound):
         with _driver_errors():
             buffer = _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
             if zero:
-                cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
+                # In pieces: one driver hangs on more than 2 GiB at once.
+                for begin in range(0, size, _FILLED):
+                    piece = min(_FILLED, size - begin)
+                    cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), begin, piece)
         return buffer
 
     def download(self, buffer: cl.Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:

@@ -19,8 +19,8 @@ from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import TableMemoryError
 from gpusense.plan import Omission, Plan, share
-from gpusense.region import Region
 from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
 from gpusense.scanner import Scanner
 from gpusense.workspace import Workspace

@@ -47,7 +47,7 @@ real short_factor(const real x) {
 // p_rand is at least 1e-30 times the larger of 1 and the peak, so components may underflow one by one, from 2e-38 on, and
 // one logarithm is enough.
 lanes log_density(const lanes z, const lanes expected, global const real *terms) {
-    lanes p = 0;
+    lanes p = terms[5];
 #if HIT
     const lanes off = z - expected, hit = terms[0] * exp_lanes(off * (off * -terms[1]));
     // The mass is 1 unless the nearer end is near.
@@ -66,7 +66,7 @@ lanes log_density(const lanes z, const lanes expected, global const real *terms)
     const lanes within = terms[3] * exp_lanes(-terms[4] * z) / divisor;
     p += (z <= expected) & (expected > 0) ? within : (lanes)0;
 #endif
-    return log_lanes(p + terms[5]);
+    return log_lanes(p);
 }
 #else
 #if LINEAR

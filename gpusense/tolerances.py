@@ -76,6 +76,14 @@ _ALL = (
         "half an ulp of the last sum, and up to 0.4 of what rounds its terms and of the polynomials",
     ),
     Tolerance(
+        "exp, 1 - exp and log in lanes", 1.1, "ulps of float32",
+        "half an ulp of the last operation, and what rounds its terms and the polynomials",
+    ),
+    Tolerance(
+        "erf in lanes", 4, "ulps of float32",
+        "1 - exp(-x W(x)): W and its product with x lose three ulps, and both count where x is small",
+    ),
+    Tolerance(
         "float32 ranges", 0, "values with other bits",
         "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines come "
         "from the host",

@@ -48,8 +48,14 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
         const lanes expected = expected_ranges(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit, resolution,
                                                range_max);
         const int count = min(readings - k, LANES);
-        for (int i = 0; i < LANES; ++i) one[i] = reading[k + min(i, count - 1)];
-        store_lanes(log_density(load_lanes(0, one), expected, terms), 0, one);
+        lanes z;
+        if (count == LANES) {
+            z = load_lanes(0, reading + k);
+        } else {
+            for (int i = 0; i < LANES; ++i) one[i] = reading[k + min(i, count - 1)];
+            z = load_lanes(0, one);
+        }
+        store_lanes(log_density(z, expected, terms), 0, one);
         for (int i = 0; i < count; ++i) {
 #if PER_BEAM
             parts[(long)n * readings + k + i] = one[i];

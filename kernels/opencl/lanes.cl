@@ -9,6 +9,7 @@ typedef int16 ilanes;
 #define to_lanes convert_float16
 #define to_ilanes convert_int16_rtz
 #define as_ilanes as_int16
+#define as_lanes as_float16
 #define load_lanes vload16
 #define store_lanes vstore16
 #define GATHER(type, table, i)                                                                                           \

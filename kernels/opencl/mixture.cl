@@ -2,33 +2,24 @@
 // terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding
 // took from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
 // z_rand / range_max; in the log domain their logarithms.
-// requires: lanes error_free
+// requires: lanes lane_math error_free
 
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keeps 1 / z* finite.
 #define SMALLEST_RANGE ((real)1e-37)
-
-// One number, or one for each lane; what is written for both takes vectors and scalars alike.
-#if WIDE
-typedef lanes number;
-#define ALL(condition) all(condition)
-#else
-typedef real number;
-#define ALL(condition) (condition)
-#endif
-
-#if HIT
-// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
-number hit_mass(const number expected, const real erf_scale, const real range_max) {
-    const number below = expected * erf_scale, above = (range_max - expected) * erf_scale;
-    if (ALL(below > ERF_ONE && above > ERF_ONE)) return (number)1;
-    return (real)0.5 * (erf(below) + erf(above));
-}
-#endif
+// Up to this 1 - exp(-x) is x within a quarter of the last bit of float32.
+#define SMALL_DECAY 2.98023224e-08f
 
 #if !WIDE
 #if HIT
+// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
+real hit_mass(const real expected, const real erf_scale, const real range_max) {
+    const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
+    if (below > ERF_ONE && above > ERF_ONE) return 1;
+    return (real)0.5 * (erf(below) + erf(above));
+}
+
 // (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large and
 // nearly cancel, and the second part keeps the digits that are left.
 real2 hit_exponent(const real z, const real expected, global const real *terms) {
@@ -42,30 +33,40 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
 #endif
 }
 #endif
-#endif
 
 #if SHORT
 // x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
-number short_factor(const number x) {
-    const number h = (real)0.5 * x;
-    return h > TINY ? h / tanh(h) + h : (number)1;
+real short_factor(const real x) {
+    const real h = (real)0.5 * x;
+    return h > TINY ? h / tanh(h) + h : (real)1;
 }
+#endif
 #endif
 
 #if WIDE
-// p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+// p_rand is at least 1e-30 times the larger of 1 and the peak, so components may underflow one by one, from 2e-38 on, and
+// one logarithm is enough.
 lanes log_density(const lanes z, const lanes expected, global const real *terms) {
-    lanes p = 0;
+    lanes p = terms[5];
 #if HIT
-    const lanes off = z - expected;
-    p += terms[0] * exp(-(off * (off * terms[1]))) / hit_mass(expected, terms[2], terms[6]);
+    const lanes off = z - expected, hit = terms[0] * exp_lanes(off * (off * -terms[1]));
+    // The mass is 1 unless the nearer end is near.
+    const lanes below = expected * terms[2], above = (terms[6] - expected) * terms[2];
+    const lanes nearer = below < above ? below : above;
+    if (some(nearer < ERF_ONE))
+        p += hit / (0.5f * (erf_lanes(nearer) + erf_lanes(below < above ? above : below)));
+    else
+        p += hit;
 #endif
 #if SHORT
-    const lanes factor = terms[3] * short_factor(terms[4] * expected);
-    const lanes within = factor * exp(-terms[4] * z) / (expected > SMALLEST_RANGE ? expected : (lanes)SMALLEST_RANGE);
-    p += z <= expected && expected > 0 ? within : (lanes)0;
+    // short_factor(x) / z* with one division: (1 - exp(-x)) / lambda is z* to the last bit where x is small.
+    const lanes x = terms[4] * expected;
+    const lanes length = x > SMALL_DECAY ? one_minus_exp(-x) * (1 / terms[4]) : expected;
+    const lanes divisor = length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
+    const lanes within = terms[3] * exp_lanes(-terms[4] * z) / divisor;
+    p += (z <= expected) & (expected > 0) ? within : (lanes)0;
 #endif
-    return log(p + terms[5]);
+    return log_lanes(p);
 }
 #else
 #if LINEAR

@@ -19,7 +19,9 @@ from gpusense.sources import assemble, relevant, uses_double, with_places
 SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
 _LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
 _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
-_FILLED = 1 << 30
+# One driver's own clearing hangs beyond 2 GiB.
+_CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
+_CLEARED_WORDS = 1 << 28
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
@@ -96,7 +98,7 @@ class OpenCLBackend(ProcessBound):
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> cl.Buffer:
         """See Backend.empty."""
-        size = max(count, 1) * np.dtype(dtype).itemsize
+        size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         if size > self.info.max_buffer:
             raise MemoryError(
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
@@ -104,11 +106,17 @@ class OpenCLBackend(ProcessBound):
         with _driver_errors():
             buffer = _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
             if zero:
-                # In pieces: one driver hangs on more than 2 GiB at once.
-                for begin in range(0, size, _FILLED):
-                    piece = min(_FILLED, size - begin)
-                    cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), begin, piece)
+                self._clear(buffer, size)
         return buffer
+
+    def _clear(self, buffer: cl.Buffer, size: int) -> None:
+        if size <= 4 * _CLEARED_WORDS:
+            cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
+            return
+        kernel, words = cl.Kernel(self._built(cl.Program(self._context, _CLEAR)), "clear"), size // 4
+        for first in range(0, words, _CLEARED_WORDS):
+            kernel.set_args(buffer, np.uint64(first))
+            cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
 
     def download(self, buffer: cl.Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""

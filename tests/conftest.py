@@ -68,12 +68,14 @@ def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backe
 
 @pytest.fixture
 def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
-    """Each tested backend in turn; called with True it pretends to be a GPU, with False it is itself again."""
+    """Each tested backend in turn; called with True it pretends to be a GPU, with False to be a processor."""
     device = get_backend(backend)
     before = device.info
 
     def pretend(gpu: bool = True) -> Backend:
-        device.info = dataclasses.replace(before, kind="gpu", lanes=1) if gpu else before
+        device.info = (
+            dataclasses.replace(before, kind="gpu", lanes=1) if gpu else dataclasses.replace(before, kind="cpu")
+        )
         return device
 
     yield pretend

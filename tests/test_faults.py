@@ -36,10 +36,12 @@ def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type, 
     whole = model.log_likelihood(poses, ranges)
     device = get_backend(backend)
     empty, asked = type(device).empty, []
+    # Of 2000 particles; GPUs keep the 41 numbers of each of a beam model's 256 until they are summed.
+    room_for = 11_000 if device.info.kind == "gpu" and model_type is gs.BeamModel else 2500
 
     def short_of_memory(self, count, dtype, *, zero=False):
         asked.append(count)
-        if count > 2500:
+        if count > room_for:
             raise MemoryError("the device is full")
         return empty(self, count, dtype, zero=zero)
 
@@ -47,7 +49,7 @@ def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type, 
     with monkeypatch.context() as patch:
         patch.setattr(type(device), "empty", short_of_memory)
         pieces = model.log_likelihood(poses, ranges)
-        assert max(asked) > 2500
+        assert max(asked) > room_for
     np.testing.assert_array_equal(pieces, whole)
     np.testing.assert_array_equal(model.log_likelihood(poses, ranges), whole)
 

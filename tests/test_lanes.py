@@ -26,7 +26,7 @@ def device(needs):
     before = backend.info
 
     def ask(lanes: int):
-        backend.info = dataclasses.replace(before, lanes=lanes)
+        backend.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
         return backend
 
     yield ask

@@ -68,7 +68,7 @@ def scene_omissions(
     """
     found = [Omission(f"{name[2:]} component", f"{name} = 0", cost) for name, weight, cost in components if not weight]
     if mount[:2] == (0.0, 0.0):
-        found.append(Omission("mount", "the scanner sits at the robot's origin", "a rotation per particle on the host"))
+        found.append(Omission("mount", "the scanner sits at the robot's origin", "a rotation per particle"))
     found.append(
         Omission(
             "unknown branch",
@@ -82,7 +82,7 @@ def scene_omissions(
     if precision == "float32":
         found.append(
             Omission(
-                "float64", "cells are split into integer and fraction on the host", "half the bytes and wide units"
+                "float64", "positions are split into cell and fraction in float64", "half the bytes and wide units"
             )
         )
     return found

@@ -85,8 +85,8 @@ _ALL = (
     ),
     Tolerance(
         "float32 ranges", 0, "values with other bits",
-        "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines come "
-        "from the host",
+        "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines are made "
+        "of these alone",
     ),
     Tolerance(
         "float64 ranges", 1e-12, "relative",

@@ -71,6 +71,9 @@ def _adopt(array: Any, backend: Backend, name: str) -> Any:
             device=info.selection.removeprefix("warp:"), copy=False,
         )  # fmt: skip
         found._gpusense_owner = array
+        if interface.get("stream") is not None:
+            # What another stream still writes must be there; of DLPack's arrays their own library sees to that.
+            wp.synchronize_device(found.device)
     if f"warp:{found.device.alias}" != info.selection:
         raise TypeError(f"{name}: must be on {info.selection}, got an array on {found.device.alias}")
     return found

@@ -15,14 +15,12 @@ from gpusense.frames import Mount, frame_scalars, place_poses, to_grid
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
 from gpusense.reference.heading import LIMIT
+from gpusense.reference.order import ALL_BINS, STRETCH
 from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
 from gpusense.region import Region
 from gpusense.workspace import Workspace
 
 _INT = np.dtype(np.int32)
-_BINS = 32768
-_SAMPLES = 256
-_STRETCHES = 1024
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
 # Particle-beams from which the time that an order saves is more than what it takes, and as many particles.
 LEAST_ORDERED = (1 << 22, 1 << 12)
@@ -136,14 +134,21 @@ class Cloud:
         cell, pose = space.upload("cell", placed.cell), space.upload("pose", placed.pose)
         return Placed(cell, pose, space.upload("pose_low", low))
 
-    def check_on_device(self, backend: Backend, space: Workspace, name: str = "poses") -> None:
-        """Wait, and raise ValueError if a pose on the device was not finite."""
-        if not self.on_device or self.count == 0:
-            return
-        verdict = backend.download(space.empty("verdict", 2, _INT, zero=True), np.empty(2, _INT))
-        if verdict[0]:
-            space.upload("verdict", np.zeros(2, _INT))
-            raise ValueError(f"{name}: must be finite, got a pose on the device that is not")
+
+def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
+    """Wait for a call to end.
+
+    Raises:
+        ValueError: a pose on the device that was placed in it was not finite.
+    """
+    verdict = np.zeros(2, _INT)
+    if on_device:
+        space.download(space.empty("verdict", 2, _INT, zero=True), verdict)
+    space.wait()
+    if verdict[0]:
+        space.upload("verdict", np.zeros(2, _INT))
+        space.wait()
+        raise ValueError(f"{name}: must be finite, got a pose on the device that is not")
 
 
 def _bounds(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,11 +192,11 @@ def ordered(backend: Backend, space: Workspace, placed: Placed, count: int, rays
     if count * rays < LEAST_ORDERED[0] or count < LEAST_ORDERED[1]:
         return None
     flags = frozenset({"FLOAT64"} if real == np.float64 else ())
-    bounds, bins = space.upload("bounds", _UNBOUNDED), space.empty("bins", _BINS, _INT)
+    bounds, bins = space.upload("bounds", _UNBOUNDED), space.empty("bins", ALL_BINS, _INT)
     bin_of, order = space.empty("bin_of", count, _INT), space.empty("order", count, _INT)
-    backend.compile("order_bounds", flags)((_BINS,), placed.cell, placed.pose, bounds, bins, count)
+    backend.compile("order_bounds", flags)((ALL_BINS,), placed.cell, placed.pose, bounds, bins, count)
     backend.compile("order_count", flags)((count,), placed.cell, placed.pose, bounds, bins, bin_of, count)
-    backend.compile("order_starts", flags)((_STRETCHES,), bounds, bins)
+    backend.compile("order_starts", flags)((ALL_BINS // STRETCH,), bounds, bins)
     backend.compile("order_fill", flags)((count,), bin_of, bins, order, count)
     return order
 

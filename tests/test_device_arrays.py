@@ -130,6 +130,17 @@ def test_in_pieces_on_the_device(method, device, monkeypatch):
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
+@pytest.mark.parametrize("count", [COUNT, 0])
+@pytest.mark.parametrize("where", [to_device, np.array], ids=["device", "host"])
+def test_no_array_of_a_call_is_kept(where, count, device):
+    """A scan's arrays must live until the device has read them, and no longer: filters call for hours."""
+    model, caster = gs.BeamModel(GRID, SCANNER, backend=device), gs.RayCaster(GRID, RANGE, backend=device)
+    for scan in (SCAN, np.full(BEAMS, np.nan)):
+        model.log_likelihood(where(POSES[:count]), scan)
+        caster.cast(where(POSES[:count]), SCANNER.bearings)
+        assert model._workspace._busy == [] and caster._caster._workspace._busy == []
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_no_particles_on_the_device(method, device):
     call, shape = call_of(method, device)

@@ -13,7 +13,7 @@ from gpusense import _checks, arrays, casters
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster, Window
-from gpusense.cloud import Cloud, all_within, ordered, tiles_of
+from gpusense.cloud import Cloud, all_within, finish, ordered, tiles_of
 from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
@@ -269,8 +269,7 @@ class MapCaster:
                     cloud.count, chunk, self._workspace,
                     lambda begin, end: self._cast_chunk(cloud, (begin, end), ray, rays, ranges),
                 )  # fmt: skip
-                self._workspace.wait()
-                cloud.check_on_device(self.backend, self._workspace)
+                finish(self._workspace, cloud.on_device)
         if out is not None:
             return out
         if cloud.on_device:

@@ -14,7 +14,7 @@ from gpusense import _checks, arrays
 from gpusense import compat as compat_module
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
-from gpusense.cloud import Cloud
+from gpusense.cloud import Cloud, finish
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import TableMemoryError
@@ -274,11 +274,7 @@ class ScanModel(ABC):
                 own = (i * count, (i + 1) * count)
                 target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)
                 self._score_scan(cloud, scans if single else scans[i], target, each_parts[i], per_beam)
-            if clouds and clouds[0].on_device:
-                for cloud in clouds:
-                    cloud.check_on_device(backend, self._workspace)
-            else:
-                self._workspace.wait()
+            finish(self._workspace, any(cloud.on_device for cloud in clouds))
         if out is not None:
             log_p = out
         elif arrays.on_device(poses):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import on_every_backend
 
 import gpusense as gs
 from gpusense import cloud
@@ -112,12 +113,12 @@ def call_of(what: str, device, precision: str):
     return model.log_likelihood, *copied
 
 
-@pytest.mark.parametrize(("gpu", "order"), [(False, False), (True, False), (True, True)])
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("what", WHATS)
-def test_the_second_call(what, precision, gpu, order, as_gpu, backend, monkeypatch):
-    if backend.startswith("warp") and precision == "float64" and not order:
-        pytest.skip("Warp compiles each set of flags anew")
+@on_every_backend(
+    what=WHATS, precision=("float32", "float64"), path=("processor", "gpu", "gpu in order"),
+    on_warp=lambda what, precision, path: precision == "float32" or path == "gpu in order",
+)  # fmt: skip
+def test_the_second_call(what, precision, path, as_gpu, monkeypatch):
+    gpu, order = path != "processor", path == "gpu in order"
     if order:
         monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
     device = as_gpu(gpu)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from conftest import on_every_backend
 from kernel_scenes import assert_near
 
 import gpusense as gs
@@ -115,11 +116,11 @@ def test_a_table_of_densities(ordered, as_gpu):
     )
 
 
-@pytest.mark.parametrize("kind", ["all over", "inside"])
-@pytest.mark.parametrize("method", ["exact", "dda", "march", "bresenham", "cddt", "lookup"])
-def test_casters(method, kind, ordered, as_gpu, backend):
-    if backend.startswith("warp") and (kind, method) not in (("all over", "exact"), ("inside", "lookup")):
-        pytest.skip("Warp compiles each set of flags anew")
+@on_every_backend(
+    method=("exact", "dda", "march", "bresenham", "cddt", "lookup"), kind=("all over", "inside"),
+    on_warp=lambda method, kind: (kind, method) in (("all over", "exact"), ("inside", "lookup")),
+)  # fmt: skip
+def test_casters(method, kind, ordered, as_gpu):
     grid, scanner, _ = world()
     for outside, precision, _ in FEW:
         found = [

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from gpusense.backends import _pocl
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel, lanes_of
@@ -78,6 +79,7 @@ class OpenCLBackend(ProcessBound):
         super().__init__()
         self.info = info
         self._device = device
+        _pocl.mend(device)
         self._context = cl.Context([device])
         self._queue = cl.CommandQueue(self._context)
         self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}

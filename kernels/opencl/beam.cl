@@ -6,6 +6,10 @@
 // What one reading adds to the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const int cells, const real per_metre, const real range_max) {
+#if ALL_READINGS
+    if (isnan(z)) return 0;
+    if (isinf(z)) return terms[7];
+#endif
 #if CUBES
     const real p = compat_density(z, expected, terms);
     return p * p * p;
@@ -95,16 +99,7 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
         const int k = r;
         {
 #endif
-            const real z = reading[k];
-            real term;
-#if ALL_READINGS
-            if (isnan(z))
-                term = 0;
-            else if (isinf(z))
-                term = terms[7];
-            else
-#endif
-                term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -129,9 +124,7 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
     log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
 #endif
 }
-#endif
 
-#if !WIDE
 // For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
 kernel void beam_tiles(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
                        global const int *order, global const real2 *ray, global const int *first,
@@ -156,16 +149,7 @@ kernel void beam_tiles(global const entry *map_table, global const int2 *pose_ce
         const int k = r;
         {
 #endif
-            const real z = reading[k];
-            real term;
-#if ALL_READINGS
-            if (isnan(z))
-                term = 0;
-            else if (isinf(z))
-                term = terms[7];
-            else
-#endif
-                term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max);
             parts[(long)place * across + (long)k * along] = term;
         }
     }

@@ -50,6 +50,11 @@ def make(name, flags):
         per_metre: real,
         range_max: real,
     ):
+        if ALL_READINGS:
+            if wp.isnan(z):
+                return ZERO
+            if wp.isinf(z):
+                return terms[7]
         if CUBES:
             p = compat_density(z, expected, terms)
             return p * p * p
@@ -113,15 +118,7 @@ def make(name, flags):
                 begin = first[r]
                 end = first[r + 1]
             for k in range(begin, end):
-                z = reading[k]
-                term = real(0.0)
-                known = True
-                if ALL_READINGS:
-                    known = not (wp.isnan(z) or wp.isinf(z))
-                    if wp.isinf(z):
-                        term = terms[7]
-                if known:
-                    term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max)
+                term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -189,15 +186,7 @@ def make(name, flags):
                 k = first[r]
                 end = first[r + 1]
             while k < end:
-                z = reading[k]
-                term = real(0.0)
-                known = True
-                if ALL_READINGS:
-                    known = not (wp.isnan(z) or wp.isinf(z))
-                    if wp.isinf(z):
-                        term = terms[7]
-                if known:
-                    term = reading_term(z, expected, terms, sensor, cells, per_metre, range_max)
+                term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max)
                 parts[place * across + k * along] = term
                 k += 1
             r += tile_step(spread)

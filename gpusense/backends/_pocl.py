@@ -10,10 +10,12 @@ from __future__ import annotations
 import ctypes
 import os
 import struct
+from typing import TYPE_CHECKING
 
-import pyopencl as cl
+if TYPE_CHECKING:
+    import pyopencl as cl
 
-# From the newest: instruction sets as Linux names them, and a processor that has them, for which PoCL's library is built.
+# From the newest: instruction sets as Linux names them, and a processor that has them, as PoCL's own library does.
 _PROCESSORS = (
     ({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}, "skylake-avx512"),
     ({"avx2", "fma", "bmi2"}, "haswell"),
@@ -41,10 +43,11 @@ def mend(device: cl.Device) -> str | None:
     with open("/proc/self/mem", "rb", buffering=0) as memory:
         words = struct.unpack(f"<{_WORDS}Q", os.pread(memory.fileno(), 8 * _WORDS, device.int_ptr))
         for i in range(1, _WORDS):
-            if _text(memory.fileno(), words[i]) == b"generic" and _text(memory.fileno(), words[i - 1])[:7] == b"x86_64-":
-                name = known_processor(_instruction_sets())
-                _replace(device.int_ptr + 8 * i, name)
-                return name
+            target, name = (_text(memory.fileno(), word) for word in words[i - 1 : i + 1])
+            if target.startswith(b"x86_64-") and name == b"generic":
+                known = known_processor(_instruction_sets())
+                _replace(device.int_ptr + 8 * i, known)
+                return known
     return None
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gpusense.models.beam import BeamModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
-    from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
+    from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
     from gpusense.weights import Weights, normalize_weights, resample
@@ -30,6 +30,7 @@ _HOME = {
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
@@ -54,6 +55,7 @@ __all__ = [
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
     "OccupancyGrid",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
 from typing import Any, ClassVar, Literal, Self
 
 from gpusense import _checks
@@ -86,6 +87,56 @@ class BeamParameters(_Parameters):
         self._check_weights("z_hit", "z_short", "z_max", "z_rand")
         self._check("sigma_hit", above=0)
         self._check("lambda_short", low=0)
+
+
+@dataclass(frozen=True)
+class IncidenceParameters:
+    """The beam model's parameters for each range of angles of incidence.
+
+    The angle of incidence lies between a beam and the normal of the surface it hits: 0 is head-on, pi / 2 grazing.
+
+    Raises:
+        TypeError: a value is not of its field's kind.
+        ValueError: the edges do not rise from 0 to pi / 2, or there is not one set of parameters for each bin.
+    """
+
+    edges: tuple[float, ...]
+    """(B + 1,) bounds of the bins, rising from 0 to pi / 2 [rad]."""
+    parameters: tuple[BeamParameters, ...]
+    """(B,) the parameters of each bin; a beam that hits nothing has those of the first."""
+
+    def __post_init__(self) -> None:
+        edges = tuple(float(edge) for edge in _checks.array("edges", self.edges, ("B + 1",)))
+        if len(edges) < 2 or edges[0] != 0 or abs(edges[-1] - math.pi / 2) > 1e-9:
+            raise ValueError(f"edges: must rise from 0 to pi / 2, got {_checks.show(self.edges)}")
+        if any(low >= high for low, high in pairwise(edges)):
+            raise ValueError(f"edges: must rise from 0 to pi / 2, got {_checks.show(self.edges)}")
+        parameters = tuple(self.parameters)
+        for each in parameters:
+            if not isinstance(each, BeamParameters):
+                raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(each)}")
+        if len(parameters) != len(edges) - 1:
+            raise ValueError(f"parameters: must be one for each of {len(edges) - 1} bins, got {len(parameters)}")
+        object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "parameters", parameters)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields by name, as plain numbers."""
+        return {"edges": list(self.edges), "parameters": [each.to_dict() for each in self.parameters]}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The parameters that :meth:`to_dict` wrote.
+
+        Raises:
+            TypeError: ``values`` is not a mapping, or a value is not of its field's kind.
+            ValueError: a key is missing or names no field, or a value breaks its field's rule.
+        """
+        if not isinstance(values, Mapping):
+            raise TypeError(f"values: must be a mapping, got {_checks.show(values)}")
+        if set(values) != {"edges", "parameters"}:
+            raise ValueError(f"{cls.__name__}: must have the fields edges and parameters, got {sorted(values)}")
+        return cls(values["edges"], tuple(BeamParameters.from_dict(each) for each in values["parameters"]))
 
 
 @dataclass(frozen=True)

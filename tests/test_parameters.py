@@ -11,7 +11,7 @@ import json
 import numpy as np
 import pytest
 
-from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
 
 
 def test_defaults():
@@ -66,7 +66,39 @@ def test_extreme_scales_are_legal():
     assert BeamParameters(sigma_hit=3e7, lambda_short=1e6).sigma_hit == 3e7
 
 
-@pytest.mark.parametrize("kind", [BeamParameters, LikelihoodFieldParameters])
+TWO = IncidenceParameters((0, 0.6, np.pi / 2), (BeamParameters(), BeamParameters(sigma_hit=0.3)))
+
+
+def test_parameters_for_each_angle_of_incidence():
+    assert TWO.edges == (0.0, 0.6, np.pi / 2)
+    assert IncidenceParameters.from_dict(json.loads(json.dumps(TWO.to_dict()))) == TWO
+    assert len({TWO, IncidenceParameters(TWO.edges, TWO.parameters)}) == 1
+
+
+@pytest.mark.parametrize(
+    ("edges", "parameters", "error", "message"),
+    [
+        ((0, 1), TWO.parameters[:1], ValueError, "edges: must rise from 0 to pi / 2, got (0, 1)"),
+        ((0, 1, 0.5, np.pi / 2), TWO.parameters, ValueError, "edges: must rise from 0 to pi / 2, got"),
+        ((0.1, np.pi / 2), TWO.parameters[:1], ValueError, "edges: must rise from 0 to pi / 2, got"),
+        ((0, np.nan, np.pi / 2), TWO.parameters, ValueError, "edges: must be finite"),
+        (TWO.edges, TWO.parameters[:1], ValueError, "parameters: must be one for each of 2 bins, got 1"),
+        (TWO.edges, (BeamParameters(), 3), TypeError, "parameters: must be BeamParameters, got 3"),
+    ],
+)
+def test_bad_parameters_for_angles_of_incidence(edges, parameters, error, message):
+    with pytest.raises(error) as raised:
+        IncidenceParameters(edges, parameters)
+    assert str(raised.value).startswith(message)
+
+
+@pytest.mark.parametrize("values", [3, {"edges": [0, 1]}, {**TWO.to_dict(), "more": 1}])
+def test_bad_dictionaries_of_them(values):
+    with pytest.raises((TypeError, ValueError), match=r"must (be a mapping|have the fields edges and parameters), got"):
+        IncidenceParameters.from_dict(values)
+
+
+@pytest.mark.parametrize("kind", [BeamParameters, IncidenceParameters, LikelihoodFieldParameters])
 def test_every_parameter_is_documented(kind):
     body = ast.parse(inspect.getsource(kind)).body[0].body
     documented = {

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyopencl as cl
 
 # From the newest: instruction sets as Linux names them, and a processor that has them, as PoCL's own library does.
-_PROCESSORS = (
+_PROCESSORS: tuple[tuple[set[str], str], ...] = (
     ({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}, "skylake-avx512"),
     ({"avx2", "fma", "bmi2"}, "haswell"),
     ({"avx"}, "sandybridge"),

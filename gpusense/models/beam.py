@@ -15,7 +15,8 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
 from gpusense.cloud import Cloud, all_within, ordered, tiles_of
-from gpusense.cones import Cones, require_exact
+from gpusense.cones import cones_of, require_exact
+from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
@@ -111,15 +112,16 @@ class BeamModel(ScanModel):
             if sensor_table is not None:
                 raise ValueError(f"sensor_table: must be None with compat, got {_checks.show(sensor_table)}")
         method = casters.choose("caster", "exact" if caster is None else caster)
-        if incidence is not None:
-            require_exact("caster", method)
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize,
             z_max=max(p.z_max for p in self._kinds), end_points=False,
         )  # fmt: skip
         self._max_depends = len({p.z_max for p in self._kinds}) > 1
-        self._cones = Cones(incidence=incidence is not None)
+        self._cones = cones_of(scanner, method, incidence=incidence is not None)
+        self._rays_each = self._cones.rays
+        # The rays of each beam: one, or those of a cone.
+        self._cone_vectors = ray_vectors(scanner.ray_bearings, scanner.mount)
         self._caster = MapCaster(
             self._backend, self._real, grid, scanner.mount, scanner.range_max, method,
             unknown=self.unknown, outside=self.outside, crop=specialize,
@@ -177,20 +179,20 @@ class BeamModel(ScanModel):
             self.grid = self._caster.update(cells, region)
 
     def expected_ranges(self, poses: object, *, out: Any = None) -> Any:
-        """z* of every beam of the scanner at each pose.
+        """z* of every beam of the scanner at each pose; of a cone, the range of the nearest return.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad]; arrays of other libraries as in ``log_likelihood``.
             out: Where to write them, as in ``log_likelihood``.
 
         Returns:
-            (N, K) metres in the model's precision; exactly range_max where nothing is nearer.
+            (N, K) metres in the model's precision; exactly range_max where nothing is nearer, or returns.
 
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
         """
         with self._lock:
-            return self._caster.cast(poses, self._vectors, out)
+            return self._caster.cast(poses, self._cone_vectors, out, dataclasses.replace(self._cones, incidence=False))
 
     def incidence(self, poses: object, *, out: Any = None) -> Any:
         """The angle of incidence of every beam of the scanner at each pose; see ``RayCaster.incidence``.
@@ -200,14 +202,15 @@ class BeamModel(ScanModel):
             out: Where to write them, as in ``log_likelihood``.
 
         Returns:
-            (N, K) radians in [0, pi / 2] in the model's precision, 0 head-on; NaN where a beam hits nothing.
+            (N, K) radians in [0, pi / 2] in the model's precision, 0 head-on; of a cone, that of the ray with the
+            nearest return. NaN where a beam has none.
 
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers, or a caster that is not exact.
         """
         require_exact("caster", self._caster.method)
         with self._lock:
-            return self._caster.cast(poses, self._vectors, out, dataclasses.replace(self._cones, incidence=True))
+            return self._caster.cast(poses, self._cone_vectors, out, dataclasses.replace(self._cones, incidence=True))
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
@@ -253,6 +256,7 @@ class BeamModel(ScanModel):
             omissions.append(far)
         caster = self._caster.method
         how = "" if caster.name == "exact" else f", ranges by {caster}"
+        how += self._cones.words(self.scanner.critical_incidence)
         if self.incidence_parameters is not None:
             how += f", parameters for {len(self._kinds)} ranges of the angle of incidence"
             how += " (max readings depend on it)" if self._max_depends else ""
@@ -331,7 +335,9 @@ class BeamModel(ScanModel):
 
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
-        ray, shared = space.upload("ray", scan.rays.astype(real)), scan.shared or not self._specialize
+        # Readings that share a ray, the axis of their cones, share these.
+        vectors = scan.rays if self._cones.rays == 1 else self._cone_vectors[scan.columns[scan.first[:-1]]]
+        ray, shared = space.upload("ray", vectors.astype(real)), scan.shared or not self._specialize
         first = space.upload("first", scan.first) if scan.shared else self._one_each
         reading = space.upload("reading", scan.readings.astype(real))
         rays, readings = len(scan.rays), len(scan.readings)

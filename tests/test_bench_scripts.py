@@ -124,3 +124,21 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert {"rays, global, 120 x 8", "field, tracking, 120 x 8", "preparation, beam model"} <= set(names)
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 for row in report["rows"])
     assert all(row["error"] < 1e-2 for row in report["rows"] if row["error"] is not None)
+
+
+def test_sonar_field_runs(tmp_path: Path) -> None:
+    """Every way is tuned and scored, and the drawings are made; the recorded run is left out where there is none."""
+    report = run_script(
+        "sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4", "--particles", "30",
+        "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
+    )  # fmt: skip
+    rows = report["rows"]
+    assert len({row["model"] for row in rows}) == 4 and {row["window"] for row in rows} == {1, 8}
+    for row in rows:
+        assert len(row["rank"]) == (4 if row["window"] == 1 else 2)
+        assert all(0 <= rank <= 1 for rank in row["rank"] + row["global rank"])
+        assert all(-50 < value <= math.log(31) + 1e-9 for value in row["information"])
+        assert all(0 <= error < 5 for error in row["error"])
+        # Tuned ways know more than nothing about a pose, one frame at a time.
+        assert row["window"] == 8 or sum(row["information"]) > 0
+    assert sorted(file.name for file in (tmp_path / "drawn").glob("*.png")) == ["sonar-scene.png", "sonar-scores.png"]

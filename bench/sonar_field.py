@@ -236,6 +236,22 @@ def better(log_p: np.ndarray) -> float:
     return float((log_p[1:] > log_p[0]).mean() + 0.5 * (log_p[1:] == log_p[0]).mean())
 
 
+def at_the_truth(model: Any, poses: np.ndarray, z: np.ndarray) -> dict[str, float | None]:
+    """How the readings differ from what a beam model expects at the true poses.
+
+    The median of the differences of those that have both a reading and an expected return, and the share of readings
+    without an echo where one is expected.
+    """
+    if not isinstance(model, gs.BeamModel):
+        return {"bias": None, "unexpected_silence": None}
+    expected, heard = model.expected_ranges(poses), np.isfinite(z)
+    returns = expected < model.scanner.range_max
+    return {
+        "bias": float(np.median((z - expected)[heard & returns])),
+        "unexpected_silence": float(returns[~heard].mean()) if not heard.all() else None,
+    }
+
+
 def measure(place: Place, arguments: argparse.Namespace, backend: Any) -> list[dict[str, Any]]:
     """Tune each way and score it; a row a way and length of windows."""
     rng = np.random.default_rng(7)
@@ -250,31 +266,39 @@ def measure(place: Place, arguments: argparse.Namespace, backend: Any) -> list[d
     rows = []
     for name in COLOURS:
         numbers, model = tuned(place, name, np.stack(clouds), z, arguments.quick, backend)
+        numbers = {"numbers": numbers, **at_the_truth(model, *place.scored)}
         for window in (1, 8):
             # Simulated paths are of 8 frames.
             every = max((len(place.scored[0]) - window + 1) // arguments.scans, 1)
             every = window if window == 8 and place.name == "building" else every
             found = scores(place, model, window, arguments.particles, every, np.random.default_rng(11))
-            rows.append({"place": place.name, "model": name, "window": window, "numbers": numbers, **found})
+            rows.append({"place": place.name, "model": name, "window": window, **numbers, **found})
     return rows
 
 
 # ---- report
 
 
+def known(number: float | None) -> str:
+    """A number, or a dash."""
+    return "-" if number is None else f"{number:.2f}"
+
+
 def to_markdown(rows: list[dict[str, Any]]) -> str:
     """A table of medians and means."""
     lines = [
         "| place (scored) | frames | model | tuned to | rank median / mean | global rank median / mean "
-        "| information mean [nats] | error median / mean [m] | of the guess [m] |",
-        "| --- " * 9 + "|",
+        "| information mean [nats] | error median / mean [m] | of the guess [m] | reading less expected, median [m] "
+        "| no echo where one is expected |",
+        "| --- " * 11 + "|",
     ]
     for row in rows:
         numbers = ", ".join(f"{name} {value:g}" for name, value in row["numbers"].items())
         pairs = [f"{np.median(row[k]):.3f} / {np.mean(row[k]):.3f}" for k in ("rank", "global rank", "error")]
         lines.append(
             f"| {row['place']} ({len(row['rank'])}) | {row['window']} | {row['model']} | {numbers} | {pairs[0]} "
-            f"| {pairs[1]} | {np.mean(row['information']):.2f} | {pairs[2]} | {np.mean(row['prior']):.3f} |"
+            f"| {pairs[1]} | {np.mean(row['information']):.2f} | {pairs[2]} | {np.mean(row['prior']):.3f} "
+            f"| {known(row['bias'])} | {known(row['unexpected_silence'])} |"
         )
     return "\n".join(lines)
 
@@ -340,6 +364,17 @@ def draw_scene(place: Place, path: Path, backend: Any) -> None:
     plots.save(figure, path)
 
 
+def draw_run(place: Place, path: Path) -> None:
+    """A map and the poses that are scored in it."""
+    figure = plots.new_figure(6.5, 5.0)
+    ax = figure.add_subplot()
+    plots.draw_map(ax, place.grid)
+    ax.plot(*place.scored[0][:, :2].T, ".", ms=2, color="#d7263d", label="scored poses")
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+    ax.legend(loc="upper right", fontsize=8)
+    plots.save(figure, path)
+
+
 def main() -> int:
     """Measure, draw and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -362,6 +397,8 @@ def main() -> int:
                 draw_scene(place, arguments.figures / "sonar-scene.png", device)
         elif name == "sonar_pioneer8" and arguments.data is not None:
             place = recorded(Path(arguments.data) / name, arguments.scans)
+            if arguments.figures:
+                draw_run(place, arguments.figures / "sonar-map.png")
         else:
             left_out.append(name)
             continue

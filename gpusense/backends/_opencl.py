@@ -63,9 +63,18 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
 
 def _lanes(device: cl.Device) -> int:
     """PoCL compiles loops in kernels as they are written; other drivers make vectors of neighbouring work-items."""
-    if "Portable Computing Language" not in device.platform.name or not device.type & cl.device_type.CPU:
+    if not _pocl.is_pocl(device) or not device.type & cl.device_type.CPU:
         return 1
     return 16 if device.native_vector_width_float >= 16 else 8
+
+
+def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
+    """Where programs are kept; None for PoCL, which keeps them itself.
+
+    Asked for a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size. That
+    takes three times as long as all it does unasked.
+    """
+    return None if _pocl.is_pocl(device) else ProgramCache(info)
 
 
 class _Buffer(cl.Buffer):
@@ -84,7 +93,7 @@ class OpenCLBackend(ProcessBound):
         self._queue = cl.CommandQueue(self._context)
         self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
-        self._cache = ProgramCache(info)
+        self._cache = _program_cache(info, device)
         # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
@@ -158,20 +167,28 @@ class OpenCLBackend(ProcessBound):
         if not self.info.float64 and uses_double(file, flags):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
-        binary = self._cache.load(source, self.options)
-        if binary is not None:
-            try:
-                return self._built(cl.Program(self._context, [self._device], [binary]))
-            except cl.Error:
-                self._cache.discard(source, self.options)
+        if (program := self._kept(source)) is not None:
+            return program
         try:
             program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
             log = with_places(str(error), source)
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
-        binaries: Any = program.get_info(cl.program_info.BINARIES)
-        self._cache.store(source, self.options, binaries[0])
+        if self._cache is not None:
+            binaries: Any = program.get_info(cl.program_info.BINARIES)
+            self._cache.store(source, self.options, binaries[0])
         return program
+
+    def _kept(self, source: str) -> cl.Program | None:
+        """The program as an earlier run compiled it, where there is one that the driver still takes."""
+        binary = None if self._cache is None else self._cache.load(source, self.options)
+        if self._cache is None or binary is None:
+            return None
+        try:
+            return self._built(cl.Program(self._context, [self._device], [binary]))
+        except cl.Error:
+            self._cache.discard(source, self.options)
+            return None
 
     def _built(self, program: cl.Program) -> cl.Program:
         with warnings.catch_warnings():

@@ -26,20 +26,34 @@ def on_device(array: object) -> bool:
     return hasattr(array, "__cuda_array_interface__")
 
 
-def to_host(array: object) -> object:
-    """A NumPy view of an array of another library in host memory, anything else as it is."""
+def to_host(array: object, name: str = "poses") -> object:
+    """A NumPy view of an array of another library in host memory, anything else as it is.
+
+    Raises:
+        TypeError: a tensor whose gradients are recorded.
+    """
     if isinstance(array, (np.ndarray, list, tuple)) or not hasattr(array, "__dlpack__"):
         return array
     try:
         return np.from_dlpack(array)
-    except (BufferError, RuntimeError, TypeError, AttributeError):
+    except (BufferError, RuntimeError, TypeError, AttributeError) as error:
+        _check_gradients(array, name, error)
         return array
+
+
+def _check_gradients(array: object, name: str, error: Exception) -> None:
+    """Say why an array is not exported where its library records its gradients, which are not computed here."""
+    if getattr(array, "requires_grad", False) is True:
+        raise TypeError(
+            f"{name}: must not require gradients, which are not computed here, got a "
+            f"{type(array).__module__}.{type(array).__name__} that does: pass {name}.detach()"
+        ) from error
 
 
 def copied_to_host(array: object, backend: Backend, name: str) -> object:
     """Readings as NumPy has them; those on the device are copied, which waits for it."""
     if not on_device(array):
-        return to_host(array)
+        return to_host(array, name)
     return _adopt(array, backend, name).numpy()
 
 
@@ -60,7 +74,11 @@ def _adopt(array: Any, backend: Backend, name: str) -> Any:
     if isinstance(array, wp.array):
         found = array
     elif hasattr(array, "__dlpack__"):
-        found = wp.from_dlpack(array)
+        try:
+            found = wp.from_dlpack(array)
+        except (BufferError, RuntimeError, TypeError) as error:
+            _check_gradients(array, name, error)
+            raise
     else:
         interface = array.__cuda_array_interface__
         dtype = {"<f4": wp.float32, "<f8": wp.float64, "<i4": wp.int32, "<i8": wp.int64}.get(interface["typestr"])
@@ -140,7 +158,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, given: object
         dtype, contiguous = np.dtype(str(found.dtype.__name__)), found.is_contiguous
         writeable, found_shape = True, found.shape
     else:
-        found = to_host(out)
+        found = to_host(out, "out")
         if not isinstance(found, np.ndarray):
             raise TypeError(f"out: must be an array, got {show(out)}")
         if not found.flags.writeable and found is not out:

@@ -28,11 +28,15 @@ LEAST_ORDERED = (1 << 22, 1 << 12)
 
 @dataclass(frozen=True)
 class Placed:
-    """Sensors in the frame of a window, on the device: cells, poses, and what rounding took from these."""
+    """Sensors in the frame of a window, on the device: cells, poses, and what rounding took from these.
+
+    ``flags`` is what their headings ask for: HUGE_HEADINGS or nothing.
+    """
 
     cell: Buffer
     pose: Buffer
     low: Buffer
+    flags: frozenset[str]
 
 
 class Cloud:
@@ -54,7 +58,7 @@ class Cloud:
         if self.on_device:
             self._buffer, self.count, self._single = arrays.adopt_poses(poses, backend, name)
             return
-        given = arrays.to_host(poses)
+        given = arrays.to_host(poses, name)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
             self.host = np.ascontiguousarray(given, np.float64)
             self._corners = self._bounds(0, len(given))
@@ -99,24 +103,26 @@ class Cloud:
         """Poses part[0] to part[1] - 1 in the frame of a window."""
         (begin, end), (region, grid, mount) = part, frame
         count = end - begin
+        # Nobody has looked at the headings of poses that are on the device.
+        huge = self.host is None or np.abs(self._corners[:, 2]).max() > LIMIT
+        headings = frozenset({"HUGE_HEADINGS"} if huge else ())
         if not backend.info.float64:
-            return self._place_on_host(space, part, frame, real, careful)
-        flags = {"FLOAT64"} if real == np.float64 else set()
+            return self._place_on_host(space, part, frame, real, careful, headings)
+        flags = headings | ({"FLOAT64"} if real == np.float64 else set())
         flags |= {"CAREFUL"} if careful else set()
         if self.host is None:
-            given, flags = self._buffer, flags | {"HUGE_HEADINGS"} | ({"POSES_FLOAT32"} if self._single else set())
+            given, flags = self._buffer, flags | ({"POSES_FLOAT32"} if self._single else set())
             given = backend.part(given, 3 * begin, 3 * count)
         else:
             given = space.upload("poses", self.host[begin:end])
-            flags |= {"HUGE_HEADINGS"} if np.abs(self._corners[:, 2]).max() > LIMIT else set()
         cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
         low = space.empty("pose_low", 4 * count if careful else 4, real)
         verdict = space.empty("verdict", 2, _INT, zero=True)
         window = (region.col, region.row, region.rows, region.cols)
-        backend.compile("place_poses", frozenset(flags))(
+        backend.compile("place_poses", flags)(
             (count,), given, cell, pose, low, verdict, *frame_scalars(grid, mount), *window, count
         )
-        return Placed(cell, pose, low)
+        return Placed(cell, pose, low, headings)
 
     def _place_on_host(
         self,
@@ -125,6 +131,7 @@ class Cloud:
         frame: tuple[Region, OccupancyGrid, Mount],
         real: np.dtype,
         careful: bool,
+        headings: frozenset[str],
     ) -> Placed:
         assert self.host is not None
         region, grid, mount = frame
@@ -132,7 +139,7 @@ class Cloud:
         placed.cell[:] -= (region.col, region.row)
         low = placed.low if careful else placed.low[:1]
         cell, pose = space.upload("cell", placed.cell), space.upload("pose", placed.pose)
-        return Placed(cell, pose, space.upload("pose_low", low))
+        return Placed(cell, pose, space.upload("pose_low", low), headings)
 
 
 def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:

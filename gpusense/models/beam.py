@@ -13,7 +13,7 @@ from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
-from gpusense.cloud import Cloud, all_within, ordered, tiles_of
+from gpusense.cloud import LEAST_ORDERED, Cloud, all_within, ordered, tiles_of
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
@@ -25,7 +25,7 @@ from gpusense.models.scan_model import (
     sums_linearly,
 )
 from gpusense.parameters import BeamParameters
-from gpusense.plan import Omission, scene_omissions, share
+from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
@@ -198,6 +198,7 @@ class BeamModel(ScanModel):
                     "exponents in two parts", f"the hit density's peak is at most {HIGH_PEAK:g} / m", "37 operations"
                 )
             )
+        omissions += launch_omissions(self._last_code, LEAST_ORDERED if self.device.kind == "gpu" else None)
         if (far := self._caster.omission()) is not None:
             omissions.append(far)
         caster = self._caster.method
@@ -276,7 +277,7 @@ class BeamModel(ScanModel):
             table, region, corners = cloud.ensure(self._caster.map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
             placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=False)
-            flags = self._components | self._scene_flags() | self._caster.flags
+            flags = self._components | self._scene_flags() | self._caster.flags | placed.flags
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}

@@ -25,7 +25,7 @@ from gpusense.models.scan_model import (
     sums_linearly,
 )
 from gpusense.parameters import LikelihoodFieldParameters
-from gpusense.plan import Omission, scene_omissions
+from gpusense.plan import Omission, launch_omissions, scene_omissions
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
@@ -161,6 +161,7 @@ class LikelihoodFieldModel(ScanModel):
             omissions.append(Omission("exponents in two parts", why, "some 200 operations per particle-beam"))
         if not self._bilinear:
             omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))
+        omissions += launch_omissions(self._last_code)
         if (far := self._map.omission(self._real.itemsize)) is not None:
             omissions.append(far)
         title = f"likelihood field{self._peer_note()}, {self.precision}, {self.device.selection} ({self.device.name})"
@@ -215,7 +216,7 @@ class LikelihoodFieldModel(ScanModel):
             table, region, corners = cloud.ensure(self._map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
             placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=careful)
-            flags = self._flags | ({"PER_BEAM"} if per_beam else set())
+            flags = self._flags | placed.flags | ({"PER_BEAM"} if per_beam else set())
             given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
             if backend.info.kind == "gpu" and not per_beam:
                 if careful and self._log_table and self._specialize:

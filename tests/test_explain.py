@@ -57,7 +57,7 @@ def test_explain_of_a_model_that_leaves_nothing_out(kind):
 
 
 def test_explain_of_a_full_beam_model(backend):
-    """What is needed is not called unnecessary. The other tests are of host code, which is the same for all backends."""
+    """What is needed is not called unnecessary; what the other tests look at is host code, the same everywhere."""
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())

@@ -17,7 +17,7 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """hit_mass, short_factor and log_density specialised by the flags."""
+    """hit_mass, hit_exponent, short_factor, short_peak and log_density specialised by the flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     two_product = error_free.functions(flags).two_product
@@ -35,13 +35,21 @@ def functions(flags):
     SMALLEST_RANGE = real(1e-37)
 
     # Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
+    # Most ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
     @wp.func
     def hit_mass(expected: real, erf_scale: real, range_max: real):
         below = expected * erf_scale
         above = (range_max - expected) * erf_scale
-        if wp.min(below, above) > ERF_ONE:
+        nearer = wp.min(below, above)
+        farther = wp.max(below, above)
+        if nearer > ERF_ONE:
             return ONE
-        return HALF * (wp.erf(below) + wp.erf(above))
+        rest = real(1.0)
+        if farther <= ERF_ONE:
+            rest = wp.erf(farther)
+        if nearer > ZERO:
+            rest += wp.erf(nearer)
+        return HALF * rest
 
     # (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large
     # and nearly cancel, and the second part keeps the digits that are left.
@@ -63,6 +71,18 @@ def functions(flags):
             return h / wp.tanh(h) + h
         return ONE
 
+    # short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
+    @wp.func
+    def short_peak(rate: real, expected: real):
+        h = HALF * (rate * expected)
+        above = ONE
+        below = wp.max(expected, SMALLEST_RANGE)
+        if h > TINY:
+            t = wp.tanh(h)
+            above = rate * (ONE + t)
+            below = t + t
+        return above / below
+
     # p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
     @wp.func
     def log_density_linear(z: real, expected: real, terms: wp.array(dtype=real)):
@@ -77,8 +97,7 @@ def functions(flags):
                 p += hit / mass
         if SHORT:
             if z <= expected and expected > ZERO:
-                x = terms[4] * expected
-                p += terms[3] * short_factor(x) * wp.exp(-terms[4] * z) / wp.max(expected, SMALLEST_RANGE)
+                p += terms[3] * wp.exp(-terms[4] * z) * short_peak(terms[4], expected)
         return wp.log(p + terms[5])
 
     # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.

@@ -5,19 +5,20 @@ NumPy arrays are checked and bounded here; arrays that are on the device already
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpusense import _checks, arrays
 from gpusense.backends.base import Backend, Buffer
-from gpusense.frames import Mount, frame_scalars, place_poses, to_grid
+from gpusense.frames import Mount, frame_scalars, place_poses
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
 from gpusense.reference.heading import LIMIT
 from gpusense.reference.order import ALL_BINS, STRETCH
 from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
-from gpusense.region import Region
+from gpusense.region import Corners, Region, extent
 from gpusense.workspace import Workspace
 
 _INT = np.dtype(np.int32)
@@ -58,7 +59,7 @@ class Cloud:
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
             self.host = np.ascontiguousarray(given, np.float64)
             self._corners = self._bounds(0, len(given))
-            if not np.isfinite(self._corners).all():
+            if not all(map(math.isfinite, (*self._corners[0], *self._corners[3]))):
                 self.host = _checks.array(name, given, ("N", 3))
         else:
             self.host = np.ascontiguousarray(_checks.array(name, given, ("N", 3)))
@@ -68,18 +69,18 @@ class Cloud:
     def __len__(self) -> int:
         return self.count
 
-    def corners(self, begin: int, end: int) -> np.ndarray:
-        """(4, 3) corners of the box that holds some poses; the corners of no poses are at 0."""
+    def corners(self, begin: int, end: int) -> Corners:
+        """Four corners of the box that holds some poses; the corners of no poses are at 0."""
         return self._corners if end - begin == self.count else self._bounds(begin, end)
 
-    def _bounds(self, begin: int, end: int) -> np.ndarray:
+    def _bounds(self, begin: int, end: int) -> Corners:
         assert self.host is not None
         if begin == end:
-            return np.zeros((4, 3))
+            return ((0.0, 0.0, 0.0),) * 4
         low, high = _bounds(self.host[begin:end])
-        return np.array([low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high])
+        return low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high
 
-    def ensure(self, table: ReachableMap, begin: int, end: int) -> tuple[Buffer, Region, np.ndarray | None]:
+    def ensure(self, table: ReachableMap, begin: int, end: int) -> tuple[Buffer, Region, Corners | None]:
         """The map's table for some poses, its window, and the corners of these poses where they are known."""
         if self.host is None:
             return *table.ensure(None), None
@@ -108,7 +109,7 @@ class Cloud:
             given = backend.part(given, 3 * begin, 3 * count)
         else:
             given = space.upload("poses", self.host[begin:end])
-            flags |= {"HUGE_HEADINGS"} if np.abs(self._corners[:, 2]).max() > LIMIT else set()
+            flags |= {"HUGE_HEADINGS"} if max(-self._corners[0][2], self._corners[3][2]) > LIMIT else set()
         cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
         low = space.empty("pose_low", 4 * count if careful else 4, real)
         verdict = space.empty("verdict", 2, _INT, zero=True)
@@ -151,7 +152,7 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
         raise ValueError(f"{name}: must be finite, got a pose on the device that is not")
 
 
-def _bounds(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(poses: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Least and largest of each column of (N, 3) numbers, NaN where there is one.
 
     Columns of three are slow to reduce, so 64 rows at a time are taken for one.
@@ -162,23 +163,18 @@ def _bounds(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         wide = poses[:whole].reshape(-1, 192)
         parts += [np.minimum.reduce(wide).reshape(64, 3), np.maximum.reduce(wide).reshape(64, 3)]
     few = np.concatenate(parts)
-    return few.min(axis=0), few.max(axis=0)
-
-
-def extent(corners: np.ndarray, grid: OccupancyGrid, mount: Mount) -> tuple[float, float, float, float]:
-    """Least and largest column and row, in cells, that a sensor of poses within these corners can have."""
-    x, y = to_grid(grid, corners[:, 0] - grid.origin[0], corners[:, 1] - grid.origin[1])
-    margin = float(np.hypot(mount[0], mount[1])) / grid.resolution + 1
-    return x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin
+    low, high = np.minimum.reduce(few).tolist(), np.maximum.reduce(few).tolist()
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
 def all_within(
-    corners: np.ndarray | None, grid: OccupancyGrid, mount: Mount, region: Region, reach: float, ring: int = 0
+    corners: Corners | None, grid: OccupancyGrid, mount: Mount, region: Region, reach: float, ring: int = 0
 ) -> bool:
     """Whether everything within reach cells of the sensors surely lies in a window and a ring around it."""
     if corners is None:
         return False
-    left, right, low, high = extent(corners, grid, mount)
+    left, right, low, high = extent(grid, corners, mount)
+    reach += 1
     return bool(
         left - reach >= region.col - ring
         and right + reach <= region.col + region.cols + ring

@@ -247,7 +247,7 @@ class MapCaster:
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
         with self._lock:
-            buffer, region = self.map.ensure(np.array([self.grid.origin]))
+            buffer, region = self.map.ensure([self.grid.origin])
             entries = self.backend.download(buffer, np.empty(region.cells * bins, np.uint16))
             obstacles = region.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))

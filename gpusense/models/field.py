@@ -94,6 +94,8 @@ class LikelihoodFieldModel(ScanModel):
         self._bilinear = p.interpolation == "bilinear"
         self._lead = 0.0 if peer is None else 1.0
         self._log_table = (specialize or peer is not None) and not self._bilinear
+        self._guard = _GUARD * float(np.finfo(self._real).eps)
+        self._firsts = np.arange(0, scanner.count, BLOCK_TERMS)
         self._flags, terms = self._mixture()
         self._terms_there = self._backend.upload(terms)
         self._none = self._backend.upload(np.zeros(1, np.int32))
@@ -194,22 +196,26 @@ class LikelihoodFieldModel(ScanModel):
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
         cells = scan.readings / self.grid.resolution
-        finite = np.isfinite(cells)
-        high, low = split(scan.vectors * np.where(finite, cells, 0.0)[:, None], real)
-        high[~finite] = cells[~finite, None]
+        lengths = cells
+        if not self._specialize:
+            # Missing and max readings are no lengths, and stay what they are as points.
+            finite = np.isfinite(cells)
+            lengths = np.where(finite, cells, 0.0)
+        high, low = split(scan.vectors * lengths[:, None], real)
+        if not self._specialize:
+            high[~finite] = cells[~finite, None]
         point, point_low = space.upload("point", high), space.upload("point_low", low)
-        longest = np.max(cells, initial=0.0, where=finite)
+        longest = float(lengths.max())
         # What products of rounded factors and their sums can be off: 3.12 eps of the longest reading, and 1.5 eps.
-        guard = _GUARD * np.finfo(real).eps * (longest + 2)
+        guard = self._guard * (longest + 2)
         if backend.info.kind == "gpu":
-            firsts = np.arange(0, len(cells), BLOCK_TERMS)
-            longest_each = np.maximum.reduceat(np.where(finite, cells, 0.0), firsts)
-            guards = space.upload("guards", (_GUARD * np.finfo(real).eps * (longest_each + 2)).astype(real))
+            longest_each = np.maximum.reduceat(lengths, self._firsts[: -(-len(cells) // BLOCK_TERMS)])
+            guards = space.upload("guards", (self._guard * (longest_each + 2)).astype(real))
         readings = len(scan.readings)
 
         careful = "CAREFUL" in self._flags
         scalars = (scan.constant + self._lead, self.temperature)
-        reach = float(longest) + 2
+        reach = longest + 2
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._map, *part)

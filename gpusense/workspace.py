@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import cast
+
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Backend, Buffer, Gathering
 
 
 class Workspace:
@@ -15,10 +18,20 @@ class Workspace:
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that copies under way read or write.
         self._busy: list[np.ndarray] = []
+        self._gather: Callable[[], None] | None = getattr(backend, "gather", None)
+
+    def __enter__(self) -> Workspace:
+        """Begin a call: where that is faster, the device may do all that it starts in one go."""
+        if self._gather is not None:
+            self._gather()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._gather is not None:
+            cast(Gathering, self._backend).scatter()
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """A buffer of at least ``count`` numbers; what it held is lost. A new one is cleared where asked."""
-        dtype = np.dtype(dtype)
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
             self._buffers.pop((name, dtype), None)

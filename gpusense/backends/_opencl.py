@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpusense.backends import _pocl
-from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
+from gpusense.backends.base import BackendInfo, Buffer, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel, lanes_of
 from gpusense.sources import assemble, relevant, uses_double, with_places
@@ -92,7 +92,7 @@ class _Shared(cl.SVMAllocation):
         flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
         super().__init__(context, size, _ALIGNMENT, flags)
         # By address, since a view of this object that it keeps would be a cycle.
-        self.bytes = np.frombuffer((ctypes.c_char * size).from_address(self.svm_ptr), np.uint8)
+        self.bytes = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
         self._settle = settle
 
     def __del__(self) -> None:
@@ -125,7 +125,7 @@ class OpenCLBackend(ProcessBound):
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
 
-    def upload(self, array: np.ndarray, out: cl.Buffer | None = None, *, wait: bool = True) -> cl.Buffer:
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
         self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
@@ -139,7 +139,7 @@ class OpenCLBackend(ProcessBound):
                 cl.enqueue_copy(self._queue, buffer, array, is_blocking=wait)
         return buffer
 
-    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Any:
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """See Backend.empty."""
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         if size > self.info.max_buffer:
@@ -166,7 +166,7 @@ class OpenCLBackend(ProcessBound):
             kernel.set_args(buffer, np.uint64(first))
             cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
 
-    def download(self, buffer: cl.Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
             if isinstance(buffer, _Shared):
@@ -177,7 +177,7 @@ class OpenCLBackend(ProcessBound):
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
 
-    def part(self, buffer: cl.Buffer, first: int, count: int) -> cl.Buffer:
+    def part(self, buffer: Buffer, first: int, count: int) -> Buffer:
         """See Backend.part."""
         raise TypeError("buffer: parts of OpenCL buffers are not used")
 

@@ -70,6 +70,19 @@ class Launcher(Protocol):
         """Start one launch; buffers and scalars in the order of the signature table."""
 
 
+class Gathering(Protocol):
+    """What a backend may have besides, where to start things takes longer than small ones last."""
+
+    def gather(self) -> None:
+        """From now on this thread's launches and copies may wait until ``synchronize``, and are done in their order.
+
+        Nothing else changes: what must be done at once is done at once, after all before it.
+        """
+
+    def scatter(self) -> None:
+        """Start what still waits, and gather no more."""
+
+
 class Backend(Protocol):
     """A device that holds buffers and runs kernels."""
 

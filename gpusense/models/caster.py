@@ -262,7 +262,7 @@ class MapCaster:
         else:
             ranges = np.empty((cloud.count, rays), self.real) if given is None else given
         if cloud.count * rays:
-            with self._lock:
+            with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
                 chunk = chunk_of(self.backend, rays, self.real.itemsize)
                 in_chunks(

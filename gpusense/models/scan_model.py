@@ -269,7 +269,7 @@ class ScanModel(ABC):
             flat = (np.empty(shape, self._real) if given is None else given).reshape(-1)
         parts = np.zeros((*shape, self.scanner.count if per_beam else 0), self._real)
         each_parts = parts.reshape(len(clouds), count, parts.shape[-1])
-        with self._lock:
+        with self._lock, self._workspace:
             for i, cloud in enumerate(clouds):
                 own = (i * count, (i + 1) * count)
                 target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)

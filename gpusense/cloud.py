@@ -22,6 +22,8 @@ from gpusense.region import Corners, Region, extent
 from gpusense.workspace import Workspace
 
 _INT = np.dtype(np.int32)
+_PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
+_SINGLE = _HUGE | {"POSES_FLOAT32"}
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
 # Poses whose bounds are found at once.
 _BOUNDED = 8192
@@ -89,34 +91,41 @@ class Cloud:
         corners = self.corners(begin, end)
         return *table.ensure(corners), corners
 
+    def given(self, backend: Backend, space: Workspace, part: tuple[int, int]) -> Buffer:
+        """Poses part[0] to part[1] - 1 on the device, as they were given; None where the host is to place them."""
+        begin, count = part[0], part[1] - part[0]
+        if self.host is None:
+            return backend.part(self._buffer, 3 * begin, 3 * count)
+        return space.upload("poses", self.host[begin : part[1]]) if backend.info.float64 else None
+
+    def code(self) -> frozenset[str]:
+        """The flags of ``place_poses`` that these poses need."""
+        if self.host is None:
+            return _SINGLE if self._single else _HUGE
+        return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LIMIT else _PLAIN
+
     def place(
         self,
         backend: Backend,
         space: Workspace,
+        given: Buffer,
         part: tuple[int, int],
         frame: tuple[Region, OccupancyGrid, Mount],
         real: np.dtype,
         *,
         careful: bool,
     ) -> Placed:
-        """Poses part[0] to part[1] - 1 in the frame of a window."""
+        """Poses part[0] to part[1] - 1, which are ``given``, in the frame of a window."""
         (begin, end), (region, grid, mount) = part, frame
         count = end - begin
-        if not backend.info.float64:
+        if given is None:
             return self._place_on_host(space, part, frame, real, careful)
-        flags = {"FLOAT64"} if real == np.float64 else set()
-        flags |= {"CAREFUL"} if careful else set()
-        if self.host is None:
-            given, flags = self._buffer, flags | {"HUGE_HEADINGS"} | ({"POSES_FLOAT32"} if self._single else set())
-            given = backend.part(given, 3 * begin, 3 * count)
-        else:
-            given = space.upload("poses", self.host[begin:end])
-            flags |= {"HUGE_HEADINGS"} if max(-self._corners[0][2], self._corners[3][2]) > LIMIT else set()
+        flags = self.code() | ({"FLOAT64"} if real == np.float64 else set()) | ({"CAREFUL"} if careful else set())
         cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
         low = space.empty("pose_low", 4 * count if careful else 4, real)
         verdict = space.empty("verdict", 2, _INT, zero=True)
         window = (region.col, region.row, region.rows, region.cols)
-        backend.compile("place_poses", frozenset(flags))(
+        backend.compile("place_poses", flags)(
             (count,), given, cell, pose, low, verdict, *frame_scalars(grid, mount), *window, count
         )
         return Placed(cell, pose, low)

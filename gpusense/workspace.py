@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Hashable, Iterable
 from typing import cast
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer, Gathering
+
+# Calls whose launches are kept.
+_MOST_KEPT = 64
 
 
 class Workspace:
@@ -18,22 +21,56 @@ class Workspace:
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that copies under way read or write.
         self._busy: list[np.ndarray] = []
-        self._gather: Callable[[], None] | None = getattr(backend, "gather", None)
+        self._gathering = cast(Gathering, backend) if hasattr(backend, "gather") else None
+        # Launches of earlier calls by all that they depend on, and that of which some have begun.
+        self._kept: dict[Hashable, object] = {}
+        self._begun: tuple[Hashable, object] | None = None
 
     def __enter__(self) -> Workspace:
         """Begin a call: where that is faster, the device may do all that it starts in one go."""
-        if self._gather is not None:
-            self._gather()
+        if self._gathering is not None:
+            self._gathering.gather()
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._gather is not None:
-            cast(Gathering, self._backend).scatter()
+        if self._gathering is not None:
+            self._gathering.scatter()
+
+    def again(self, buffers: Iterable[Buffer], *key: Hashable) -> bool:
+        """Repeat launches of an earlier call, if it has been seen; otherwise they follow, and ``keep``.
+
+        Args:
+            buffers: Those of the launches that are not of this workspace and may be others in another call.
+            key: All else that differs between calls: sizes, numbers, flags.
+        """
+        self._begun = None
+        gathering = self._gathering
+        if gathering is None or (mark := gathering.mark()) is None:
+            return False
+        key += tuple([gathering.address(buffer) for buffer in buffers])
+        kept = self._kept.get(key)
+        if kept is None:
+            self._begun = (key, mark)
+            return False
+        gathering.repeat(kept)
+        return True
+
+    def keep(self) -> None:
+        """Keep the launches since ``again``."""
+        if self._begun is not None and self._gathering is not None:
+            key, mark = self._begun
+            kept = self._gathering.kept(mark)
+            if kept is not None:
+                if len(self._kept) >= _MOST_KEPT:
+                    del self._kept[next(iter(self._kept))]
+                self._kept[key] = kept
+        self._begun = None
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """A buffer of at least ``count`` numbers; what it held is lost. A new one is cleared where asked."""
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
+            self._kept.clear()
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
@@ -60,4 +97,5 @@ class Workspace:
     def release(self, keep: str = "") -> None:
         """Wait, and give the memory back, but for that of one name; the next call allocates anew."""
         self.wait()
+        self._kept.clear()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}

@@ -25,7 +25,7 @@ import warp as wp
 
 from gpusense._kernel_files import warp_module
 from gpusense.backends._numpy import _memory
-from gpusense.backends._warp_queue import Graphs, Queue
+from gpusense.backends._warp_queue import Graphs, Group, Queue
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import cache_folder
 from gpusense.signatures import KERNELS, Argument, Kernel
@@ -193,6 +193,33 @@ class WarpBackend(ProcessBound):
             finally:
                 self._queues.append(queue)
 
+    def mark(self) -> object | None:
+        """See Gathering.mark."""
+        queue = self.gathering()
+        return None if queue is None else (queue.started, len(queue.steps))
+
+    def kept(self, mark: object) -> object | None:
+        """See Gathering.kept."""
+        queue = self.gathering()
+        assert queue is not None and isinstance(mark, tuple)
+        started, first = mark
+        steps = queue.steps[first:]
+        if started != queue.started or not all(isinstance(step, _LaunchStep) for step in steps):
+            return None
+        group = Group([step.alone() for step in steps if isinstance(step, _LaunchStep)])
+        queue.steps[first:] = [group]
+        return group
+
+    def repeat(self, kept: object) -> None:
+        """See Gathering.repeat."""
+        queue = self.gathering()
+        assert queue is not None and isinstance(kept, Group)
+        queue.steps.append(kept)
+
+    def address(self, buffer: wp.array) -> int:
+        """See Gathering.address."""
+        return int(buffer.ptr or 0)
+
     def gathering(self) -> Queue | None:
         """What this thread gathers in, if it does."""
         return getattr(self._thread, "queue", None)
@@ -201,6 +228,7 @@ class WarpBackend(ProcessBound):
         """Start what was gathered."""
         if queue.steps:
             steps, queue.steps = queue.steps, []
+            queue.started += 1
             self._graphs.start(steps)
 
     def _wait(self) -> None:
@@ -278,6 +306,12 @@ class _LaunchStep:
         self._given = (size, arguments, keys)
         self._launch = launch
         self.key: Hashable = (id(launch), size, *keys)
+
+    def alone(self) -> _LaunchStep:
+        """The same launch, which keeps no array alive."""
+        size, arguments, keys = self._given
+        own = [_slice(value, 0, value.size) if isinstance(value, wp.array) else value for value in arguments]
+        return _LaunchStep(self._launch, size, tuple(own), keys)
 
     def start(self, stream: wp.Stream | None) -> None:
         """See Step.start."""

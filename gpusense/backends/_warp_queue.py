@@ -8,6 +8,7 @@ replayed from a graph: one start for all. Pointers and numbers are what a graph 
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Hashable, Mapping
 from typing import Any, Protocol
@@ -50,11 +51,27 @@ class Copy:
         wp.copy(target, source, count=count, stream=stream)
 
 
+class Group:
+    """Steps that belong together: one for whoever compares them."""
+
+    _numbers = itertools.count()
+
+    def __init__(self, steps: list[Step]) -> None:
+        self._steps = steps
+        self.key: Hashable = next(self._numbers)
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """See Step.start."""
+        _start_each(self._steps, stream)
+
+
 class Queue:
     """What one call has gathered."""
 
     def __init__(self, device: wp.Device, types: Mapping[Any, Any]) -> None:
         self.steps: list[Step] = []
+        # How often steps were started.
+        self.started = 0
         # False while the device may still read or write the page-locked memory.
         self.settled = True
         self._types = types

@@ -82,6 +82,18 @@ class Gathering(Protocol):
     def scatter(self) -> None:
         """Start what still waits, and gather no more."""
 
+    def mark(self) -> object | None:
+        """Where in what this thread gathers it is now; None where it does not."""
+
+    def kept(self, mark: object) -> object | None:
+        """The launches since a mark, to be repeated; None if there was anything else. It keeps no buffer alive."""
+
+    def repeat(self, kept: object) -> None:
+        """Gather such launches once more: with the same memory and numbers."""
+
+    def address(self, buffer: Buffer) -> int:
+        """Where a buffer lies."""
+
 
 class Backend(Protocol):
     """A device that holds buffers and runs kernels."""

@@ -275,15 +275,23 @@ class BeamModel(ScanModel):
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
-            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=False)
+            poses = cloud.given(backend, space, part)
             flags = self._components | self._scene_flags() | self._caster.flags
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
+            gpu = backend.info.kind == "gpu" and not per_beam
+            if gpu:
+                sizes = (count, rays, readings, shared, inside)
+                if space.again(
+                    (poses, result, table, first), cloud.code(), self._caster.map.preparations, sizes, scalars
+                ):
+                    return None
+            placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=False)
             world = (region.rows, region.cols, count, rays, readings, *self._caster.scalars, self._cells)
             world += (self._cells / self.scanner.range_max, self._caster.limit, self.grid.resolution)
             world += (self.scanner.range_max,)
-            if backend.info.kind == "gpu" and not per_beam:
+            if gpu:
                 order = ordered(backend, space, placed, count, rays, real)
                 flags |= {"ORDERED"} if order is not None else set()
                 self._last_code = frozenset(flags)
@@ -297,6 +305,7 @@ class BeamModel(ScanModel):
                 backend.compile("sum_parts", self._last_code)(
                     (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
                 )
+                space.keep()
                 return parts
             flags |= {"PER_BEAM"} if per_beam else set()
             flags = self._last_code = widened(backend.info, "score_beams", flags)

@@ -279,7 +279,8 @@ class MapCaster:
     def _cast_chunk(self, cloud: Cloud, part: tuple[int, int], ray: Buffer, rays: int, ranges: Any) -> None:
         space, backend, count = self._workspace, self.backend, part[1] - part[0]
         table, region, corners = cloud.ensure(self.map, *part)
-        placed = cloud.place(backend, space, part, (region, self.grid, self.mount), self.real, careful=False)
+        given = cloud.given(backend, space, part)
+        placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
         if cloud.on_device:
             result = backend.part(ranges, part[0] * rays, count * rays)
         else:

@@ -97,6 +97,7 @@ class LikelihoodFieldModel(ScanModel):
         self._guard = _GUARD * float(np.finfo(self._real).eps)
         self._firsts = np.arange(0, scanner.count, BLOCK_TERMS)
         self._flags, terms = self._mixture()
+        self._quick, self._inside = self._flags | {"QUICK"}, self._flags | {"QUICK", "INSIDE"}
         self._terms_there = self._backend.upload(terms)
         self._none = self._backend.upload(np.zeros(1, np.int32))
         table = FieldTable(
@@ -220,14 +221,20 @@ class LikelihoodFieldModel(ScanModel):
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
-            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=careful)
-            flags = self._flags | ({"PER_BEAM"} if per_beam else set())
-            given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
-            if backend.info.kind == "gpu" and not per_beam:
+            poses = cloud.given(backend, space, part)
+            flags, gpu = self._flags, backend.info.kind == "gpu" and not per_beam
+            if gpu:
                 if careful and self._log_table and self._specialize:
                     inside = all_within(corners, self.grid, mount, region, reach, _RING)
-                    flags |= {"QUICK", "INSIDE"} if inside else {"QUICK"}
+                    flags = self._inside if inside else self._quick
                 self._last_code = flags
+                if space.again(
+                    (poses, result, table), cloud.code(), flags, self._map.preparations, count, readings, scalars
+                ):
+                    return None
+            placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=careful)
+            given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
+            if gpu:
                 blocks = -(-readings // BLOCK_TERMS)
                 parts = space.empty("parts", count * blocks, real)
                 spread = spread_of(count, blocks)
@@ -238,7 +245,9 @@ class LikelihoodFieldModel(ScanModel):
                 backend.compile("sum_parts", flags)(
                     (count,), parts, self._none, result, count, blocks, 1, 1, count, *scalars
                 )
+                space.keep()
                 return parts
+            flags |= {"PER_BEAM"} if per_beam else set()
             flags = self._last_code = widened(backend.info, "score_field", flags)
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             backend.compile("score_field", flags)(

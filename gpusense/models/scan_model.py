@@ -334,7 +334,9 @@ class ScanModel(ABC):
         """Place poses on the device for nothing but to learn whether they are finite."""
         if cloud.on_device and cloud.count:
             frame = (Region(0, 0, *self.grid.shape), self.grid, self.scanner.mount)
-            cloud.place(self._backend, self._workspace, (0, cloud.count), frame, self._real, careful=False)
+            part = (0, cloud.count)
+            given = cloud.given(self._backend, self._workspace, part)
+            cloud.place(self._backend, self._workspace, given, part, frame, self._real, careful=False)
 
     def _fill(self, log_p: Any, value: float) -> None:
         if isinstance(log_p, np.ndarray):

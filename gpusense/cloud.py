@@ -57,7 +57,7 @@ class Cloud:
         self.host: np.ndarray | None = None
         self.on_device = arrays.on_device(poses)
         if self.on_device:
-            self._buffer, self.count, self._single = arrays.adopt_poses(poses, backend, name)
+            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name)
             return
         given = arrays.to_host(poses)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from typing import cast
 
 import numpy as np
@@ -11,6 +11,8 @@ from gpusense.backends.base import Backend, Buffer, Gathering
 
 # Calls whose launches are kept.
 _MOST_KEPT = 64
+# Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
+_ALIGNED = 64
 
 
 class Workspace:
@@ -25,6 +27,7 @@ class Workspace:
         # Launches of earlier calls by all that they depend on, and that of which some have begun.
         self._kept: dict[Hashable, object] = {}
         self._begun: tuple[Hashable, object] | None = None
+        self._parts: dict[Hashable, list[Buffer]] = {}
 
     def __enter__(self) -> Workspace:
         """Begin a call: where that is faster, the device may do all that it starts in one go."""
@@ -35,6 +38,11 @@ class Workspace:
     def __exit__(self, *error: object) -> None:
         if self._gathering is not None:
             self._gathering.scatter()
+
+    def start(self) -> None:
+        """Let the device begin with what the call has started so far."""
+        if self._gathering is not None:
+            self._gathering.start()
 
     def again(self, buffers: Iterable[Buffer], *key: Hashable) -> bool:
         """Repeat launches of an earlier call, if it has been seen; otherwise they follow, and ``keep``.
@@ -70,7 +78,7 @@ class Workspace:
         """A buffer of at least ``count`` numbers; what it held is lost. A new one is cleared where asked."""
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
-            self._kept.clear()
+            self._forget()
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
@@ -84,6 +92,28 @@ class Workspace:
         self._busy.append(array)
         return self._backend.upload(array, self.empty(name, array.size, array.dtype), wait=False)
 
+    def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
+        """Upload arrays of one dtype, none of them empty: as one where the device does in one go what a call starts."""
+        if self._gathering is None or self._gathering.mark() is None:
+            return [self.upload(f"{name} {i}", array) for i, array in enumerate(arrays)]
+        sizes = tuple([array.size for array in arrays])
+        firsts, total = [], 0
+        for size in sizes:
+            firsts.append(total)
+            total += -(-size // _ALIGNED) * _ALIGNED
+        packed = np.empty(total, arrays[0].dtype)
+        for first, array in zip(firsts, arrays, strict=True):
+            packed[first : first + array.size] = array.reshape(-1)
+        buffer = self.upload(name, packed)
+        key = (name, packed.dtype, sizes)
+        parts = self._parts.get(key)
+        if parts is None:
+            if len(self._parts) >= _MOST_KEPT:
+                self._parts.clear()
+            parts = [self._backend.part(buffer, first, size) for first, size in zip(firsts, sizes, strict=True)]
+            self._parts[key] = parts
+        return parts
+
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""
         self._busy.append(out)
@@ -94,8 +124,13 @@ class Workspace:
         self._backend.synchronize()
         self._busy.clear()
 
+    def _forget(self) -> None:
+        """What was kept of buffers is no longer right."""
+        self._kept.clear()
+        self._parts.clear()
+
     def release(self, keep: str = "") -> None:
         """Wait, and give the memory back, but for that of one name; the next call allocates anew."""
         self.wait()
-        self._kept.clear()
+        self._forget()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}

@@ -73,9 +73,9 @@ def _lanes(device: cl.Device) -> int:
 
 def _shares_memory(device: cl.Device) -> bool:
     """Whether host and device may look at the same memory between commands, and neither is far from it: a processor."""
-    if not device.type & cl.device_type.CPU or not device.host_unified_memory:
-        return False
     try:
+        if not device.type & cl.device_type.CPU or not device.host_unified_memory:
+            return False
         return bool(device.svm_capabilities & cl.device_svm_capabilities.FINE_GRAIN_BUFFER)
     except cl.Error:
         return False

@@ -183,6 +183,12 @@ class WarpBackend(ProcessBound):
         queue.begin()
         self._thread.queue = queue
 
+    def start(self) -> None:
+        """See Gathering.start."""
+        queue = self.gathering()
+        if queue is not None:
+            self._flush(queue)
+
     def scatter(self) -> None:
         """See Gathering.scatter."""
         queue = self.gathering()

@@ -17,12 +17,15 @@ import numpy as np
 import warp as wp
 
 # Page-locked bytes of a call, and the largest array that takes this way.
-_MEMORY = 4 << 20
+_MEMORY = 16 << 20
 _LARGEST = 256 << 10
 # Bytes between the beginnings of arrays there.
 _ALIGNMENT = 256
 # Views of that memory, graphs, and keys of calls that might become graphs, which are kept.
-_MOST_VIEWS, _MOST_GRAPHS, _MOST_SEEN = 1024, 64, 256
+_MOST_VIEWS, _MOST_GRAPHS, _MOST_SEEN = 1024, 256, 512
+# A graph makes room for another when so many calls have not used it, in multiples of the graphs that there may be: to
+# make one takes longer than what it stands for.
+_STALE = 16
 # Beyond this a call is long enough for its starts not to count.
 _MOST_STEPS = 64
 
@@ -135,7 +138,9 @@ class Graphs:
 
     def __init__(self, device: wp.Device) -> None:
         self._device = device
-        self._graphs: dict[Hashable, Any] = {}
+        # The least recently used first, each with the number of the call that used it last.
+        self._graphs: dict[Hashable, tuple[Any, int]] = {}
+        self._calls = 0
         self._seen: dict[Hashable, None] = {}
         self._lock = threading.Lock()
         self._stream: wp.Stream | None = None
@@ -149,16 +154,24 @@ class Graphs:
         key = tuple([step.key for step in steps])
         # A graph must not be started by two threads at once.
         with self._lock:
-            graph = self._graphs.pop(key, None)
-            if graph is None and self._seen.pop(key, key) is None:
+            self._calls += 1
+            graph, _ = self._graphs.pop(key, (None, 0))
+            if graph is None and self._seen.pop(key, key) is None and self._room():
                 graph = self._record(steps)
             if graph is None:
                 _remember(self._seen, key, None, _MOST_SEEN)
             else:
-                _remember(self._graphs, key, graph, _MOST_GRAPHS)
+                _remember(self._graphs, key, (graph, self._calls), _MOST_GRAPHS)
                 wp.capture_launch(graph)
                 return
         _start_each(steps, None)
+
+    def _room(self) -> bool:
+        """Whether another graph may be kept."""
+        if len(self._graphs) < _MOST_GRAPHS:
+            return True
+        _, used = next(iter(self._graphs.values()))
+        return self._calls - used > _STALE * _MOST_GRAPHS
 
     def _record(self, steps: list[Step]) -> Any:
         """A graph of steps, none of which is started; None where there can be none now.

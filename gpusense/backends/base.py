@@ -79,6 +79,9 @@ class Gathering(Protocol):
         Nothing else changes: what must be done at once is done at once, after all before it.
         """
 
+    def start(self) -> None:
+        """Start what still waits."""
+
     def scatter(self) -> None:
         """Start what still waits, and gather no more."""
 

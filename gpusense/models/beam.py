@@ -266,9 +266,9 @@ class BeamModel(ScanModel):
 
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
-        ray, shared = space.upload("ray", scan.rays.astype(real)), scan.shared or not self._specialize
+        ray, reading = space.upload_all("scan", (scan.rays.astype(real), scan.readings.astype(real)))
+        shared = scan.shared or not self._specialize
         first = space.upload("first", scan.first) if scan.shared else self._one_each
-        reading = space.upload("reading", scan.readings.astype(real))
         rays, readings = len(scan.rays), len(scan.readings)
         scalars = (scan.constant + self._lead, self.temperature)
 

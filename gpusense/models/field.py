@@ -205,13 +205,15 @@ class LikelihoodFieldModel(ScanModel):
         high, low = split(scan.vectors * lengths[:, None], real)
         if not self._specialize:
             high[~finite] = cells[~finite, None]
-        point, point_low = space.upload("point", high), space.upload("point_low", low)
-        longest = float(lengths.max())
+        longest = float(np.maximum.reduce(lengths))
         # What products of rounded factors and their sums can be off: 3.12 eps of the longest reading, and 1.5 eps.
         guard = self._guard * (longest + 2)
         if backend.info.kind == "gpu":
             longest_each = np.maximum.reduceat(lengths, self._firsts[: -(-len(cells) // BLOCK_TERMS)])
-            guards = space.upload("guards", (self._guard * (longest_each + 2)).astype(real))
+            guard_each = (self._guard * (longest_each + 2)).astype(real)
+            point, point_low, guards = space.upload_all("points", (high, low, guard_each))
+        else:
+            point, point_low = space.upload_all("points", (high, low))
         readings = len(scan.readings)
 
         careful = "CAREFUL" in self._flags

@@ -274,6 +274,8 @@ class ScanModel(ABC):
                 own = (i * count, (i + 1) * count)
                 target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)
                 self._score_scan(cloud, scans if single else scans[i], target, each_parts[i], per_beam)
+                if not single:
+                    self._workspace.start()
             finish(self._workspace, any(cloud.on_device for cloud in clouds))
         if out is not None:
             log_p = out

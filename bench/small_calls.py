@@ -155,6 +155,10 @@ class Bench:
                     call_there = functools.partial(call, poses=there)
                     self.add(f"{size}, on the device{what}", call_there, call_there, kernels, calls)
             self.several(name, model, next(iter(self.clouds.values())), kernels)
+        graphs = getattr(self.device, "_graphs", None)
+        if graphs is not None and self.device._gathers:
+            refused = ", and the driver refused one" if graphs.failed else ""
+            print(f"{self.device.info.selection}: {len(graphs._graphs)} graphs are kept{refused}", file=sys.stderr)
 
     def several(self, name: str, model: Any, poses: np.ndarray, kernels: float) -> None:
         """Many scans in one call, against as many calls, both the short way."""

@@ -96,7 +96,8 @@ class _Shared(cl.SVMAllocation):
         self._settle = settle
 
     def __del__(self) -> None:
-        # Unlike a buffer, the driver does not keep it for what was started; PoCL 3's clEnqueueSVMFree corrupts memory.
+        # Unlike a buffer, the driver does not keep it for what was started. To free it through the queue, pyopencl's
+        # other way, ended in a corrupted heap with PoCL 3.
         self._settle()
 
 
@@ -203,7 +204,7 @@ class OpenCLBackend(ProcessBound):
         if self._ended != self._queued:
             self.synchronize()
 
-    def start(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
+    def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
         """Queue a launch of a kernel whose arguments are set."""
         cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
         with self._count:
@@ -264,7 +265,7 @@ class _Launch:
         # Arguments belong to the kernel object, so two threads must not interleave here.
         with self._lock, _driver_errors():
             self._kernel.set_args(*arguments)
-            self._backend.start(self._kernel, rounded, group)
+            self._backend.enqueue(self._kernel, rounded, group)
 
 
 class _driver_errors:

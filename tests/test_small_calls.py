@@ -78,6 +78,14 @@ def test_what_is_started_sees_what_was_there(two_ways):
     assert all(np.array_equal(a, b) for a, b in zip(results[:3], results[3:], strict=True))
 
 
+def test_shared_memory_that_is_not_to_be_had(two_ways):
+    """It is a MemoryError, and nothing else is said."""
+    from gpusense.backends._opencl import _driver_errors, _Shared
+
+    with pytest.raises(MemoryError, match="out of memory"), _driver_errors():
+        _Shared(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
+
+
 # ---- CUDA: launches and copies that are gathered, and graphs; Warp's processor stands in for a GPU
 
 
@@ -126,6 +134,12 @@ def test_graphs_change_no_bit(kind, gathering, monkeypatch):
         poses[0, 2] = 1e8 if seed == 3 else 0.5
         expected = plainly(device, monkeypatch, lambda p=poses, z=ranges: model.log_likelihood(p, z))
         assert differing(model.log_likelihood(poses, ranges), expected) == 0
+        if kind is gs.BeamModel:
+            # Code of calls that are kept shows as well.
+            inside = np.full((50, 3), 3.0)
+            assert "ORIGINS_OUTSIDE" in model._last_code
+            model.log_likelihood(inside, ranges)
+            assert "ORIGINS_OUTSIDE" not in model._last_code
     # Of each of three sizes the first calls are plain, and so are those of other code.
     assert len(started) >= 3
     # A changed map mends or makes the table anew.

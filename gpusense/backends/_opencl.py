@@ -98,7 +98,9 @@ class _Shared(cl.SVMAllocation):
     def __del__(self) -> None:
         # Unlike a buffer, the driver does not keep it for what was started. To free it through the queue, pyopencl's
         # other way, ended in a corrupted heap with PoCL 3.
-        self._settle()
+        # What could not be made has nothing to wait for.
+        if (settle := getattr(self, "_settle", None)) is not None:
+            settle()
 
 
 class OpenCLBackend(ProcessBound):

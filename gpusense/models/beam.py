@@ -282,6 +282,7 @@ class BeamModel(ScanModel):
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
             gpu = backend.info.kind == "gpu" and not per_beam
             if gpu:
+                self._last_code = frozenset(flags)
                 sizes = (count, rays, readings, shared, inside)
                 if space.again(
                     (poses, result, table, first), cloud.code(), self._caster.map.preparations, sizes, scalars

@@ -205,11 +205,10 @@ class Device:
         start = time.perf_counter()
         call(poses)
         first = time.perf_counter() - start
-        self.backend.launches.clear()
+        launches = self.backend.launches_of(lambda: call(poses))
         start = time.perf_counter()
         result = call(poses)
         once = time.perf_counter() - start
-        launches = list(self.backend.launches)
         seconds = min(self.arguments.seconds, self.arguments.total)
         least, median = best(lambda: call(poses), self.arguments.repeats, seconds) if once < seconds else (once, once)
 

@@ -5,6 +5,7 @@ Two protocols are understood: DLPack (PyTorch, CuPy, JAX, Warp, NumPy) and the C
 
 from __future__ import annotations
 
+import functools
 import sys
 from typing import Any
 
@@ -97,8 +98,16 @@ def _adopt(array: Any, backend: Backend, name: str) -> Any:
     return found
 
 
-def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int, bool]:
-    """(N, 3) poses on the device as a flat buffer, their number, and whether they are float32.
+@functools.lru_cache(maxsize=64)
+def _flat(address: int, count: int, dtype: Any, device: str) -> Buffer:
+    """Memory on the device as a flat buffer that does not own it."""
+    import warp as wp
+
+    return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
+
+
+def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int, bool, object]:
+    """(N, 3) poses on the device as a flat buffer, their number, whether they are float32, and what owns the memory.
 
     Raises:
         TypeError: not float32 or float64, or not on the backend's device.
@@ -113,7 +122,9 @@ def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int
         raise TypeError(f"{name}: must hold float32 or float64, got {found.dtype.__name__}")
     if not found.is_contiguous:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {found.strides}")
-    return found.flatten(), found.shape[0], found.dtype == wp.float32
+    count = found.shape[0]
+    flat = _flat(found.ptr, 3 * count, found.dtype, found.device.alias) if count else found.flatten()
+    return flat, count, found.dtype == wp.float32, found
 
 
 def blank(backend: Backend, count: int, real: np.dtype) -> Buffer:
@@ -155,8 +166,8 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, given: object
         raise TypeError("out: must be in the memory where the poses are, got one that is not")
     if on_device(out):
         found = _adopt(out, backend, "out")
-        dtype, contiguous = np.dtype(str(found.dtype.__name__)), found.is_contiguous
-        writeable, found_shape = True, found.shape
+        dtype, contiguous = found.dtype.__name__, found.is_contiguous
+        same, writeable, found_shape = dtype == real.name, True, found.shape
     else:
         found = to_host(out, "out")
         if not isinstance(found, np.ndarray):
@@ -165,10 +176,11 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, given: object
             # Exporters of the first DLPack cannot say that memory may be written; NumPy's own protocols can.
             plain = np.asarray(out)
             found = plain if plain.ctypes.data == found.ctypes.data else found
-        dtype, found_shape = found.dtype, found.shape
+        same, found_shape = found.dtype == real, found.shape
+        dtype = "" if same else found.dtype.name
         contiguous, writeable = found.flags.c_contiguous, found.flags.writeable
-    if dtype != real:
-        raise TypeError(f"out: must hold {real.name}, got {dtype.name}")
+    if not same:
+        raise TypeError(f"out: must hold {real.name}, got {dtype}")
     if tuple(found_shape) != shape:
         raise ValueError(f"out: shape must be {shape_text(shape)}, got {shape_text(found_shape)}")
     if not contiguous or not writeable:

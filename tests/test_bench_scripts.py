@@ -124,3 +124,14 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert {"rays, global, 120 x 8", "field, tracking, 120 x 8", "preparation, beam model"} <= set(names)
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 for row in report["rows"])
     assert all(row["error"] < 1e-2 for row in report["rows"] if row["error"] is not None)
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "50", "--particles", "90", "--beams", "12", "--scans", "3", "--calls", "4"]
+    output = tmp_path / "small_calls"
+    report = run_script("small_calls.py", "--backend", needs(selection), "--size", "20", *arguments, output=output)
+    names = [row["what"] for row in report["rows"]]
+    assert {"field, 50 x 12, NumPy in and out", "beam model, 3 scans of 50 x 12 in 3 calls"} <= set(names)
+    assert len(names) == 12 and all(row["differing_bits"] == 0 for row in report["rows"])
+    assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])

@@ -267,24 +267,33 @@ class BeamModel(ScanModel):
 
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
-        ray, shared = space.upload("ray", scan.rays.astype(real)), scan.shared or not self._specialize
+        ray, reading = space.upload_all("scan", (scan.rays.astype(real), scan.readings.astype(real)))
+        shared = scan.shared or not self._specialize
         first = space.upload("first", scan.first) if scan.shared else self._one_each
-        reading = space.upload("reading", scan.readings.astype(real))
         rays, readings = len(scan.rays), len(scan.readings)
         scalars = (scan.constant + self._lead, self.temperature)
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
-            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=False)
-            flags = self._components | self._scene_flags() | self._caster.flags | placed.flags
+            poses = cloud.given(backend, space, part)
+            flags = self._components | self._scene_flags() | self._caster.flags | cloud.headings()
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
+            gpu = backend.info.kind == "gpu" and not per_beam
+            if gpu:
+                self._last_code = frozenset(flags)
+                sizes = (count, rays, readings, shared, inside)
+                if space.again(
+                    (poses, result, table, first), cloud.code(), self._caster.map.preparations, sizes, scalars
+                ):
+                    return None
+            placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=False)
             world = (region.rows, region.cols, count, rays, readings, *self._caster.scalars, self._cells)
             world += (self._cells / self.scanner.range_max, self._caster.limit, self.grid.resolution)
             world += (self.scanner.range_max,)
-            if backend.info.kind == "gpu" and not per_beam:
+            if gpu:
                 order = ordered(backend, space, placed, count, rays, real)
                 flags |= {"ORDERED"} if order is not None else set()
                 self._last_code = frozenset(flags)
@@ -298,6 +307,7 @@ class BeamModel(ScanModel):
                 backend.compile("sum_parts", self._last_code)(
                     (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
                 )
+                space.keep()
                 return parts
             flags |= {"PER_BEAM"} if per_beam else set()
             flags = self._last_code = widened(backend.info, "score_beams", flags)

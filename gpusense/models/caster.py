@@ -247,7 +247,7 @@ class MapCaster:
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
         with self._lock:
-            buffer, region = self.map.ensure(np.array([self.grid.origin]))
+            buffer, region = self.map.ensure([self.grid.origin])
             entries = self.backend.download(buffer, np.empty(region.cells * bins, np.uint16))
             obstacles = region.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
@@ -262,7 +262,7 @@ class MapCaster:
         else:
             ranges = np.empty((cloud.count, rays), self.real) if given is None else given
         if cloud.count * rays:
-            with self._lock:
+            with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
                 chunk = chunk_of(self.backend, rays, self.real.itemsize)
                 in_chunks(
@@ -279,7 +279,8 @@ class MapCaster:
     def _cast_chunk(self, cloud: Cloud, part: tuple[int, int], ray: Buffer, rays: int, ranges: Any) -> None:
         space, backend, count = self._workspace, self.backend, part[1] - part[0]
         table, region, corners = cloud.ensure(self.map, *part)
-        placed = cloud.place(backend, space, part, (region, self.grid, self.mount), self.real, careful=False)
+        given = cloud.given(backend, space, part)
+        placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
         if cloud.on_device:
             result = backend.part(ranges, part[0] * rays, count * rays)
         else:

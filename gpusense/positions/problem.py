@@ -28,8 +28,8 @@ LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
     "cauchy": lambda z: (np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2),
     "arctan": lambda z: (np.arctan(z), 1 / (1 + z * z), -2 * z / (1 + z * z) ** 2),
 }
-# A Jacobian of a larger condition number has no digit left in the covariance, which squares it.
-SINGULAR = 1e8
+# A Jacobian is rounded to some 1e-16: a larger condition number is rounding.
+SINGULAR = 1e12
 # Subsets of the beacons of which closed forms are taken to start from.
 STARTS = 300
 
@@ -153,16 +153,19 @@ class Problem:
         gain = (right.T / values) @ left.T * root * balance[:, None]
         return gain @ gain.T, condition
 
-    def fix(self, states: Sequence[Floats] | Floats, status: str) -> PositionFix:
+    def fix(self, states: Sequence[Floats] | Floats, status: str, *, flat: bool = False) -> PositionFix:
         """The result for states in the order given.
 
         Args:
             states: (S, d) solutions.
             status: Of the best; "unique" and the like become "singular" where it is.
+            flat: Whether the information is known to be singular, whatever rounding makes of it.
         """
         found = np.asarray(states, np.float64).reshape(-1, self.dimension)
         assert status in STATUSES
         pairs = [self.information(state) for state in found]
+        if flat:
+            pairs = [(np.full_like(covariance, np.nan), math.inf) for covariance, _ in pairs]
         singular = not pairs or not pairs[0][1] < SINGULAR
         if singular and status in ("unique", "two", "mirror", "ambiguous"):
             status = "singular"

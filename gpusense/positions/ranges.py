@@ -58,7 +58,7 @@ def trilaterate(
         return problem.fix([], "coincident")
     if len(problem.xy) == 2:
         both, (meet,) = _pairs(problem, np.array([[0, 1]]))
-        return problem.fix(both if meet == "two" else both[:1], str(meet))
+        return problem.fix(both if meet == "two" else both[:1], str(meet), flat=meet != "two")
     line = in_line(problem.xy, problem.noise)
     starts = np.vstack([_linearised(problem), _pairs(problem, subsets(len(problem.xy), 2))[0]])
     if line is not None:
@@ -113,7 +113,7 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)
     if not len(states) or on_cost[0] <= costs[0] + rounding:
         status = "at a beacon" if _at_beacon(problem, on[0]) else "in line"
-        return problem.fix(on[:1], status)
+        return problem.fix(on[:1], status, flat=True)
     chosen, _ = pick(states, costs, told=told)
     both = np.stack([chosen, reflect(chosen, line)], axis=1).reshape(-1, 2)
     return problem.fix(both, "mirror" if len(chosen) == 1 else "ambiguous")

@@ -100,9 +100,9 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
 
     Source: lectures, "Bearings Only".
     """
-    problem = make_problem(xy, bearings=bearings, sigma_bearing=sigma, least=3, reason=" for a triangle")
-    if len(problem.keep) != 3:
-        raise ValueError(f"xy: must hold exactly 3 beacons, got {len(problem.keep)}")
+    problem = make_problem(xy, bearings=bearings, sigma_bearing=sigma)
+    if len(problem.xy) != 3:
+        raise ValueError(f"xy: must hold exactly 3 beacons, got {len(problem.xy)}")
     word = _no_solution(problem)
     if word:
         return problem.fix([], word)
@@ -117,7 +117,7 @@ def _angle_rounding(problem: Problem) -> float:
 
 
 def _blur(problem: Problem) -> float:
-    """What is left of |w| in :func:`three_bearings` by rounding where it should be 0."""
+    """Rounding of the angles between lines of sight, and of |w| in :func:`three_bearings`, where they should be 0."""
     return _angle_rounding(problem) + 2 * problem.noise / problem.spread
 
 
@@ -128,7 +128,7 @@ def _no_solution(problem: Problem) -> str:
     if len(places) == 1 or (problem.heading is None and len(places) == 2):
         return "coincident"
     turned = problem.bearings - problem.bearings[0]
-    if np.abs(np.sin(turned)).max() > _angle_rounding(problem):
+    if np.abs(np.sin(turned)).max() > _blur(problem):
         return ""
     # All lines of sight are parallel. They may be one and the same.
     line = in_line(problem.xy, problem.noise)

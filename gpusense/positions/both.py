@@ -56,6 +56,9 @@ def locate(
 
     Source: lectures, "Distance and Bearing"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
     """
+    for name, sigma in (("sigma_range", sigma_range), ("sigma_bearing", sigma_bearing)):
+        if sigma is None:
+            raise TypeError(f"{name}: must hold real numbers, got None")
     least, reason = (2, ", or a circle of solutions remains") if heading is None else (1, "")
     problem = make_problem(
         xy, ranges=ranges, bearings=bearings, heading=heading, sigma_range=sigma_range, sigma_bearing=sigma_bearing,

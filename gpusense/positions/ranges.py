@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense.positions.closed_forms import two_circles
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Floats, Problem, make_problem, subsets
-from gpusense.positions.solver import in_line, minima, pick, reflect
+from gpusense.positions.solver import distinct, in_line, minima, pick, reflect
 
 
 def trilaterate(
@@ -108,8 +108,7 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     aside = (states - point) @ normal
     # Nearer to the line than the root of the rounding nothing tells a solution from its image.
     off = np.abs(aside) > 1e-7 * problem.spread
-    states = states[off] + (np.abs(aside) - aside)[off, None] * normal
-    costs = costs[off]
+    states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)
     if not len(states) or on_cost[0] <= costs[0] + rounding:
         status = "at a beacon" if _at_beacon(problem, on[0]) else "in line"

@@ -14,6 +14,8 @@ FOLLOWED = 8
 APART = 0.05
 # Minima nearer to each other are one.
 SAME = 1e-6
+# How little a step must change while starts are followed; the lowest minima are then found to rounding.
+COARSE, FINE = 1e-4, 1e-15
 # Minima whose costs differ by less cannot be told apart: 3 sigma of a likelihood ratio.
 AMBIGUOUS = 9.0
 
@@ -24,13 +26,14 @@ def distance(problem: Problem, states: Floats, state: Floats) -> Floats:
     return away if problem.dimension == 2 else np.maximum(away, np.abs(wrap(states[:, 2] - state[2])))
 
 
-def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None = None) -> Floats:
+def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None, step: float) -> Floats:
     """The minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a start.
 
     Args:
         problem: What is measured.
         start: (d,) a state.
         line: A point and a direction (2,) that the position must not leave; None lets it go anywhere.
+        step: Relative change of the cost and of the state at which it stops.
     """
     from scipy.optimize import least_squares
 
@@ -57,7 +60,7 @@ def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None 
     x0 = np.linalg.lstsq(moves, start - base, rcond=None)[0]
     found = least_squares(
         residuals, x0, jacobian, loss="linear" if problem.loss == "linear" else rho, f_scale=problem.loss_scale,
-        ftol=1e-15, xtol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=200,
+        ftol=step, xtol=step, gtol=FINE, x_scale="jac", max_nfev=200,
     )  # fmt: skip
     return base + moves @ found.x
 
@@ -74,7 +77,7 @@ def minima(
         line: As for :func:`descend`.
 
     Returns:
-        (S, d) and (S,); S is 0 where no start is finite.
+        (S, d) and (S,), of minima that come near the lowest; S is 0 where no start is finite.
     """
     left = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
     left = left[np.isfinite(left).all(axis=1)]
@@ -84,15 +87,26 @@ def minima(
         if not len(left):
             break
         start, left = left[0], left[1:]
-        state = descend(problem, start, line)
+        state = descend(problem, start, line, COARSE)
         for near in (start, state):
             left = left[distance(problem, left, near) > APART]
-        if not found or distance(problem, np.array(found), state).min() > SAME:
+        if not found or distance(problem, np.array(found), state).min() > APART / 10:
             found.append(state)
     states = np.array(found).reshape(-1, problem.dimension)
     costs = problem.costs(states)
-    order = np.argsort(costs, kind="stable")
-    return states[order], costs[order]
+    near = states[costs <= 1.1 * costs.min(initial=np.inf) + 2 * AMBIGUOUS]
+    fine = [descend(problem, state, line, FINE) for state in near]
+    return distinct(problem, np.array(fine).reshape(-1, problem.dimension))
+
+
+def distinct(problem: Problem, states: Floats) -> tuple[Floats, Floats]:
+    """The different ones of (S, d) states, the lowest first, and their costs."""
+    costs = problem.costs(states)
+    kept: list[int] = []
+    for k in np.argsort(costs, kind="stable"):
+        if not kept or distance(problem, states[kept], states[k]).min() > SAME:
+            kept.append(int(k))
+    return states[kept], costs[kept]
 
 
 def pick(states: Floats, costs: Floats, *, told: bool) -> tuple[Floats, str]:

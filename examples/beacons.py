@@ -38,7 +38,7 @@ scenes = {
 
 extent = (-1.0, 10.0, -3.0, 8.0)
 points = position_plots.tile_centers(extent, 300)
-figure = plots.new_figure(15.0, 9.4)
+figure = plots.new_figure(12.6, 7.8)
 axes = figure.subplots(2, 3)
 for (certain, uncertain), (title, (count, fix, measured, noise)) in zip(axes.T, scenes.items(), strict=True):
     measured = {name: values[:count] for name, values in measured.items()}

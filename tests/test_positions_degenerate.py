@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from position_scenes import CASES
 
 import gpusense as gs
 from gpusense.positions.fix import STATUSES
@@ -244,6 +245,31 @@ def test_poses_that_see_beacons_behind_their_bearings():
                 np.angle(np.exp(1j * (bearings_to(SQUARE[:3], fix.best) - bearings))), 0, rtol=0, atol=1e-9
             )
     assert words.count("behind") > 5 and words.count("unique") > 5
+
+
+@placed
+def test_scenes_on_a_small_lattice(place):
+    """Beacons and robots on few lattice points stand at one place, in line, on circles and on each other all the time.
+
+    Whatever the scene, without noise the truth is among the solutions, or the fix says that it is degenerate, or the
+    robot stands at a beacon, whose bearing is made up here.
+    """
+    rng = np.random.default_rng(3)
+    seen = set()
+    for k in range(240):
+        case = CASES[k % len(CASES)]
+        xy, robot = place(rng.integers(-1, 2, (case.beacons, 2)) * 1.0), place(rng.integers(-1, 2, (1, 2)) * 1.0)[0]
+        theta = float(rng.choice([0.0, 0.5, np.pi, -3.0]))
+        sigma = case.sigmas(case.beacons) if case.kind == "both" else None
+        fix = case.solve(xy, case.measure(xy, (*robot, theta)), theta, sigma=sigma)
+        seen.add(fix.status)
+        assert fix.status in STATUSES and fix.status not in ("parallel", "disjoint", "contained")
+        assert fix.degenerate or np.isfinite(fix.covariance[0]).all()
+        if fix.degenerate or ranges_to(xy, robot).min() < 1e-6:
+            continue
+        # UTM coordinates are rounded to 1e-9 m, which the condition number stretches.
+        assert ranges_to(fix.solutions, robot).min() < 1e-7 * max(1.0, fix.condition[0]), (case.name, xy, robot, fix)
+    assert seen >= {"unique", "two", "mirror", "coincident", "at a beacon", "in line", "circle"}
 
 
 def test_every_status_is_explained():

@@ -69,11 +69,10 @@ def triangulate(
         return problem.fix([], "circle")
     linear = _nearest_point(problem) if heading is not None else _linear_pose(problem)
     states, status = pick(*minima(problem, np.vstack([linear, starts])), told=sigma is not None)
-    if status == "unique":
-        if np.hypot(*(problem.xy - states[0, :2]).T).min() <= 1e-12 * problem.spread:
-            status = "at a beacon"
-        elif np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
-            status = "behind"
+    if problem.at_beacon(states[0]):
+        status = "at a beacon"
+    elif status == "unique" and np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
+        status = "behind"
     return problem.fix(states, status)
 
 
@@ -111,9 +110,9 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
 
 
 def _angle_rounding(problem: Problem) -> float:
-    """Rounding of the bearings and of their differences."""
+    """Rounding of the bearings, which were often reduced by whole turns or are differences of larger angles."""
     assert problem.bearings is not None
-    return EPS * (ROUNDINGS + float(np.abs(problem.bearings).max()))
+    return EPS * (4 * ROUNDINGS + float(np.abs(problem.bearings).max()))
 
 
 def _blur(problem: Problem) -> float:
@@ -159,8 +158,7 @@ def _exact(problem: Problem, states: Floats, rho: Floats, clarity: float) -> Pos
     """As many bearings as unknowns: the closed form's solution, if it is one."""
     if problem.heading is None and clarity <= _blur(problem):
         return problem.fix([], "in line" if in_line(problem.xy, problem.noise) else "circle")
-    near = 4 * problem.noise + _angle_rounding(problem) * problem.spread / clarity
-    if np.abs(rho).min() <= near:
+    if problem.at_beacon(states[0]):
         return problem.fix(states, "at a beacon")
     return problem.fix([], "behind") if rho.min() < 0 else problem.fix(states, "unique")
 

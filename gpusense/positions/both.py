@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +12,9 @@ from gpusense.positions.closed_forms import two_circles, wrap
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Floats, Problem, make_problem, subsets
 from gpusense.positions.solver import minima, pick
+
+# The deviation of a bearing that says nothing [rad].
+NO_BEARING = 1e100
 
 
 def locate(
@@ -37,7 +41,8 @@ def locate(
     Args:
         xy: (M, 2) the beacons' x and y [m].
         ranges: (M,) measured distances [m], >= 0.
-        bearings: (M,) directions in the robot's frame, counter-clockwise from straight ahead [rad], any real.
+        bearings: (M,) directions in the robot's frame, counter-clockwise from straight ahead [rad], any real. The
+            bearing to a beacon at range 0 says nothing and is not used.
         heading: The robot's heading in the world [rad], or None: it is looked for.
         sigma_range: Standard deviation of the ranges [m], one or (M,), > 0.
         sigma_bearing: Standard deviation of the bearings [rad], one or (M,), > 0.
@@ -67,8 +72,13 @@ def locate(
     )  # fmt: skip
     if heading is None and np.hypot(*(problem.xy - problem.xy[0]).T).max() <= problem.noise:
         return problem.fix([], "coincident")
+    assert problem.ranges is not None
+    # A beacon at no distance has no bearing: a deviation that is large enough for it to count for nothing.
+    problem = replace(
+        problem, sigma_bearing=np.where(problem.ranges <= problem.touch, NO_BEARING, problem.sigma_bearing)
+    )
     states, status = pick(*minima(problem, _starts(problem)), told=True)
-    if status == "unique" and np.hypot(*(problem.xy - states[0, :2]).T).min() <= 1e-8 * problem.spread:
+    if problem.at_beacon(states[0]):
         status = "at a beacon"
     return problem.fix(states, status)
 

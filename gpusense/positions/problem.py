@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -30,6 +31,8 @@ LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
 }
 # A Jacobian is rounded to some 1e-16: a larger condition number is rounding.
 SINGULAR = 1e12
+# Nearer to a beacon, in the scene's spread, a robot stands at it: bad geometry makes that of some 1e-15 of rounding.
+TOUCH = 1e-12
 # Subsets of the beacons of which closed forms are taken to start from.
 STARTS = 300
 
@@ -80,6 +83,15 @@ class Problem:
         reach = float(np.hypot(*(self.xy - self.xy.mean(axis=0)).T).max())
         return max(reach, 0.0 if self.ranges is None else float(self.ranges.max()))
 
+    @functools.cached_property
+    def touch(self) -> float:
+        """Within this of a beacon the robot stands at it: the direction to it is rounding."""
+        return max(TOUCH * self.spread, 4 * self.noise)
+
+    def at_beacon(self, state: Floats) -> bool:
+        """Whether the robot stands at a beacon."""
+        return bool(np.hypot(*(self.xy - state[:2]).T).min() <= self.touch)
+
     @property
     def noise(self) -> float:
         """Rounding of the beacons' coordinates in the world, and of differences of them."""
@@ -100,13 +112,14 @@ class Problem:
         """(R, d) derivatives of the expected measurements at one state; zero where the robot stands at the beacon."""
         dx, dy = (self.xy - state[:2]).T
         rho = np.hypot(dx, dy)
-        safe = np.where(rho > 0, rho, 1.0)
-        cosine, sine = dx / safe, dy / safe
+        known = rho > self.touch
+        safe = np.where(known, rho, 1.0)
+        cosine, sine = np.where(known, dx / safe, 0.0), np.where(known, dy / safe, 0.0)
         parts = []
         if self.ranges is not None:
             parts.append(np.column_stack([-cosine, -sine, np.zeros_like(rho)]))
         if self.bearings is not None:
-            parts.append(np.column_stack([sine / safe, -cosine / safe, np.where(rho > 0, -1.0, 0.0)]))
+            parts.append(np.column_stack([sine / safe, -cosine / safe, np.where(known, -1.0, 0.0)]))
         return np.concatenate(parts)[:, : self.dimension]
 
     @property

@@ -64,7 +64,7 @@ def trilaterate(
     if line is not None:
         return _beside_line(problem, starts, line, told=sigma is not None)
     states, status = pick(*minima(problem, starts), told=sigma is not None)
-    if status == "unique" and _at_beacon(problem, states[0]):
+    if problem.at_beacon(states[0]):
         status = "at a beacon"
     return problem.fix(states, status)
 
@@ -111,13 +111,8 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)
     if not len(states) or on_cost[0] <= costs[0] + rounding:
-        status = "at a beacon" if _at_beacon(problem, on[0]) else "in line"
+        status = "at a beacon" if problem.at_beacon(on[0]) else "in line"
         return problem.fix(on[:1], status, flat=True)
     chosen, _ = pick(states, costs, told=told)
     both = np.stack([chosen, reflect(chosen, line)], axis=1).reshape(-1, 2)
     return problem.fix(both, "mirror" if len(chosen) == 1 else "ambiguous")
-
-
-def _at_beacon(problem: Problem, state: Floats) -> bool:
-    """Whether the robot stands where a beacon does, to what a squared residual of rounding allows."""
-    return bool(np.hypot(*(problem.xy - state).T).min() <= 1e-8 * problem.spread)

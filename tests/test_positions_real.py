@@ -10,7 +10,7 @@ import pytest
 
 import gpusense as gs
 
-# Of single sightings within 3 m, as the folder's README says of all: the map's and the reference's own errors included.
+# What single sightings show against the reference pose, the map's and the reference's own errors included.
 SIGMA_RANGE, SIGMA_BEARING = 0.06, 0.03
 
 
@@ -49,7 +49,7 @@ def test_two_fiducials(sightings):
     """Fixes lie as near to the reference as single sightings do: some cm, and cm per 0.01 rad across a few metres.
 
     The map's and the reference's errors are within the bounds: the sightings' ranges are off by 5 cm in the median and
-    13 cm at 90 %, as the folder's README says, and nearly all are too long or too short together.
+    13 cm at 90 %, their bearings by 0.008 and 0.03 rad.
     """
     truths = [pose for pose, *_ in sightings]
     assert len(truths) > 200

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+    from gpusense.positions.bearings import triangulate, triangulate_triangle
+    from gpusense.positions.both import locate
+    from gpusense.positions.fix import PositionFix
+    from gpusense.positions.ranges import trilaterate
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
     from gpusense.weights import Weights, normalize_weights, resample
@@ -35,6 +39,7 @@ _HOME = {
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
     "Odometry": "gpusense.logs",
+    "PositionFix": "gpusense.positions.fix",
     "RayCaster": "gpusense.models.caster",
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
@@ -43,10 +48,14 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
+    "triangulate": "gpusense.positions.bearings",
+    "triangulate_triangle": "gpusense.positions.bearings",
+    "trilaterate": "gpusense.positions.ranges",
     "write_map": "gpusense.map_io",
 }
 
@@ -60,6 +69,7 @@ __all__ = [
     "LikelihoodFieldParameters",
     "OccupancyGrid",
     "Odometry",
+    "PositionFix",
     "RayCaster",
     "Reading",
     "Scan",
@@ -69,10 +79,14 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "locate",
     "normalize_weights",
     "read_log",
     "read_map",
     "resample",
+    "triangulate",
+    "triangulate_triangle",
+    "trilaterate",
     "write_map",
 ]
 

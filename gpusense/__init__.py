@@ -15,6 +15,8 @@ from gpusense._version import __version__
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.grid import OccupancyGrid
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.beam import BeamModel
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
@@ -43,6 +46,7 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "fit_beam_parameters": "gpusense.learning.fit",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
@@ -51,6 +55,7 @@ _HOME = {
 }
 
 __all__ = [
+    "BeamFit",
     "BeamModel",
     "BeamParameters",
     "CasterMethod",
@@ -69,6 +74,7 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "fit_beam_parameters",
     "normalize_weights",
     "read_log",
     "read_map",

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.grid import OccupancyGrid
     from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
     from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
@@ -33,6 +34,7 @@ _HOME = {
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
@@ -47,6 +49,7 @@ _HOME = {
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
     "fit_beam_parameters": "gpusense.learning.fit",
+    "fit_incidence_parameters": "gpusense.learning.incidence",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
@@ -60,6 +63,7 @@ __all__ = [
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "IncidenceFit",
     "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
@@ -75,6 +79,7 @@ __all__ = [
     "devices",
     "distance_transform",
     "fit_beam_parameters",
+    "fit_incidence_parameters",
     "normalize_weights",
     "read_log",
     "read_map",

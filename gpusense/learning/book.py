@@ -11,6 +11,9 @@ from gpusense.learning.em import Climb, Watch
 from gpusense.learning.point import HIT, SHORT, Point
 from gpusense.learning.problem import Problem, Value
 
+# Beyond these, squares of a shape or of its inverse overflow.
+_SMALLEST = 1e-150
+
 
 def climb_book(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
     """Repeat lines 3 to 15 of table 6.2 until the log-likelihood changes by at most ``tolerance`` nats.
@@ -29,7 +32,7 @@ def climb_book(problem: Problem, start: Point, *, max_iterations: int, tolerance
         broken = [
             f"{name} became {number:g} in iteration {iteration}, where the book's form ends"
             for name, number in (("sigma_hit", point.sigma), ("lambda_short", point.rate))
-            if not (math.isfinite(number) and number > 0 and math.isfinite(1 / number**2))
+            if not _SMALLEST < number < 1 / _SMALLEST
         ]
         if broken:
             notes += broken

@@ -14,7 +14,7 @@ from gpusense import _checks
 from gpusense.backends import Backend, get_backend
 from gpusense.learning.book import climb_book
 from gpusense.learning.device_sums import DeviceSums
-from gpusense.learning.em import Climb, Watch, climb_em
+from gpusense.learning.em import Climb, Watch, climb_em, newton_direction
 from gpusense.learning.pairs import Pairs, make_pairs
 from gpusense.learning.point import (
     BIAS,
@@ -337,10 +337,10 @@ def _bias(problem: Problem, value: Value) -> tuple[float, float]:
     error = standard_errors(with_bias, value)[NAMES[BIAS]]
     if problem.fit_bias:
         return value.point.bias, error
-    # One Newton step from 0 in all coordinates.
-    from gpusense.learning.em import newton_direction
-
-    return float(newton_direction(with_bias, value)[0][BIAS]), error
+    if math.isfinite(error):
+        # One Newton step from 0 in all coordinates.
+        return float(newton_direction(with_bias, value)[0][BIAS]), error
+    return float(value.sums[12] / value.sums[1]) if value.sums[1] > 0 else 0.0, error
 
 
 def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray[np.float64]:

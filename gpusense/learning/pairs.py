@@ -50,6 +50,12 @@ class Pairs:
         """How many readings say nothing."""
         return int(np.count_nonzero(self.kinds == Reading.MISSING))
 
+    def subset(self, chosen: NDArray[np.bool_]) -> Pairs:
+        """The pairs of some readings; ``chosen`` (n,) says of which."""
+        own = chosen[self.places]
+        places = np.cumsum(chosen)[self.places[own]] - 1
+        return Pairs(self.reading[own], self.expected[own], places, self.kinds[chosen], self.range_max, self.quantum)
+
 
 def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_min: float = 0.0) -> Pairs:
     """Class the readings and keep the hits.

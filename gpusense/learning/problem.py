@@ -180,10 +180,13 @@ class Problem:
         free[RATE] &= value.totals[SHORT] > NOTHING
         for place, now, (low, high) in ((SIGMA, point.sigma, bounds.sigma), (RATE, point.rate, bounds.rate)):
             slope = value.gradient[place]
-            free[place] &= not ((now <= low and slope < 0) or (now >= high and slope > 0))
+            near = _AT * now
+            free[place] &= not ((now <= low + near and slope < 0) or (now >= high - near and slope > 0))
         free[BIAS] &= abs(point.bias) < bounds.bias
         return free
 
 
+# A shape so near a bound, relatively, is at it.
+_AT = 1e-9
 # A cause that accounts for less than this many readings is taken for one that does not occur.
 NOTHING = 1e-2

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.learning.em import Climb, Watch, newton_direction
+from gpusense.learning.em import Climb, Watch, newton_direction, without_needless
 from gpusense.learning.point import BIAS, RAND, Floats, Point
 from gpusense.learning.problem import Problem, Value
 
@@ -83,7 +83,7 @@ class _Search:
 
     def left(self) -> float:
         """Nats that the quadratic model still sees to gain."""
-        self.best = self.problem.value(self.best.point, second=True)
+        self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
         return newton_direction(self.problem, self.best)[1]
 
 
@@ -99,8 +99,6 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
     coordinates = search.coordinates
     if not len(coordinates.places):
         return Climb(search.best, search.trace, True)
-    notes: list[str] = []
-    converged = False
     while len(search.trace) <= max_iterations:
         before = search.best.objective
         found = minimize(
@@ -122,11 +120,11 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
         if found.nit == 0:
             search.end_iteration()
         if gained <= max(tolerance, search.problem.noise(search.best)):
-            converged = search.left() <= max(1e3 * tolerance, search.problem.noise(search.best))
-            break
-    if not converged:
-        notes.append(f"no convergence within {max_iterations} iterations")
-    return Climb(search.best, search.trace, converged, notes)
+            left = search.left()
+            if left <= max(1e3 * tolerance, search.problem.noise(search.best)):
+                return Climb(search.best, search.trace, True)
+            return Climb(search.best, search.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
+    return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
 
 
 def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
@@ -152,6 +150,7 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
             options={"maxiter": max_iterations + 1 - len(search.trace), "xtol": 1e-6, "ftol": 1e-14},
         )
         if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):
+            search.best = without_needless(problem, search.best)
             return Climb(search.best, search.trace, True)
     return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
 

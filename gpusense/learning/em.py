@@ -30,6 +30,8 @@ _LONGEST = 2.0
 # Newton steps begin once an EM step gains less than this, or after so many EM steps.
 _LITTLE, _MANY = 0.5, 20
 _HALVINGS = 30
+# Nats left to gain below which a Newton step is trusted.
+_NEAR = 1e-4
 
 Watch = Callable[[int, Value], None]
 
@@ -119,7 +121,7 @@ def _log_step(above: float, below: float, slope: float) -> float:
     """log(above / below) / slope, at most _LONGEST; towards the bound where a side is 0."""
     if above <= 0 or below <= 0:
         return _LONGEST if above > below else -_LONGEST if above < below else 0.0
-    rise = math.log(above / below)
+    rise = math.log(above) - math.log(below)
     return math.copysign(min(abs(rise) / max(slope, 1e-9), _LONGEST), rise)
 
 
@@ -130,9 +132,11 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
         return value, 0.0
     longest = float(np.abs(step[: RATE + 1]).max())
     scale = min(1.0, _LONGEST / max(longest, 1e-300))
+    # Near the optimum the gain is less than rounding, and the step is right all the same.
+    least = value.objective - (problem.noise(value) if left < _NEAR else 0.0)
     for _ in range(5):
         found = problem.value(value.point.moved(scale * step, problem.bounds), second=True)
-        if found.objective > value.objective:
+        if found.objective > least:
             return found, left
         scale /= 4
     return value, left

@@ -147,7 +147,7 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
             method="Powell",
             bounds=coordinates.limits,
             callback=search.end_iteration,
-            options={"maxiter": max_iterations + 1 - len(search.trace), "xtol": 1e-6, "ftol": 1e-14},
+            options={"maxiter": max_iterations + 1 - len(search.trace), "xtol": 1e-4, "ftol": 1e-13},
         )
         if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):
             search.best = without_needless(problem, search.best)

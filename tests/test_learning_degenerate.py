@@ -40,7 +40,7 @@ DATA = {
     [
         *((name, method) for name in DATA for method in ("em", "gradient")),
         ("all max", "hill_climb"),
-        ("one z*", "hill_climb"),
+        ("all beyond z*", "hill_climb"),
     ],
 )
 def test_degenerate_readings_give_finite_parameters_and_a_reason(name: str, method: str) -> None:

@@ -9,9 +9,9 @@ beside them the NumPy reference on the same pairs (a part of them where it is sl
 must match: *error* is the largest difference of the fitted parameters, relative, in float64.
 
 *Scenes*: fifty scenes with known parameters, from mild to stiff. Parameters whose standard error is below 30 % of
-them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the log-likelihood in
-an iteration of exact EM and of the book's; and from --starts starts, by how many nats "gradient" and "hill_climb" end
-from EM's optimum in scenes that are identified as a whole.
+them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
+log-likelihood in an iteration of exact EM and of the book's; and from --starts starts, by how many nats "gradient" and
+"hill_climb" end from EM's optimum in scenes that are identified as a whole.
 
 Exit code 1 where exact EM falls by more than 1e-9 of the log-likelihood, fewer than 95 % are within 3 standard errors,
 or an end differs by more than 1e-4 nats.
@@ -155,7 +155,8 @@ def to_markdown(rows: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> str
         )
     lines += [
         "", "| scene | identified | within 3 s.e. | worst, s.e. | iterations | EM's worst fall | book: falls "
-        "| book: nats behind | gradient, nats off | hill climbing, nats off |", "|---|---|---|---|---|---|---|---|---|---|",
+        "| book: nats behind | gradient, nats off | hill climbing, nats off |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for s in scenes:
         ends = " | ".join(f"{s['ends'][m]:.0e}" if m in s["ends"] else "-" for m in ("gradient", "hill_climb"))

@@ -153,3 +153,12 @@ def test_extremes_underflow_nowhere(backend: str) -> None:
             assert np.isfinite(value.gradient).all() and np.isfinite(value.hessian).all()
     impossible = problem.value(point(0, 1.0, 0, 0, sigma=1.0, rate=1.0))
     assert impossible.log_likelihood == -np.inf
+
+
+def test_threads_share_the_blocks_with_the_same_bits(needs, monkeypatch: pytest.MonkeyPatch) -> None:
+    z, expected = draw(TYPICAL, 3001, 3)
+    device = problem_of(z, expected, backend=needs("warp")).device
+    sums, causes = device.sums(POINTS["ordinary"]), device.causes(POINTS["ordinary"])
+    monkeypatch.setattr("gpusense.backends._warp._PIECE_WORK", 64)
+    assert (device.sums(POINTS["ordinary"]) == sums).all()
+    assert (device.causes(POINTS["ordinary"]) == causes).all()

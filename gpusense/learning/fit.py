@@ -94,7 +94,8 @@ def fit_beam_parameters(
             failures; ``"gradient"``: L-BFGS-B; ``"hill_climb"``: Powell's method; ``"genetic"``: differential
             evolution, finished by gradients.
         range_min: Readings below this are missing [m].
-        initial: Where to begin; a guess from the readings if None. A cause whose weight is 0 stays out.
+        initial: Where to begin; a guess from the readings if None. A cause whose weight is 0 stays
+            out; shapes beyond their bounds begin there.
         backend: Where it runs, see :func:`gpusense.devices`.
         precision: ``"float64"`` or ``"float32"``; None is float64 where the device has it.
         max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.

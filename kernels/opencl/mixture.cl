@@ -37,7 +37,8 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
 // Terms of the log domain: log of z_hit p_hit(z | z*).
 real log_hit(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
-    return (terms[0] - exponent.x) + (terms[8] - exponent.y) - log(hit_mass(expected, terms[2], terms[6]));
+    const real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
+    return mass == 1 ? log_p : log_p - log(mass);
 }
 #endif
 

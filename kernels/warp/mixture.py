@@ -59,7 +59,11 @@ def functions(flags):
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
         exponent = hit_exponent(z, expected, terms)
-        return (terms[0] - exponent.x) + (terms[8] - exponent.y) - wp.log(hit_mass(expected, terms[2], terms[6]))
+        log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y)
+        mass = hit_mass(expected, terms[2], terms[6])
+        if mass == ONE:
+            return log_p
+        return log_p - wp.log(mass)
 
     # x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
     @wp.func

@@ -15,6 +15,9 @@ from gpusense._version import __version__
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.grid import OccupancyGrid
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.beam import BeamModel
@@ -30,10 +33,12 @@ if TYPE_CHECKING:
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
@@ -48,6 +53,8 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "fit_beam_parameters": "gpusense.learning.fit",
+    "fit_incidence_parameters": "gpusense.learning.incidence",
     "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
@@ -60,10 +67,12 @@ _HOME = {
 }
 
 __all__ = [
+    "BeamFit",
     "BeamModel",
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "IncidenceFit",
     "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
@@ -79,6 +88,8 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "fit_beam_parameters",
+    "fit_incidence_parameters",
     "locate",
     "normalize_weights",
     "read_log",

@@ -141,7 +141,7 @@ def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     words = (
         "--pairs 4000 --numpy-pairs 2000 --scenes 2 --count 400 --starts 1 --repeats 2 --seconds 1 --precision float64"
     )
-    arguments = ["--backend", "numpy", "--backend", needs("opencl"), *words.split(), "--precision", "float64"]
+    arguments = ["--backend", "numpy", "--backend", needs("opencl"), *words.split()]
     report = run_script("learning.py", *arguments, output=tmp_path / "small")
     assert [row["backend"].split(":")[0] for row in report["rows"]] == ["numpy", "opencl"]
     for row in report["rows"]:

@@ -15,6 +15,9 @@ from gpusense._version import __version__
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.grid import OccupancyGrid
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.beam import BeamModel
@@ -22,20 +25,27 @@ if TYPE_CHECKING:
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.normals import surface_normals
     from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+    from gpusense.positions.bearings import triangulate, triangulate_triangle
+    from gpusense.positions.both import locate
+    from gpusense.positions.fix import PositionFix
+    from gpusense.positions.ranges import trilaterate
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
     "Odometry": "gpusense.logs",
+    "PositionFix": "gpusense.positions.fix",
     "RayCaster": "gpusense.models.caster",
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
@@ -44,24 +54,33 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "fit_beam_parameters": "gpusense.learning.fit",
+    "fit_incidence_parameters": "gpusense.learning.incidence",
+    "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
     "surface_normals": "gpusense.normals",
+    "triangulate": "gpusense.positions.bearings",
+    "triangulate_triangle": "gpusense.positions.bearings",
+    "trilaterate": "gpusense.positions.ranges",
     "write_map": "gpusense.map_io",
 }
 
 __all__ = [
+    "BeamFit",
     "BeamModel",
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "IncidenceFit",
     "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
     "OccupancyGrid",
     "Odometry",
+    "PositionFix",
     "RayCaster",
     "Reading",
     "Scan",
@@ -71,11 +90,17 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "fit_beam_parameters",
+    "fit_incidence_parameters",
+    "locate",
     "normalize_weights",
     "read_log",
     "read_map",
     "resample",
     "surface_normals",
+    "triangulate",
+    "triangulate_triangle",
+    "trilaterate",
     "write_map",
 ]
 

@@ -346,6 +346,7 @@ class BeamModel(ScanModel):
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
+            normals = self._caster.normals(region, self._cones.flags)
             mount, count = self.scanner.mount, part[1] - part[0]
             poses = cloud.given(backend, space, part)
             flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
@@ -353,7 +354,6 @@ class BeamModel(ScanModel):
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
-            normals = self._caster.normals(region, flags)
             gpu = backend.info.kind == "gpu" and not per_beam
             if gpu:
                 self._last_code = frozenset(flags)

@@ -242,7 +242,7 @@ class MapCaster:
         """Bytes of the map's tables on the device."""
         return self._table_bytes + (0 if self._normals is None else self._normals[2])
 
-    def normals(self, region: Region, flags: frozenset[str] | set[str]) -> Buffer:
+    def normals(self, region: Region, flags: frozenset[str]) -> Buffer:
         """Normals of the walls in a window, where flags ask for them; made once for a window.
 
         Raises:
@@ -332,6 +332,7 @@ class MapCaster:
     ) -> None:
         space, backend, count = self._workspace, self.backend, part[1] - part[0]
         table, region, corners = cloud.ensure(self.map, *part)
+        normals = self.normals(region, cones.flags)
         given = cloud.given(backend, space, part)
         placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
         if cloud.on_device:
@@ -344,7 +345,7 @@ class MapCaster:
         if "ECHO" in flags:
             other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
             both = (other, result) if cones.incidence else (result, other)
-            inputs = (table, self.normals(region, flags), placed.cell, placed.pose, ray)
+            inputs = (table, normals, placed.cell, placed.pose, ray)
             backend.compile("cast_echoes", flags)((rays, count), *inputs, *both, *sizes[:4], *cones.scalars, *sizes[4:])
         elif backend.info.kind == "gpu":
             order = ordered(backend, space, placed, count, rays, self.real)

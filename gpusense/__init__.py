@@ -14,6 +14,7 @@ from gpusense._version import __version__
 
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
+    from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
@@ -30,6 +31,9 @@ _HOME = {
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "DiscreteBeamModel": "gpusense.discrete",
+    "DiscreteCauses": "gpusense.discrete",
+    "DiscreteFit": "gpusense.discrete",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
@@ -55,6 +59,9 @@ __all__ = [
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "DiscreteBeamModel",
+    "DiscreteCauses",
+    "DiscreteFit",
     "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",

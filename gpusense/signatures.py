@@ -192,7 +192,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_beams": _kernel(
         "beam", "particle", *_CAST, *_POSES, "real2 ray [rays]", "int first [rays + 1]", "real reading [readings]",
-        "real terms [10]", "real sensor [cells * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
+        "real terms [10]", "real sensor [(cells + 1) * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
         "int readings", *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
         wide_group=16,
     ),
@@ -202,7 +202,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "beam_tiles": _kernel(
         "beam", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]", "int first [rays + 1]",
-        "real reading [readings]", "real terms [10]", "real sensor [cells * (cells + 1)]",
+        "real reading [readings]", "real terms [10]", "real sensor [(cells + 1) * (cells + 1)]",
         "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_CASTER,
         "int cells", "real per_metre", *_RANGE, "int across", "int along", "int spread",
     ),

@@ -14,6 +14,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
 from gpusense.cloud import Cloud, all_within, ordered, tiles_of
+from gpusense.discrete import DiscreteBeamModel
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
@@ -43,7 +44,8 @@ class BeamModel(ScanModel):
     Args:
         grid: The map.
         scanner: The scanner's geometry.
-        parameters: Weights and shapes of the mixture.
+        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, the table of a sensor of the
+            scanner's range_max, of which every beam is one look-up, max readings too.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
         caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
@@ -68,7 +70,7 @@ class BeamModel(ScanModel):
         self,
         grid: OccupancyGrid,
         scanner: Scanner,
-        parameters: BeamParameters | None = None,
+        parameters: BeamParameters | DiscreteBeamModel | None = None,
         *,
         backend: str | Backend = "auto",
         precision: str = "float32",
@@ -84,9 +86,17 @@ class BeamModel(ScanModel):
         peer = compat_module.choose(compat)
         default = BeamParameters() if peer is None else peer.beam
         self.parameters = default if parameters is None else parameters
-        if not isinstance(self.parameters, BeamParameters):
-            raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(parameters)}")
-        compat_module.check_weights(self.parameters, compat)
+        self._discrete = parameters if isinstance(parameters, DiscreteBeamModel) else None
+        if self._discrete is not None:
+            _check_discrete(self._discrete, scanner, compat, sensor_table)
+        # The mixture, of which nothing is used where there is a discrete model.
+        own = default if self._discrete is not None else self.parameters
+        if not isinstance(own, BeamParameters):
+            raise TypeError(
+                f"parameters: must be BeamParameters or a DiscreteBeamModel, got {_checks.show(parameters)}"
+            )
+        compat_module.check_weights(own, compat)
+        self._weights = own
         if peer is not None:
             caster = "bresenham" if caster is None else caster
             unknown = "occupied" if unknown is None else unknown
@@ -96,9 +106,10 @@ class BeamModel(ScanModel):
         method = casters.choose("caster", "exact" if caster is None else caster)
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
-            temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
-            end_points=False,
+            temperature=temperature, beams=beams, compat=compat, specialize=specialize,
+            z_max=1.0 if self._discrete is not None else own.z_max, end_points=False,
         )  # fmt: skip
+        self._max_depends = self._discrete is not None
         self._caster = MapCaster(
             self._backend, self._real, grid, scanner.mount, scanner.range_max, method,
             unknown=self.unknown, outside=self.outside, crop=specialize,
@@ -160,13 +171,15 @@ class BeamModel(ScanModel):
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
-        p = self.parameters
+        p = self._weights
         components = [
             ("z_hit", p.z_hit, "1 exp, 2 erf and 1 division per particle-beam"),
             ("z_short", p.z_short, "1 exp, 1 tanh and 2 divisions per particle-beam"),
             ("z_rand", p.z_rand, "1 addition per particle-beam"),
             ("z_max", p.z_max, "max readings altogether"),
         ]
+        if self._discrete is not None:
+            components = []
         omissions = scene_omissions(
             components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
             precision=self.precision, ring=self._caster.method.ring,
@@ -183,12 +196,15 @@ class BeamModel(ScanModel):
             )
         if self._last_code and "ORIGINS_OUTSIDE" not in self._last_code:
             omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray"))
-        if self._last_code and "LINEAR" in self._last_code:
+        if self._last_code and "LINEAR" in self._last_code and self._discrete is None:
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
         if self._peer is not None:
             omissions.append(Omission("normalised density", f"compat='{self.compat}' sums cubes", "the likelihood"))
+        elif self._discrete is not None:
+            steps = f"{self._cells + 1} x {self._cells + 1} steps of readings and expected ranges, no return included"
+            omissions.append(Omission("mixture", f"the model is a table of {steps}", "all but 1 look-up a beam"))
         elif self.sensor_table is not None:
             why = f"log p is tabulated over {self._cells} x {self._cells + 1} bins of readings and expected ranges"
             omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
@@ -202,12 +218,13 @@ class BeamModel(ScanModel):
             omissions.append(far)
         caster = self._caster.method
         how = "" if caster.name == "exact" else f", ranges by {caster}"
-        title = f"beam model{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
+        name = "beam model" if self._discrete is None else "discrete beam model"
+        title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
 
     def _peer_mixture(self) -> tuple[frozenset[str], np.ndarray]:
         """Flags and numbers of the kernel file ``compat``."""
-        p, range_max = self.parameters, self.scanner.range_max
+        p, range_max = self._weights, self.scanner.range_max
         flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}
         hit = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
         if self.compat == "amcl":
@@ -221,7 +238,7 @@ class BeamModel(ScanModel):
         """Flags of the components, and the numbers of the kernel file ``mixture``."""
         if self._peer is not None:
             return self._peer_mixture()
-        p, range_max = self.parameters, self.scanner.range_max
+        p, range_max = self._weights, self.scanner.range_max
         weights = {"HIT": p.z_hit, "SHORT": p.z_short, "RAND": p.z_rand}
         flags = {name for name, weight in weights.items() if weight > 0 or not self._specialize}
         rand, scale = p.z_rand / range_max, p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
@@ -239,10 +256,17 @@ class BeamModel(ScanModel):
         terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
         if self.sensor_table is not None:
             flags = {"SENSOR_TABLE"} | (flags & {"LINEAR"})
+        if self._discrete is not None:
+            flags = {"SENSOR_TABLE"}
         return frozenset(flags), rounded_terms(terms, self._real)
 
     def _tabulate(self, width: float | None) -> tuple[Buffer, int]:
         """The sensor's table on the device, and its number of bins; no table and 0 where the mixture is evaluated."""
+        if self._discrete is not None:
+            table = self._discrete.sensor_table(self._real)
+            # Sums need no watch over impossible readings where there are none.
+            self._components |= {"LINEAR"} if np.isfinite(table).all() else set()
+            return self._backend.upload(table), self._discrete.bins
         if width is None:
             return self._backend.upload(np.zeros(1, self._real)), 0
         from gpusense.reference.densities import log_mixture  # loads SciPy
@@ -252,23 +276,28 @@ class BeamModel(ScanModel):
         cells = max(round(range_max / width), 1)
         middle = (np.arange(cells) + 0.5) * (range_max / cells)
         expected = np.append(middle, range_max)
-        table = np.empty((cells, cells + 1), self._real)
+        table = np.full((cells + 1, cells + 1), log_weight(self._weights.z_max), self._real)
         # In blocks of rows: the densities need some forty numbers for each of theirs.
         for first in range(0, cells, 64):
             rows = slice(first, first + 64)
-            own = self.parameters.to_dict()
-            table[rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
+            own = self._weights.to_dict()
+            table[:-1][rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
         return self._backend.upload(table), cells
 
     def _impossible(self) -> bool:
-        p = self.parameters
+        p = self._weights
         return p.z_hit == 0 and p.z_short == 0 and p.z_rand == 0
 
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
         ray, shared = space.upload("ray", scan.rays.astype(real)), scan.shared or not self._specialize
         first = space.upload("first", scan.first) if scan.shared else self._one_each
-        reading = space.upload("reading", scan.readings.astype(real))
+        values = scan.readings.astype(real)
+        if self._cells:
+            # A range below range_max that is rounded to it is still a range, and no max reading to the table.
+            top = np.nextafter(real.type(self.scanner.range_max), real.type(0))
+            values = np.where(np.isfinite(scan.readings), np.minimum(values, top), values)
+        reading = space.upload("reading", values)
         rays, readings = len(scan.rays), len(scan.readings)
         scalars = (scan.constant + self._lead, self.temperature)
 
@@ -308,3 +337,17 @@ class BeamModel(ScanModel):
             return parts
 
         return launch
+
+
+def _check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:
+    """See that nothing contradicts a discrete model.
+
+    Raises:
+        ValueError: the scanner has another range_max, or an option is given that is for the mixture.
+    """
+    for name, value in (("compat", compat), ("sensor_table", sensor_table)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {_checks.show(value)}")
+    if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
+        rule = f"must have the scanner's range_max = {scanner.range_max}"
+        raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

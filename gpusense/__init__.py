@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.beam import BeamModel
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
@@ -34,6 +38,7 @@ _HOME = {
     "DiscreteBeamModel": "gpusense.discrete",
     "DiscreteCauses": "gpusense.discrete",
     "DiscreteFit": "gpusense.discrete",
+    "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
@@ -47,6 +52,8 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "fit_beam_parameters": "gpusense.learning.fit",
+    "fit_incidence_parameters": "gpusense.learning.incidence",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
@@ -55,6 +62,7 @@ _HOME = {
 }
 
 __all__ = [
+    "BeamFit",
     "BeamModel",
     "BeamParameters",
     "CasterMethod",
@@ -62,6 +70,7 @@ __all__ = [
     "DiscreteBeamModel",
     "DiscreteCauses",
     "DiscreteFit",
+    "IncidenceFit",
     "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
@@ -76,6 +85,8 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "fit_beam_parameters",
+    "fit_incidence_parameters",
     "normalize_weights",
     "read_log",
     "read_map",

@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from gpusense import _checks
 from gpusense.compat import check_weights
 from gpusense.parameters import BeamParameters, _Parameters
+from gpusense.scanner import Reading, classes
 
 # Steps along a beam: a table of this many takes 134 MB in float64.
 MOST_BINS = 4096
@@ -197,7 +198,8 @@ class DiscreteBeamModel:
             of no return; 0 where a reading is missing.
 
         Raises:
-            TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number.
+            TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number beside a
+            reading that is not missing.
         """
         z, z_exp = check_pairs(ranges, expected, self.range_max)
         i, j = bins_of(z, self.range_max, self.bins), bins_of(z_exp, self.range_max, self.bins)
@@ -248,14 +250,17 @@ def check_pairs(ranges: object, expected: object, range_max: float) -> tuple[NDA
         float64 readings, NaN for missing and inf for no return, and expected ranges, inf for no obstacle.
 
     Raises:
-        TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number.
+        TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number beside a
+            reading that is not missing.
     """
     z = _checks.array("ranges", ranges, finite=False, dtype=None)
     z_exp = _checks.array("expected", expected, z.shape, finite=False, dtype=None)
-    bad = ~(z_exp >= 0)
+    kinds = classes(z, 0.0, range_max)
+    bad = ~(z_exp >= 0) & (kinds != Reading.MISSING)
     if bad.any():
-        raise ValueError(f"expected: every value must be >= 0, got {_checks.show(z_exp[bad].flat[0])}")
+        rule = "every value must be >= 0 where the reading is not missing"
+        raise ValueError(f"expected: {rule}, got {_checks.show(z_exp[bad].flat[0])}")
     with np.errstate(over="ignore"):  # a range_max beyond float16 is infinite there
-        far, none = z >= z.dtype.type(range_max), z_exp >= z_exp.dtype.type(range_max)
-    wide = np.where(far, np.inf, np.where(z >= 0, z.astype(np.float64), np.nan))
-    return wide, np.where(none, np.inf, z_exp.astype(np.float64))
+        none = ~(z_exp < z_exp.dtype.type(range_max))
+    wide = np.where(kinds == Reading.HIT, z, np.where(kinds == Reading.MAX, np.inf, np.nan)).astype(np.float64)
+    return wide, np.where(none, np.inf, z_exp).astype(np.float64)

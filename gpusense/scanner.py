@@ -172,9 +172,14 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
     if z.ndim not in (1, 2) or z.shape[-1] != scanner.count:
         rule = f"shape must be ({scanner.count},) or (S, {scanner.count})"
         raise ValueError(f"ranges: {rule}, got {_checks.shape_text(z.shape)}")
+    return classes(z, scanner.range_min, scanner.range_max)
+
+
+def classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:
+    """:func:`classify` for readings of any shape between two ranges."""
     with np.errstate(over="ignore"):  # a range_max beyond float16 is infinite there
-        nearest, farthest = z.dtype.type(scanner.range_min), z.dtype.type(scanner.range_max)
-    too_near = (z < nearest) | (z <= 0) if scanner.range_min > 0 else z < 0
+        nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
+    too_near = (z < nearest) | (z <= 0) if range_min > 0 else z < 0
     kinds = np.full(z.shape, Reading.HIT, dtype=np.uint8)
     kinds[z >= farthest] = Reading.MAX
     kinds[too_near | np.isnan(z)] = Reading.MISSING

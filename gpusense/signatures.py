@@ -45,6 +45,7 @@ FLAGS = {
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
     "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "INFORMATION": "the sums of the log-likelihood's second derivatives are wanted",
     "CAREFUL": "end points need more than the working precision to fall into the right cell",
 }
 
@@ -142,6 +143,8 @@ _PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
 _CHANGED = (
     *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right",
 )  # fmt: skip
+# Readings and expected ranges to learn from, in blocks of one length.
+_PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
 _RANGE = ("real limit", "real resolution", "real range_max")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 
@@ -236,6 +239,14 @@ KERNELS: dict[str, Kernel] = {
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "real guard [readings]",
         "out real parts [particles * readings]", *_MAP, "int particles", "int readings", "int across", "int along",
         "int spread",
+    ),
+    "e_step": _kernel(
+        "learning", "block", *_PAIRS, "real terms [12]", "out real sums [blocks * width]", "int blocks", "int readings",
+        "int across", "int along", "int width",
+    ),
+    "pair_causes": _kernel(
+        "learning", "block", *_PAIRS, "real terms [12]", "out real4 causes [blocks * readings]", "int blocks",
+        "int readings", "int across", "int along",
     ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",

@@ -124,3 +124,16 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert {"rays, global, 120 x 8", "field, tracking, 120 x 8", "preparation, beam model"} <= set(names)
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 for row in report["rows"])
     assert all(row["error"] < 1e-2 for row in report["rows"] if row["error"] is not None)
+
+
+def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    words = (
+        "--pairs 4000 --numpy-pairs 2000 --scenes 2 --count 400 --starts 1 --repeats 2 --seconds 1 --precision float64"
+    )
+    arguments = ["--backend", "numpy", "--backend", needs("opencl"), *words.split(), "--precision", "float64"]
+    report = run_script("learning.py", *arguments, output=tmp_path / "small")
+    assert [row["backend"].split(":")[0] for row in report["rows"]] == ["numpy", "opencl"]
+    for row in report["rows"]:
+        assert row["error"] < 1e-6 and row["converged"] and 0 < row["iteration_s"] < math.inf
+    assert len(report["scenes"]) == 2 and report["fall"] <= 1e-9
+    assert 0 < report["within"] <= report["identified"] <= 12

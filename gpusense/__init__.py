@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from gpusense.models.beam import BeamModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
+    from gpusense.normals import surface_normals
     from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
@@ -58,6 +59,7 @@ _HOME = {
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
+    "surface_normals": "gpusense.normals",
     "write_map": "gpusense.map_io",
 }
 
@@ -91,6 +93,7 @@ __all__ = [
     "read_log",
     "read_map",
     "resample",
+    "surface_normals",
     "write_map",
 ]
 

@@ -155,7 +155,9 @@ def data_of_pairs(
         if limit is not None and kept >= limit:
             break
     if not kept:
-        raise ValueError(f"pairs: must hold a pair of number {offset}, which is the first one chosen, got {seen} in {file}")
+        raise ValueError(
+            f"pairs: must hold a pair of number {offset}, which is the first one chosen, got {seen} in {file}"
+        )
     table = np.concatenate(parts)
     incidence = table[:, 2].copy() if columns == 3 else None
     return RangeData(
@@ -305,7 +307,9 @@ def log_densities(parameters: BeamParameters, data: RangeData, range_bias: float
 def block_mean(values: Floats, block: NDArray[np.int64]) -> tuple[float, float]:
     """Mean of all values and its standard error, that of a ratio of sums over blocks; NaN for fewer than 2 blocks."""
     if not np.isfinite(values).all():
-        return (float(values.sum()) if not (np.isposinf(values).any() and np.isneginf(values).any()) else math.nan), math.nan
+        return (
+            float(values.sum()) if not (np.isposinf(values).any() and np.isneginf(values).any()) else math.nan
+        ), math.nan
     counts, sums = np.bincount(block).astype(float), np.bincount(block, values)
     mean = float(sums.sum() / counts.sum())
     blocks = len(counts)

@@ -6,7 +6,7 @@ from gpusense.backends.base import BackendInfo
 from gpusense.signatures import CASTER_FLAGS
 
 # A kernel has no such variant with these flags, or without all of some set of those.
-_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
+_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "score_beams": ({"LINEAR"},),

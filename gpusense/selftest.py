@@ -99,6 +99,7 @@ class Recorder:
             "parts": {"PER_BEAM"} & flags,
             "pose_low": {"CAREFUL"} & flags,
             "sensor": {"SENSOR_TABLE"} & flags,
+            "normals": {"INCIDENCE"} & flags,
             "map_table": {},
         }
         for argument, value in given.items():

@@ -31,6 +31,8 @@ FLAGS = {
     "BRESENHAM": "rays are cast along Bresenham's lines",
     "CDDT": "rays are cast through a compressed directional distance transform",
     "LOOKUP": "ranges come from a look-up table",
+    "ECHO": "a sensor hears the nearest of several rays, or its angle of incidence matters",
+    "INCIDENCE": "the angle of incidence chooses the mixture's terms, or says whether anything returns",
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
@@ -136,6 +138,9 @@ def _kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = Fa
 
 _MAP = ("int rows", "int cols")
 _POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
+# Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
+_NORMALS = ("real2 normals [(rows + 2) * (cols + 2)]",)
+_CONES = "real2 ray [rays * cone_rays]"
 # A map as a caster has it: what an entry is, and how many there are, is the caster's.
 _CAST = ("entry map_table [map]",)
 _CASTER = ("int bins", "real slack", "real tolerance")
@@ -146,6 +151,10 @@ _CHANGED = (
 # Readings and expected ranges to learn from, in blocks of one length.
 _PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
 _RANGE = ("real limit", "real resolution", "real range_max")
+# Rays of a cone and the least cosine of an angle of incidence that returns; kinds of terms, one for each bin of angles.
+_CONE = ("int cone_rays", "real critical")
+_ECHO = ("int kinds", *_CONE)
+_TERMS = ("real terms [10 * kinds]", "real edges [kinds]")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 
 KERNELS: dict[str, Kernel] = {
@@ -194,9 +203,9 @@ KERNELS: dict[str, Kernel] = {
         "int particles", "int rays", *_CASTER, *_RANGE, wide=True,
     ),
     "score_beams": _kernel(
-        "beam", "particle", *_CAST, *_POSES, "real2 ray [rays]", "int first [rays + 1]", "real reading [readings]",
-        "real terms [10]", "real sensor [(cells + 1) * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
-        "int readings", *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
+        "beam", "particle", *_CAST, *_NORMALS, *_POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
+        *_TERMS, "real sensor [(cells + 1) * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays", "int readings",
+        *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
         wide_group=16,
     ),
     "cast_tiles": _kernel(
@@ -204,10 +213,14 @@ KERNELS: dict[str, Kernel] = {
         "out real ranges [particles * rays]", *_MAP, "int particles", "int rays", *_CASTER, *_RANGE, "int spread",
     ),
     "beam_tiles": _kernel(
-        "beam", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]", "int first [rays + 1]",
-        "real reading [readings]", "real terms [10]", "real sensor [(cells + 1) * (cells + 1)]",
-        "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_CASTER,
+        "beam", "item", *_CAST, *_NORMALS, *_POSES, "int order [particles]", _CONES, "int first [rays + 1]",
+        "real reading [readings]", *_TERMS, "real sensor [(cells + 1) * (cells + 1)]",
+        "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_ECHO, *_CASTER,
         "int cells", "real per_metre", *_RANGE, "int across", "int along", "int spread",
+    ),
+    "cast_echoes": _kernel(
+        "echo", "ray particle", *_CAST, *_NORMALS, *_POSES, _CONES, "out real ranges [particles * rays]",
+        "out real incidence [particles * rays]", *_MAP, "int particles", "int rays", *_CONE, *_CASTER, *_RANGE,
     ),
     "sum_parts": _kernel(
         "sums", "particle", "real parts [particles * count]", "int order [particles]", "out real log_p [particles]",

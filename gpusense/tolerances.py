@@ -108,6 +108,16 @@ _ALL = (
         "end points near a cell's edge are found again with twice the digits, so float32 hits the cells of float64; "
         "nearer than 1e-13 cells per cell of range twice the digits cannot tell, and either cell is right",
     ),
+    Tolerance(
+        "normals of straight walls, mean", 2, "degrees",
+        "the error of the principal direction of a strip of 9 cells of a wall: half a cell of steps at its ends",
+    ),
+    Tolerance("normals of straight walls, largest", 12, "degrees", "a step of a wall that is almost along an axis"),
+    Tolerance(
+        "float32 angles of incidence", 8, "eps",
+        "directions and normals have the same bits everywhere; arc tangents of OpenCL are within 6 ulps",
+    ),
+    Tolerance("float64 angles of incidence", 1e-14, "rad", "arc tangents of OpenCL are within 6 ulps"),
     Tolerance("specialize=False, float32", 32, "eps (1 + |log p_k|)", "both keep the bound of one beam"),
     Tolerance("specialize=False, float64", 2e-11, "1 + |log p_k|", "both keep the bound of one beam"),
     Tolerance(

@@ -182,8 +182,8 @@ class ScanModel(ABC):
         self._peer = compat_module.choose(compat)
         # What the sum over beams begins with, and whether readings are end points.
         self._lead, self._end_points = 0.0, end_points
-        # Whether the probability of a max reading depends on the pose.
-        self._max_depends = False
+        # Rays of each beam, and whether the probability of a max reading depends on the pose.
+        self._rays_each, self._max_depends = 1, False
         # Numbers that GPUs keep for each reading until they are summed.
         self._kept_parts = 1 / BLOCK_TERMS if end_points else 1.0
         self.compat = compat
@@ -316,7 +316,7 @@ class ScanModel(ABC):
         launch = self._prepare_launch(scan)
         space, backend = self._workspace, self._backend
         kept = 1.0 if per_beam else self._kept_parts if backend.info.kind == "gpu" else 0.0
-        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize * kept)
+        chunk = chunk_of(backend, len(scan.readings) * self._rays_each, self._real.itemsize * kept)
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:

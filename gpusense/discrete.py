@@ -198,8 +198,8 @@ class DiscreteBeamModel:
             of no return; 0 where a reading is missing.
 
         Raises:
-            TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number beside a
-            reading that is not missing.
+            TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number
+                beside a reading that is not missing.
         """
         z, z_exp = check_pairs(ranges, expected, self.range_max)
         i, j = bins_of(z, self.range_max, self.bins), bins_of(z_exp, self.range_max, self.bins)
@@ -250,8 +250,8 @@ def check_pairs(ranges: object, expected: object, range_max: float) -> tuple[NDA
         float64 readings, NaN for missing and inf for no return, and expected ranges, inf for no obstacle.
 
     Raises:
-        TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number beside a
-            reading that is not missing.
+        TypeError, ValueError: not real numbers, shapes that differ, or an expected range below 0 or not a number
+            beside a reading that is not missing.
     """
     z = _checks.array("ranges", ranges, finite=False, dtype=None)
     z_exp = _checks.array("expected", expected, z.shape, finite=False, dtype=None)

@@ -30,7 +30,7 @@ from gpusense.scanner import Reading, classes
 Floats = NDArray[np.float64]
 
 # Scans whose rays are cast at once, lines of a file that are read at once, and readings that are scored at once.
-_SCANS, _LINES, _BLOCK = 256, 1 << 16, 1 << 17
+SCANS, _LINES, _BLOCK = 256, 1 << 16, 1 << 17
 # A longer line is no line of numbers.
 _LONGEST_LINE = 4096
 
@@ -85,6 +85,7 @@ def data_of_log(
     backend: str | Backend = "auto",
     range_min: float = 0.0,
     block: int = 1,
+    incidence: bool = False,
     step: Callable[[str], None] = lambda text: None,
 ) -> RangeData:
     """Readings of a log and the ranges that a map lets expect at their poses.
@@ -95,21 +96,25 @@ def data_of_log(
         backend: Where rays are cast.
         range_min: Readings below this are missing [m].
         block: Scans of a block.
+        incidence: Also find the angles of incidence.
         step: Called with a text before every 256 scans.
     """
     block = _checks.integer("block", block, low=1)
     model = BeamModel(grid, scans[0][1].scanner, backend=backend)
-    expected = []
-    for first in range(0, len(scans), _SCANS):
+    expected, angles = [], []
+    for first in range(0, len(scans), SCANS):
         step(f"casting scan {first} of {len(scans)}")
-        poses = np.array([scan.pose for _, scan in scans[first : first + _SCANS]], dtype=np.float64)
+        poses = np.array([scan.pose for _, scan in scans[first : first + SCANS]], dtype=np.float64)
         expected.append(np.asarray(model.expected_ranges(poses), np.float64))
+        if incidence:
+            angles.append(np.asarray(model.incidence(poses), np.float64))
     count = model.scanner.count
     # What float32 gives for "nothing" is range_max, rounded.
     ahead = np.minimum(np.concatenate(expected).ravel(), model.scanner.range_max)
     ranges = np.concatenate([scan.ranges for _, scan in scans])
     blocks = np.repeat(np.arange(len(scans)) // block, count)
-    return RangeData(ranges, ahead, None, blocks, model.scanner.range_max, range_min)
+    angle = np.concatenate(angles).ravel() if incidence else None
+    return RangeData(ranges, ahead, angle, blocks, model.scanner.range_max, range_min)
 
 
 def data_of_pairs(
@@ -155,9 +160,8 @@ def data_of_pairs(
         if limit is not None and kept >= limit:
             break
     if not kept:
-        raise ValueError(
-            f"pairs: must hold a pair of number {offset}, which is the first one chosen, got {seen} in {file}"
-        )
+        rule = f"must hold a pair of number {offset}, which is the first one chosen"
+        raise ValueError(f"pairs: {rule}, got {seen} in {file}")
     table = np.concatenate(parts)
     incidence = table[:, 2].copy() if columns == 3 else None
     return RangeData(
@@ -170,7 +174,7 @@ def _number_rows(file: Any) -> Iterator[Floats]:
     with open(file, "rb") as raw:
         zipped = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
-        stream = io.BufferedReader(gzip.GzipFile(fileobj=raw)) if zipped else raw  # type: ignore[arg-type]
+        stream = io.BufferedReader(gzip.GzipFile(fileobj=raw)) if zipped else raw
         columns, number, header = 0, 0, True
         lines: list[tuple[int, str]] = []
         while True:
@@ -307,9 +311,8 @@ def log_densities(parameters: BeamParameters, data: RangeData, range_bias: float
 def block_mean(values: Floats, block: NDArray[np.int64]) -> tuple[float, float]:
     """Mean of all values and its standard error, that of a ratio of sums over blocks; NaN for fewer than 2 blocks."""
     if not np.isfinite(values).all():
-        return (
-            float(values.sum()) if not (np.isposinf(values).any() and np.isneginf(values).any()) else math.nan
-        ), math.nan
+        with np.errstate(invalid="ignore"):
+            return float(values.sum()), math.nan
     counts, sums = np.bincount(block).astype(float), np.bincount(block, values)
     mean = float(sums.sum() / counts.sum())
     blocks = len(counts)

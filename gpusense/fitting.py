@@ -238,7 +238,8 @@ class HeldOut:
         parameters: They, with weights that sum to 1.
         per_beam: Mean log-likelihood of a reading [nats]; -inf where one is impossible.
         error: Its standard error, by blocks.
-        gain: Mean by which the fitted parameters make a reading likelier [nats]; 0 for the fitted ones.
+        gain: Mean by which the fitted parameters make a reading likelier [nats]; 0 for the fitted ones. Where these
+            make a reading impossible it is that of the softened ones.
         gain_error: Its standard error, by blocks; NaN where there are fewer than 2.
         impossible: Readings that are impossible.
     """
@@ -264,14 +265,26 @@ def peer_parameters() -> dict[str, BeamParameters]:
     return found
 
 
-def compare_held_out(fitted: BeamParameters, data: RangeData, *, range_bias: float = 0.0) -> list[HeldOut]:
+def softened(fitted: BeamParameters, readings: int) -> BeamParameters:
+    """Fitted parameters as if each cause had been seen half a time more, so that none is impossible (Jeffreys)."""
+    values = fitted.to_dict()
+    for name in ("z_hit", "z_short", "z_max", "z_rand"):
+        values[name] = (values[name] * readings + 0.5) / (readings + 2)
+    return BeamParameters.from_dict(values)
+
+
+def compare_held_out(
+    fitted: BeamParameters, data: RangeData, *, readings: int, range_bias: float = 0.0
+) -> list[HeldOut]:
     """Held-out readings with fitted parameters, and with the defaults of nav2_amcl and Beluga.
 
-    All are likelihoods by the book's normalised mixture, not the weights that these programs compute.
+    All are likelihoods by the book's normalised mixture, not the weights that these programs compute. Where the fitted
+    parameters make a held-out reading impossible, softened ones follow them, with which the others are compared.
 
     Args:
         fitted: Parameters that these readings had no part in.
         data: The readings.
+        readings: How many the parameters were fitted to.
         range_bias: Offset that was fitted with them, taken from the readings before they are scored [m].
 
     Raises:
@@ -282,10 +295,14 @@ def compare_held_out(fitted: BeamParameters, data: RangeData, *, range_bias: flo
         raise ValueError("holdout: must hold out a reading that is not missing, got none")
     data = data.chosen(known)
     _, place = np.unique(data.block, return_inverse=True)
+    candidates = {"fitted": fitted}
     own = log_densities(fitted, data, range_bias)
+    if np.isneginf(own).any():
+        candidates["fitted, softened"] = softened(fitted, readings)
+        own = log_densities(candidates["fitted, softened"], data, range_bias)
     rows = []
-    for name, parameters in {"fitted": fitted, **peer_parameters()}.items():
-        log_p = own if name == "fitted" else log_densities(parameters, data)
+    for name, parameters in {**candidates, **peer_parameters()}.items():
+        log_p = log_densities(parameters, data, range_bias if name in candidates else 0.0)
         with np.errstate(invalid="ignore"):
             gain = np.where(own == log_p, 0.0, own - log_p)
         mean, gained = block_mean(log_p, place), block_mean(gain, place)

@@ -166,10 +166,13 @@ def test_impossible_readings_are_counted(capsys, tmp_path):
     rows = [f"{1 + 0.01 * (i % 7)},1" if i < 100 or i % 10 else "inf,1" for i in range(200)]
     (tmp_path / "some.csv").write_text("\n".join(rows))
     _, text, _ = run(capsys, "--pairs", tmp_path / "some.csv", "--range-max", 4, "--holdout", "--json")
-    fitted = json.loads(text)["held_out"][0]
-    assert fitted["impossible"] == 10 and fitted["per_beam"] is None
+    fitted, soft, amcl, _ = json.loads(text)["held_out"]
+    assert fitted["impossible"] == 10 and fitted["per_beam"] is None and fitted["gain"] is None
+    # Half a reading of no return beside 100 ranges.
+    assert soft["name"] == "fitted, softened" and soft["gain"] == 0 and soft["parameters"]["z_max"] == 0.5 / 102
+    assert amcl["gain"] == pytest.approx(soft["per_beam"] - amcl["per_beam"])
     _, text, _ = run(capsys, "--pairs", tmp_path / "some.csv", "--range-max", 4, "--holdout")
-    assert "fitted: 10 held-out readings are impossible with these" in text
+    assert "fitted: 10 held-out readings are impossible" in text
 
 
 def test_pairs_are_read_in_blocks(tmp_path, monkeypatch):
@@ -213,12 +216,15 @@ PAIRS = ["--pairs", "{file}", "--range-max", "5"]
     (None, [*LOG, "--method", "magic"], "argument --method: invalid choice: 'magic'"),
     (None, [*LOG, "--offset", "99"], "log: must have a scan of index 99"),
     (None, [*LOG, "--limit", "1", "--holdout"], "holdout: must have at least 2 blocks of readings, got 1"),
-    (None, [*LOG, "--out", "{map}"], "argument --out: must be a folder that can be written to, got '{map}': File exists"),
+    (None, [*LOG, "--out", "{map}"],
+     "argument --out: must be a folder that can be written to, got '{map}': File exists"),
     (None, [*LOG, "--method", "em-book", "--range-bias"], "range_bias: must be False with method 'em-book'"),
-    ("1,1", [*PAIRS, "--incidence", "3"], "--incidence: must have pairs with a third column, the angle, got two in {file}"),
+    ("1,1", [*PAIRS, "--incidence", "3"],
+     "--incidence: must have pairs with a third column, the angle, got two in {file}"),
     ("1,1", [*PAIRS, "--backend", "opencl:no such"], "no such"),
     ("", PAIRS, "pairs: must hold a pair of number 0, which is the first one chosen, got 0 in {file}"),
-    ("1,1\n2,2\n", [*PAIRS, "--offset", "2"], "pairs: must hold a pair of number 2, which is the first one chosen, got 2"),
+    ("1,1\n2,2\n", [*PAIRS, "--offset", "2"],
+     "pairs: must hold a pair of number 2, which is the first one chosen, got 2"),
     ("z,e\n1,1\nx,2\n", PAIRS, "{file}: line 3: must hold numbers, got 'x'"),
     ("z,e\nz,e\n", PAIRS, "{file}: line 2: must hold numbers, got 'z'"),
     ("1,1\n\n1,2,3\n", PAIRS, "{file}: line 3: must hold 2 numbers with commas between them, got 3"),
@@ -226,7 +232,8 @@ PAIRS = ["--pairs", "{file}", "--range-max", "5"]
     ("1,2,3,4\n", PAIRS, "{file}: line 1: must hold 2 or 3 numbers with commas between them, got 4"),
     ("1,2\n" + "1," * 3000, PAIRS, "{file}: line 2: must have at most 4096 bytes, got more"),
     ("nan,1\nnan,1\n", PAIRS, "ranges: must hold a reading that is not missing, got 2 of which none is"),
-    ("1,9\n", PAIRS, "expected: every value must be in [0, range_max] where the reading is not missing, got 9.0 at index 0"),
+    ("1,9\n", PAIRS,
+     "expected: every value must be in [0, range_max] where the reading is not missing, got 9.0 at index 0"),
     (b"\x1f\x8b\x08junk", PAIRS, "{file}: must be a whole gzip file, got "),
     (b"\xff\xfe\x00", PAIRS, "pairs: must hold a pair of number 0"),
     (None, ["--pairs", "{folder}/none.csv", "--range-max", "5"], "none.csv: must exist, got no such file"),

@@ -181,7 +181,9 @@ def _fit(args: argparse.Namespace, data: RangeData) -> Result:
             data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias
         )
     bias = fit.range_bias if fit.bias_fitted else 0.0
-    compared = compare_held_out(fit.parameters, rest, range_bias=bias) if rest is not None else []
+    compared = []
+    if rest is not None:
+        compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias)
     return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges))
 
 
@@ -216,7 +218,8 @@ def _print(result: Result, files: list[Path]) -> None:
         print_table(columns, rows, right=columns[1:])
         for row in result.held_out:
             if row.impossible:
-                print(f"{row.name}: {row.impossible} held-out readings are impossible with these")
+                print(f"{row.name}: {row.impossible} held-out readings are impossible")
+                print("softened: as if each cause had been seen half a time more; others are compared with that")
     if files:
         print("\nwritten: " + ", ".join(map(str, files)))
     print(f"\n{machine_line()}")

@@ -17,8 +17,8 @@ The log-likelihood of a reading is a density [log 1/m], so it depends on the sen
 does not. Standard errors of the held-out figures are those of blocks of neighbouring scans (--block) or of 100 readings
 of a sonar. Others' defaults are those of nav2_amcl and Beluga with their weights divided by their sums, in the book's
 normalised mixture. Where the fitted parameters make a held-out reading impossible, half a reading of each cause is
-added to them ("softened"). --discrete adds the discrete model with dependent causes, learned in steps of that width on the
-same half, and what it gains over the fitted mixture in the same steps.
+added to them ("softened"). --discrete adds the discrete model with dependent causes, learned in steps of that width
+on the same half, and what it gains over the fitted mixture in the same steps.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The discrete model: what its rows look like, and how fast it tends to continuous densities as bins shrink.
 
-    python bench/discrete_convergence.py              # writes docs/img/discrete_*.png, prints the table of docs/discrete.md
+    python bench/discrete_convergence.py        # writes docs/img/discrete_*.png, prints the table of docs/discrete.md
     python bench/discrete_convergence.py --output DIRECTORY --most 512
 
 *Convergence*: the largest difference of densities (probability over width) from the continuous model, over readings and

@@ -233,27 +233,23 @@ BINS = (64, 128, 256, 512, 1024)
 
 
 def assert_first_order(errors: list[float]) -> None:
-    """Halving the width halves the error; 1.7 leaves room for where in a bin the places lie, and ends well below."""
-    ratios = np.array(errors[:-1]) / errors[1:]
-    assert (ratios > 1.2).all() and errors[0] / errors[-1] > 1.7 ** (len(errors) - 1), errors
+    """Halving the width halves the mean error; 1.6 leaves room for where in a bin the places lie."""
+    assert (np.array(errors[:-1]) / errors[1:] > 1.6).all(), errors
 
 
 @pytest.mark.parametrize("name", ["all", "no max", "hit"])
 def test_the_mixture_is_the_limit_of_shared_causes(name):
     """At every z but next to p_short's jump at z*, as long as some mass is left beyond."""
-    p, expected = MIXTURES[name], np.array([0.7, 2.3, 4.1, 5.6, RANGE])
+    p, expected = MIXTURES[name].replace(lambda_short=0.4), np.append(np.linspace(0.41, 5.83, 37), RANGE)
     z = np.linspace(0.01, RANGE - 1.0, 173)
-    truth = np.exp(
-        Mixture.of(p, RANGE)
-        .log_densities(np.broadcast_to(z, (5, 173)), np.broadcast_to(expected[:, None], (5, 173)))
-        .astype(float)
-    )
+    each = np.broadcast_arrays(z, expected[:, None])
+    truth = np.exp(Mixture.of(p, RANGE).log_densities(*each).astype(float))
     sure = np.abs(z - expected[:, None]) > RANGE / BINS[0]
     errors, atoms = [], []
     for bins in BINS:
         found, none = densities(p, bins, z, expected)
-        errors.append(np.abs(found - truth)[sure].max())
-        atoms.append(np.abs(none - p.z_max).max())
+        errors.append(np.abs(found - truth)[sure].mean())
+        atoms.append(np.abs(none - p.z_max).mean())
     assert_first_order(errors)
     if name == "all":
         assert_first_order(atoms)
@@ -265,7 +261,7 @@ def test_the_limit_of_separate_causes_is_that_of_the_first_of_three_waits():
     """``S(z) (lambda_short [z < z*] + lambda_rand + p f / (1 - p F))``, f and F the truncated normal's."""
     from scipy.stats import truncnorm
 
-    c, expected = CAUSES["sonar"], np.array([0.7, 2.3, 4.1, 5.6])
+    c, expected = CAUSES["sonar"], np.linspace(0.41, 5.83, 37)
     z = np.linspace(0.01, RANGE - 0.01, 173)
     ends = (0 - expected[:, None]) / c.sigma_hit, (RANGE - expected[:, None]) / c.sigma_hit
     normal = truncnorm(*ends, loc=expected[:, None], scale=c.sigma_hit)
@@ -277,8 +273,8 @@ def test_the_limit_of_separate_causes_is_that_of_the_first_of_three_waits():
     errors, atoms = [], []
     for bins in BINS:
         found, none = densities(c, bins, z, expected)
-        errors.append(np.abs(found - survival * rate)[sure].max())
-        atoms.append(np.abs(none - atom).max())
+        errors.append(np.abs(found - survival * rate)[sure].mean())
+        atoms.append(np.abs(none - atom).mean())
     assert_first_order(errors)
     assert_first_order(atoms)
 

@@ -32,7 +32,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.learning.device_sums import DeviceSums
 from gpusense.learning.em import em_step
-from gpusense.learning.fit import make_bounds, open_device
+from gpusense.learning.options import make_bounds, open_device
 from gpusense.learning.pairs import make_pairs
 from gpusense.learning.point import first_guess, random_start
 from gpusense.learning.problem import NO_PRIOR, Problem

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.normals import surface_normals
     from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+    from gpusense.positions.bearings import triangulate, triangulate_triangle
+    from gpusense.positions.both import locate
+    from gpusense.positions.fix import PositionFix
+    from gpusense.positions.ranges import trilaterate
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
     from gpusense.weights import Weights, normalize_weights, resample
@@ -45,6 +49,7 @@ _HOME = {
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
     "Odometry": "gpusense.logs",
+    "PositionFix": "gpusense.positions.fix",
     "RayCaster": "gpusense.models.caster",
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
@@ -55,11 +60,15 @@ _HOME = {
     "distance_transform": "gpusense.prepare",
     "fit_beam_parameters": "gpusense.learning.fit",
     "fit_incidence_parameters": "gpusense.learning.incidence",
+    "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
     "surface_normals": "gpusense.normals",
+    "triangulate": "gpusense.positions.bearings",
+    "triangulate_triangle": "gpusense.positions.bearings",
+    "trilaterate": "gpusense.positions.ranges",
     "write_map": "gpusense.map_io",
 }
 
@@ -78,6 +87,7 @@ __all__ = [
     "LikelihoodFieldParameters",
     "OccupancyGrid",
     "Odometry",
+    "PositionFix",
     "RayCaster",
     "Reading",
     "Scan",
@@ -89,11 +99,15 @@ __all__ = [
     "distance_transform",
     "fit_beam_parameters",
     "fit_incidence_parameters",
+    "locate",
     "normalize_weights",
     "read_log",
     "read_map",
     "resample",
     "surface_normals",
+    "triangulate",
+    "triangulate_triangle",
+    "trilaterate",
     "write_map",
 ]
 

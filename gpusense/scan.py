@@ -5,6 +5,7 @@ Readings are classed first and thinned afterwards, so that ``beams=60`` means 60
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -156,14 +157,25 @@ def prepare_scan(
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _limits(range_min: float, range_max: float, dtype: np.dtype) -> tuple[np.floating, np.floating]:
+    """The scanner's limits as readings of a type compare with them."""
+    with np.errstate(over="ignore"):
+        return dtype.type(range_min), dtype.type(range_max)
+
+
 def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float) -> PreparedScan:
     """``prepare_scan`` where all beams are used and none repeats another: what filters do at every step."""
-    with np.errstate(over="ignore"):
-        nearest, farthest = ranges.dtype.type(scanner.range_min), ranges.dtype.type(scanner.range_max)
-    far = ranges >= farthest
-    near_enough = (ranges >= nearest) & (ranges > 0) if scanner.range_min > 0 else ranges >= 0
-    columns, count = np.flatnonzero(near_enough & ~far), int(np.count_nonzero(far))
+    nearest, farthest = _limits(scanner.range_min, scanner.range_max, ranges.dtype)
+    hit = ranges >= nearest
+    if nearest == 0 < scanner.range_min:
+        hit &= ranges > 0
+    hit &= ranges < farthest
+    columns, count = hit.nonzero()[0], 0
+    far = columns[:0]
     if len(columns) < len(ranges):
+        far = (ranges >= farthest).nonzero()[0]
+        count = len(far)
         ranges, vectors = ranges[columns], vectors[columns]
     return PreparedScan(
         columns=columns,
@@ -172,7 +184,7 @@ def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max
         rays=vectors,
         first=np.arange(len(columns) + 1, dtype=np.int32),
         constant=float(count * np.log(z_max)) if count and z_max > 0 else 0.0,
-        max_columns=np.flatnonzero(far) if z_max > 0 else columns[:0],
+        max_columns=far if z_max > 0 else columns[:0],
         missing=scanner.count - len(columns) - count,
         ignored_max=0 if z_max > 0 else count,
         thinned=0,

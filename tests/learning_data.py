@@ -6,7 +6,7 @@ import numpy as np
 
 from gpusense.backends import get_backend
 from gpusense.learning.device_sums import DeviceSums
-from gpusense.learning.fit import make_bounds
+from gpusense.learning.options import make_bounds
 from gpusense.learning.pairs import make_pairs
 from gpusense.learning.point import Point, first_guess, random_start
 from gpusense.learning.problem import NO_PRIOR, Prior, Problem

@@ -50,6 +50,7 @@ def test_normals_of_straight_walls(thick, record_property):
             assert (along > 0.9).all()
     each = np.concatenate(errors)
     record_property("mean error in degrees", float(each.mean()))
+    record_property("largest error in degrees", float(each.max()))
     assert each.mean() <= TOLERANCES["normals of straight walls, mean"].value
     assert each.max() <= TOLERANCES["normals of straight walls, largest"].value
 

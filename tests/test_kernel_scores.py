@@ -11,7 +11,6 @@ from kernel_scenes import (
     GRIDS,
     LASER,
     LIMIT,
-    PRECISIONS,
     RESOLUTION,
     adversarial_poses,
     assert_near,
@@ -80,9 +79,14 @@ def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
     return reading
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("names", [(), ("ALL_READINGS", "ORIGINS_OUTSIDE", "SHARED_RAYS")])
-@pytest.mark.parametrize("name", list(MIXTURES))
+# Each set of flags is compiled. The lines of the components, of the precision and of the rest of the kernel are apart,
+# so each mixture has a plain scene in float32 and a full one in float64, and two mixtures have all four.
+FULL = ("ALL_READINGS", "ORIGINS_OUTSIDE", "SHARED_RAYS")
+BEAMS = [*((name, *case) for name in MIXTURES for case in (((), np.float32), (FULL, np.float64)))]
+BEAMS += [(name, *case) for name in ("book", "hit and short") for case in (((), np.float64), (FULL, np.float32))]
+
+
+@pytest.mark.parametrize(("name", "names", "real"), BEAMS)
 def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     occupied = GRIDS["rooms"]
     flags, terms = mixture(name, real, z_max=0.05)
@@ -197,9 +201,14 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
     )
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("names", [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")])
-@pytest.mark.parametrize("name", list(FIELDS))
+# As models have them: float32 is careful, float64 needs no second look.
+FIELD_SCENES = [
+    *((name, names, np.float32) for name in FIELDS for names in (("CAREFUL",), ("ALL_READINGS", "CAREFUL"))),
+    *((name, names, np.float64) for name in FIELDS for names in ((), ("ALL_READINGS",))),
+]
+
+
+@pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     flags = scene_flags(real, "PER_BEAM", *FIELDS[name], *names)
     scene = field_scene(name, real, all_readings="ALL_READINGS" in names)

@@ -25,7 +25,7 @@ from kernel_scenes import (
     scene_flags,
     sector_flags,
 )
-from test_kernel_scores import FIELDS, MIXTURES, field_scene, mixture, scan
+from test_kernel_scores import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mixture, scan
 
 from gpusense.backends import Backend, get_backend
 from gpusense.models.field import _GUARD
@@ -166,8 +166,11 @@ def test_tiles_of_beams(way: str, names: tuple[str, ...], device: Backend) -> No
         assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, np.float32))
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("names", [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")])
+# Each set of flags is compiled: as in test_kernel_scores, each mixture once plain in float32 and once full in float64.
+TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
+
+
+@pytest.mark.parametrize(("names", "real"), [*zip(TILED, PRECISIONS, strict=True)])
 @pytest.mark.parametrize("name", ["book", "hit", "short", "hardly any rand"])
 def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     assert name in MIXTURES
@@ -207,9 +210,7 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 
 # ---- the likelihood field
 
-CAREFUL = [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")]
-# float64 needs no second look.
-BLOCKED = [*itertools.product(FIELDS, CAREFUL, PRECISIONS), ("log table", ("CAREFUL", "QUICK"), np.float32)]
+BLOCKED = [*FIELD_SCENES, ("log table", ("CAREFUL", "QUICK"), np.float32)]
 
 
 def guards_of(point: np.ndarray) -> np.ndarray:

@@ -4,60 +4,24 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gpusense import _checks
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend
 from gpusense.learning.book import climb_book
 from gpusense.learning.device_sums import DeviceSums
-from gpusense.learning.em import Climb, Watch, climb_em, newton_direction
+from gpusense.learning.em import Climb, Watch, climb_em
+from gpusense.learning.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.pairs import Pairs, make_pairs
-from gpusense.learning.point import (
-    BIAS,
-    HIT,
-    NAMES,
-    RATE,
-    SHORT,
-    SIGMA,
-    Bounds,
-    Point,
-    first_guess,
-    possible_causes,
-    random_start,
-)
-from gpusense.learning.problem import NO_PRIOR, NOTHING, Prior, Problem, Value
+from gpusense.learning.point import Bounds, Point, first_guess, random_start
+from gpusense.learning.problem import NO_PRIOR, Prior, Problem, Value
+from gpusense.learning.report import report
 from gpusense.learning.result import BeamFit
 from gpusense.learning.searches import climb_genetic, climb_gradient, climb_hill
-from gpusense.learning.uncertainty import standard_errors
 from gpusense.parameters import BeamParameters
-from gpusense.scanner import Reading
-
-METHODS = ("em", "em-book", "gradient", "hill_climb", "genetic")
-Callback = Callable[[int, float, BeamParameters], object]
-
-# By default sigma_hit is at least the deviation of rounding to the sensor's step, or this part of range_max.
-_SMALLEST_SIGMA = 1e-6
-# lambda_short range_max: from hardly distinguishable from uniform to readings within 1e-4 range_max.
-_RATES = (1e-3, 1e4)
-
-
-@dataclass(frozen=True)
-class Options:
-    """How a fit is made; see :func:`fit_beam_parameters`."""
-
-    method: str
-    max_iterations: int
-    tolerance: float
-    restarts: int
-    seed: int
-    range_bias: bool
-    progress: bool
-    callback: Callback | None
-    responsibilities: bool
 
 
 def fit_beam_parameters(
@@ -131,91 +95,6 @@ def fit_beam_parameters(
     return fit_pairs(device, pairs, bounds, start, options)
 
 
-def check_options(
-    method: str,
-    max_iterations: int | None,
-    tolerance: float,
-    restarts: int,
-    seed: int,
-    range_bias: bool,
-    progress: bool,
-    callback: Callback | None,
-    responsibilities: bool,
-) -> Options:
-    """The options of a fit, checked.
-
-    Raises:
-        TypeError, ValueError: as :func:`fit_beam_parameters`.
-    """
-    method = _checks.choice("method", method, METHODS)
-    if max_iterations is None:
-        max_iterations = {"em": 500, "em-book": 60}.get(method, 1000)
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback: must be callable, got {_checks.show(callback)}")
-    for name, flag in (("range_bias", range_bias), ("progress", progress), ("responsibilities", responsibilities)):
-        if not isinstance(flag, (bool, np.bool)):
-            raise TypeError(f"{name}: must be True or False, got {_checks.show(flag)}")
-    if method == "em-book" and range_bias:
-        raise ValueError("range_bias: must be False with method 'em-book', which has no offset, got True")
-    return Options(
-        method,
-        _checks.integer("max_iterations", max_iterations, low=1),
-        _checks.real("tolerance", tolerance, above=0),
-        _checks.integer("restarts", restarts, low=0),
-        _checks.integer("seed", seed, low=0),
-        bool(range_bias),
-        bool(progress),
-        callback,
-        bool(responsibilities),
-    )
-
-
-def open_device(backend: str | Backend, precision: str | None) -> tuple[Backend, np.dtype]:
-    """The device and the precision of its kernels."""
-    opened = get_backend(backend)
-    if precision is None:
-        precision = "float64" if opened.info.float64 else "float32"
-    real = np.dtype(_checks.choice("precision", precision, ("float64", "float32")))
-    if real == np.float64 and not opened.info.float64:
-        raise ValueError(f"precision: must be 'float32' on {opened.info.name}, which has no float64, got 'float64'")
-    return opened, real
-
-
-def make_bounds(
-    pairs: Pairs, sigma: tuple[float, float] | None = None, rate: tuple[float, float] | None = None
-) -> Bounds:
-    """Bounds of the shapes: the user's, or those that the readings allow."""
-    range_max = pairs.range_max
-    smallest = max(pairs.quantum / math.sqrt(12), _SMALLEST_SIGMA * range_max)
-    return Bounds(
-        _bounds("sigma_bounds", sigma, (min(smallest, range_max), range_max)),
-        _bounds("lambda_bounds", rate, (_RATES[0] / range_max, _RATES[1] / range_max)),
-        range_max,
-    )
-
-
-def _bounds(name: str, given: tuple[float, float] | None, default: tuple[float, float]) -> tuple[float, float]:
-    if given is None:
-        return default
-    low, high = _checks.array(name, given, (2,)).tolist()
-    if not 0 < low <= high:
-        raise ValueError(f"{name}: must be two numbers, 0 < smallest <= largest, got {_checks.show(given)}")
-    return low, high
-
-
-def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds) -> Point:
-    """Where a user's parameters begin: without the causes that no reading can have.
-
-    Raises:
-        ValueError: the causes that are left do not explain the readings.
-    """
-    point = bounds.hold(Point.of(initial))
-    weights = np.where(possible_causes(pairs), point.weights, 0)
-    if (pairs.hits and not weights[[0, 1, 3]].any()) or (pairs.max_readings and not weights[2]):
-        raise ValueError(f"initial: must give every reading a cause, got {_checks.show(initial)}")
-    return replace(point, weights=weights / weights.sum())
-
-
 def fit_pairs(
     device: DeviceSums, pairs: Pairs, bounds: Bounds, start: Point, options: Options, prior: Prior = NO_PRIOR
 ) -> BeamFit:
@@ -230,7 +109,7 @@ def fit_pairs(
     with _watcher(options, len(starts)) as watch:
         climbs = [_climb(problem, each, options, watch) for each in starts]
     best = max(climbs, key=lambda climb: climb.value.objective)
-    return _result(problem, best, options)
+    return report(problem, best, options)
 
 
 def _climb(problem: Problem, start: Point, options: Options, watch: Watch) -> Climb:
@@ -266,88 +145,3 @@ def _watcher(options: Options, starts: int) -> Iterator[Watch]:
                 options.callback(iteration, value.log_likelihood, value.point.parameters())
 
         yield watch
-
-
-def _result(problem: Problem, climb: Climb, options: Options) -> BeamFit:
-    device, pairs = problem.device, problem.pairs
-    value = problem.value(climb.value.point, second=True)
-    held = _held(problem, value)
-    errors = standard_errors(problem, value)
-    bias, bias_error = _bias(problem, value)
-    own = {name: errors[name] for name in NAMES[:BIAS]}
-    notes = list(climb.notes)
-    if not climb.converged and not notes:
-        notes.append("did not converge")
-    count = int((value.point.weights > 0).sum()) - 1 + int(value.point.weights[HIT] > 0)
-    if problem.readings < count:
-        notes.append(f"{problem.readings} readings cannot tell {count} parameters")
-    for name, error in own.items():
-        if error == math.inf:
-            held[name] = "the readings do not tell it"
-    notes += [f"{name}: {reason}" for name, reason in held.items()]
-    head = "converged" if climb.converged else "stopped"
-    return BeamFit(
-        parameters=value.point.parameters(),
-        log_likelihood=value.log_likelihood,
-        trace=np.array(climb.trace),
-        converged=climb.converged,
-        status="; ".join([head, *notes]),
-        standard_errors=own,
-        held=held,
-        range_bias=bias,
-        range_bias_error=bias_error,
-        bias_fitted=options.range_bias,
-        iterations=len(climb.trace) - 1,
-        passes=device.passes,
-        hits=pairs.hits,
-        max_readings=pairs.max_readings,
-        missing=pairs.missing,
-        outliers=round(float(value.sums[14])),
-        method=options.method,
-        precision=device.real.name,
-        device=device.selection,
-        responsibilities=_responsibilities(device, pairs, value.point) if options.responsibilities else None,
-    )
-
-
-def _held(problem: Problem, value: Value) -> dict[str, str]:
-    """Why parameters were not free, by their names."""
-    point, bounds = value.point, problem.bounds
-    held = {}
-    for cause in range(4):
-        if point.weights[cause] == 0:
-            held[NAMES[cause]] = "no reading needs this cause"
-        elif point.weights[cause] == 1:
-            held[NAMES[cause]] = "every reading has this cause"
-    free = problem.free(value)
-    shapes = ((SIGMA, HIT, point.sigma, bounds.sigma), (RATE, SHORT, point.rate, bounds.rate))
-    for place, cause, now, (low, high) in shapes:
-        if value.totals[cause] <= NOTHING:
-            held[NAMES[place]] = f"kept, since {NAMES[cause]} accounts for no reading"
-        elif not free[place]:
-            side, bound = ("lower", low) if now <= low else ("upper", high)
-            held[NAMES[place]] = f"at its {side} bound {bound:.3g}"
-    return held
-
-
-def _bias(problem: Problem, value: Value) -> tuple[float, float]:
-    """The offset of correct ranges and its standard error; to first order where it was not fitted."""
-    if value.totals[HIT] <= NOTHING:
-        return value.point.bias, math.nan
-    with_bias = Problem(problem.device, problem.pairs, problem.bounds, problem.prior, True)
-    error = standard_errors(with_bias, value)[NAMES[BIAS]]
-    if problem.fit_bias:
-        return value.point.bias, error
-    if math.isfinite(error):
-        # One Newton step from 0 in all coordinates.
-        return float(newton_direction(with_bias, value)[0][BIAS]), error
-    return float(value.sums[12] / value.sums[1]) if value.sums[1] > 0 else 0.0, error
-
-
-def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray[np.float64]:
-    """(n, 4) of all readings in their order."""
-    found = np.full((len(pairs.kinds), 4), np.nan)
-    found[pairs.kinds == Reading.MAX] = [0, 0, 1, 0]
-    _, hit, short, rand = device.causes(point).T
-    found[pairs.places] = np.stack([hit, short, np.zeros_like(hit), rand], axis=1)
-    return found

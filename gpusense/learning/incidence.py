@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense import _checks
 from gpusense.backends import Backend
 from gpusense.learning.device_sums import DeviceSums
-from gpusense.learning.fit import Callback, check_options, fit_pairs, make_bounds, open_device, start_of
+from gpusense.learning.fit import fit_pairs
+from gpusense.learning.options import Callback, check_options, make_bounds, open_device, start_of
 from gpusense.learning.pairs import Pairs, make_pairs
 from gpusense.learning.point import Point, first_guess
 from gpusense.learning.problem import Prior

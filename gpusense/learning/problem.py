@@ -113,7 +113,6 @@ class Problem:
         bounds: Where shapes may lie.
         prior: Pseudo-readings.
         fit_bias: Whether the offset of correct ranges is free.
-        noise: How far the objective may be off by rounding.
     """
 
     def __init__(self, device: DeviceSums, pairs: Pairs, bounds: Bounds, prior: Prior, fit_bias: bool) -> None:

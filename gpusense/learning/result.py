@@ -23,7 +23,8 @@ class BeamFit:
         log_likelihood: Of the readings with them, natural log; hits are densities [1/m], max readings probabilities.
         trace: (iterations + 1,) the log-likelihood at the start and after each iteration, that of the prior included
             where there is one.
-        converged: Whether the method ended at an optimum; ``status`` says why not.
+        converged: Whether the method came to rest; ``status`` says why not. That is at an optimum of the likelihood,
+            but with ``"em-book"`` where the book's own equations hold.
         status: What is to be known of the fit, in words.
         standard_errors: Of each parameter by its name, from the observed information. NaN where a parameter was held
             (the weight of a cause that does not occur, a shape at a bound or of such a cause), infinite where the

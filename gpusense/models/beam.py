@@ -14,7 +14,7 @@ from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
-from gpusense.cloud import Cloud, all_within, ordered, tiles_of
+from gpusense.cloud import LEAST_ORDERED, Cloud, all_within, ordered, tiles_of
 from gpusense.cones import cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
@@ -29,7 +29,7 @@ from gpusense.models.scan_model import (
     sums_linearly,
 )
 from gpusense.parameters import BeamParameters, IncidenceParameters
-from gpusense.plan import Omission, scene_omissions, share
+from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
@@ -263,6 +263,7 @@ class BeamModel(ScanModel):
                     "exponents in two parts", f"the hit density's peak is at most {HIGH_PEAK:g} / m", "37 operations"
                 )
             )
+        omissions += launch_omissions(self._last_code, LEAST_ORDERED if self.device.kind == "gpu" else None)
         if (far := self._caster.omission()) is not None:
             omissions.append(far)
         caster = self._caster.method
@@ -356,33 +357,43 @@ class BeamModel(ScanModel):
         space, real, backend = self._workspace, self._real, self._backend
         # Readings that share a ray, the axis of their cones, share these.
         vectors = scan.rays if self._cones.rays == 1 else self._cone_vectors[scan.columns[scan.first[:-1]]]
-        ray, shared = space.upload("ray", vectors.astype(real)), scan.shared or not self._specialize
-        first = space.upload("first", scan.first) if scan.shared else self._one_each
         values = scan.readings.astype(real)
         if self._cells:
             # A range below range_max that is rounded to it is still a range, and no max reading to the table.
             top = np.nextafter(real.type(self.scanner.range_max), real.type(0))
             values = np.where(np.isfinite(scan.readings), np.minimum(values, top), values)
-        reading = space.upload("reading", values)
+        ray, reading = space.upload_all("scan", (vectors.astype(real), values))
+        shared = scan.shared or not self._specialize
+        first = space.upload("first", scan.first) if scan.shared else self._one_each
         rays, readings = len(scan.rays), len(scan.readings)
         scalars = (scan.constant + self._lead, self.temperature)
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
-            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=False)
+            poses = cloud.given(backend, space, part)
             flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
             # A table has a row for max readings.
-            flags |= {"ALL_READINGS"} if self._max_depends and self._discrete is None else set()
+            evaluated = self._max_depends and self._discrete is None
+            flags |= cloud.headings() | ({"ALL_READINGS"} if evaluated else set())
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
             normals = self._caster.normals(region, flags)
+            gpu = backend.info.kind == "gpu" and not per_beam
+            if gpu:
+                self._last_code = frozenset(flags)
+                sizes = (count, rays, readings, shared, inside)
+                if space.again(
+                    (poses, result, table, first, normals), cloud.code(), self._caster.map.preparations, sizes, scalars
+                ):
+                    return None
+            placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=False)
             world: tuple[Any, ...] = (region.rows, region.cols, count, rays, readings, len(self._kinds))
             world += (*self._cones.scalars, *self._caster.scalars, self._cells)
             world += (self._cells / self.scanner.range_max, self._caster.limit, self.grid.resolution)
             world += (self.scanner.range_max,)
-            if backend.info.kind == "gpu" and not per_beam:
+            if gpu:
                 order = ordered(backend, space, placed, count, rays, real)
                 flags |= {"ORDERED"} if order is not None else set()
                 self._last_code = frozenset(flags)
@@ -396,6 +407,7 @@ class BeamModel(ScanModel):
                 backend.compile("sum_parts", self._last_code)(
                     (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
                 )
+                space.keep()
                 return parts
             flags |= {"PER_BEAM"} if per_beam else set()
             flags = self._last_code = widened(backend.info, "score_beams", flags)

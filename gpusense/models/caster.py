@@ -295,7 +295,7 @@ class MapCaster:
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
         with self._lock:
-            buffer, region = self.map.ensure(np.array([self.grid.origin]))
+            buffer, region = self.map.ensure([self.grid.origin])
             entries = self.backend.download(buffer, np.empty(region.cells * bins, np.uint16))
             obstacles = region.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
@@ -313,7 +313,7 @@ class MapCaster:
         else:
             ranges = np.empty((cloud.count, rays), self.real) if given is None else given
         if cloud.count * rays:
-            with self._lock:
+            with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
                 chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
                 in_chunks(
@@ -332,7 +332,8 @@ class MapCaster:
     ) -> None:
         space, backend, count = self._workspace, self.backend, part[1] - part[0]
         table, region, corners = cloud.ensure(self.map, *part)
-        placed = cloud.place(backend, space, part, (region, self.grid, self.mount), self.real, careful=False)
+        given = cloud.given(backend, space, part)
+        placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
         if cloud.on_device:
             result = backend.part(ranges, part[0] * rays, count * rays)
         else:
@@ -343,8 +344,8 @@ class MapCaster:
         if "ECHO" in flags:
             other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
             both = (other, result) if cones.incidence else (result, other)
-            given = (table, self.normals(region, flags), placed.cell, placed.pose, ray)
-            backend.compile("cast_echoes", flags)((rays, count), *given, *both, *sizes[:4], *cones.scalars, *sizes[4:])
+            inputs = (table, self.normals(region, flags), placed.cell, placed.pose, ray)
+            backend.compile("cast_echoes", flags)((rays, count), *inputs, *both, *sizes[:4], *cones.scalars, *sizes[4:])
         elif backend.info.kind == "gpu":
             order = ordered(backend, space, placed, count, rays, self.real)
             flags |= {"ORDERED"} if order is not None else set()

@@ -271,11 +271,13 @@ class ScanModel(ABC):
             flat = (np.empty(shape, self._real) if given is None else given).reshape(-1)
         parts = np.zeros((*shape, self.scanner.count if per_beam else 0), self._real)
         each_parts = parts.reshape(len(clouds), count, parts.shape[-1])
-        with self._lock:
+        with self._lock, self._workspace:
             for i, cloud in enumerate(clouds):
                 own = (i * count, (i + 1) * count)
                 target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)
                 self._score_scan(cloud, scans if single else scans[i], target, each_parts[i], per_beam)
+                if not single:
+                    self._workspace.start()
             finish(self._workspace, any(cloud.on_device for cloud in clouds))
         if out is not None:
             log_p = out
@@ -336,7 +338,9 @@ class ScanModel(ABC):
         """Place poses on the device for nothing but to learn whether they are finite."""
         if cloud.on_device and cloud.count:
             frame = (Region(0, 0, *self.grid.shape), self.grid, self.scanner.mount)
-            cloud.place(self._backend, self._workspace, (0, cloud.count), frame, self._real, careful=False)
+            part = (0, cloud.count)
+            given = cloud.given(self._backend, self._workspace, part)
+            cloud.place(self._backend, self._workspace, given, part, frame, self._real, careful=False)
 
     def _fill(self, log_p: Any, value: float) -> None:
         if isinstance(log_p, np.ndarray):

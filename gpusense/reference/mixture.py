@@ -60,6 +60,13 @@ def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndar
     return np.where(inside, log_p, -np.inf)
 
 
+def short_peak(decay: np.floating, expected: np.ndarray) -> np.ndarray:
+    """``lambda / (1 - exp(-2 h))`` as lambda (1 + t) / (2 t) with h = lambda z* / 2 and t = tanh(h); 1 / z* at 0."""
+    h = expected.dtype.type(0.5) * (decay * expected)
+    t = np.tanh(np.where(h > TINY, h, 1))
+    return np.where(h > TINY, decay * (1 + t), 1) / np.where(h > TINY, 2 * t, np.maximum(expected, SMALLEST_RANGE))
+
+
 def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
@@ -82,7 +89,6 @@ def _linear(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: n
         exponent = hit_exponent(flags, z, expected, terms)
         p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
     if "SHORT" in flags:
-        decay = np.exp(-terms[4] * z) / np.maximum(expected, SMALLEST_RANGE)
-        density = terms[3] * short_factor(terms[4] * expected) * decay
+        density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
         p += np.where((z <= expected) & (expected > 0), density, 0)
     return np.log(p + terms[5])

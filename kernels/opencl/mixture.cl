@@ -14,11 +14,14 @@
 
 #if !WIDE
 #if HIT
-// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
+// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels. Most
+// ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
 real hit_mass(const real expected, const real erf_scale, const real range_max) {
     const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
-    if (below > ERF_ONE && above > ERF_ONE) return 1;
-    return (real)0.5 * (erf(below) + erf(above));
+    const real nearer = below < above ? below : above, farther = below < above ? above : below;
+    if (nearer > ERF_ONE) return 1;
+    const real rest = farther > ERF_ONE ? (real)1 : erf(farther);
+    return (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
 }
 
 // (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large and
@@ -53,6 +56,13 @@ real short_factor(const real x) {
 real log_short(const real z, const real expected, global const real *terms) {
     if (!(z <= expected && expected > 0)) return -INFINITY;
     return terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
+}
+
+// short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
+real short_peak(const real lambda, const real expected) {
+    const real h = (real)0.5 * (lambda * expected), t = tanh(h);
+    const real shortest = expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE;
+    return (h > TINY_DECAY ? lambda * (1 + t) : (real)1) / (h > TINY_DECAY ? 2 * t : shortest);
 }
 #endif
 #endif
@@ -93,10 +103,7 @@ real log_density(const real z, const real expected, global const real *terms) {
     p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT
-    if (z <= expected && expected > 0) {
-        const real x = terms[4] * expected;
-        p += terms[3] * short_factor(x) * exp(-terms[4] * z) / (expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE);
-    }
+    if (z <= expected && expected > 0) p += terms[3] * exp(-terms[4] * z) * short_peak(terms[4], expected);
 #endif
     return log(p + terms[5]);
 }

@@ -35,13 +35,21 @@ def functions(flags):
     SMALLEST_RANGE = real(1e-37)
 
     # Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
+    # Most ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
     @wp.func
     def hit_mass(expected: real, erf_scale: real, range_max: real):
         below = expected * erf_scale
         above = (range_max - expected) * erf_scale
-        if wp.min(below, above) > ERF_ONE:
+        nearer = wp.min(below, above)
+        farther = wp.max(below, above)
+        if nearer > ERF_ONE:
             return ONE
-        return HALF * (wp.erf(below) + wp.erf(above))
+        rest = real(1.0)
+        if farther <= ERF_ONE:
+            rest = wp.erf(farther)
+        if nearer > ZERO:
+            rest += wp.erf(nearer)
+        return HALF * rest
 
     # (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large
     # and nearly cancel, and the second part keeps the digits that are left.
@@ -80,6 +88,18 @@ def functions(flags):
             return terms[3] + wp.log(short_factor(terms[4] * expected)) - wp.log(expected) - terms[4] * z
         return NEVER
 
+    # short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
+    @wp.func
+    def short_peak(rate: real, expected: real):
+        h = HALF * (rate * expected)
+        above = ONE
+        below = wp.max(expected, SMALLEST_RANGE)
+        if h > TINY:
+            t = wp.tanh(h)
+            above = rate * (ONE + t)
+            below = t + t
+        return above / below
+
     # p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
     @wp.func
     def log_density_linear(z: real, expected: real, terms: wp.array(dtype=real)):
@@ -94,8 +114,7 @@ def functions(flags):
                 p += hit / mass
         if SHORT:
             if z <= expected and expected > ZERO:
-                x = terms[4] * expected
-                p += terms[3] * short_factor(x) * wp.exp(-terms[4] * z) / wp.max(expected, SMALLEST_RANGE)
+                p += terms[3] * wp.exp(-terms[4] * z) * short_peak(terms[4], expected)
         return wp.log(p + terms[5])
 
     # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.

@@ -14,6 +14,7 @@ from gpusense._version import __version__
 
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
+    from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
     from gpusense.learning.fit import fit_beam_parameters
     from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
@@ -39,6 +40,9 @@ _HOME = {
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "DiscreteBeamModel": "gpusense.discrete",
+    "DiscreteCauses": "gpusense.discrete",
+    "DiscreteFit": "gpusense.discrete",
     "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
@@ -74,6 +78,9 @@ __all__ = [
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "DiscreteBeamModel",
+    "DiscreteCauses",
+    "DiscreteFit",
     "IncidenceFit",
     "IncidenceParameters",
     "LikelihoodFieldModel",

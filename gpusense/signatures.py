@@ -204,8 +204,8 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_beams": _kernel(
         "beam", "particle", *_CAST, *_NORMALS, *_POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
-        *_TERMS, "real sensor [cells * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays", "int readings",
-        *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
+        *_TERMS, "real sensor [(cells + 1) * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
+        "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
         wide_group=16,
     ),
     "cast_tiles": _kernel(
@@ -214,7 +214,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "beam_tiles": _kernel(
         "beam", "item", *_CAST, *_NORMALS, *_POSES, "int order [particles]", _CONES, "int first [rays + 1]",
-        "real reading [readings]", *_TERMS, "real sensor [cells * (cells + 1)]",
+        "real reading [readings]", *_TERMS, "real sensor [(cells + 1) * (cells + 1)]",
         "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_ECHO, *_CASTER,
         "int cells", "real per_metre", *_RANGE, "int across", "int along", "int spread",
     ),

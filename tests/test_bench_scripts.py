@@ -166,3 +166,24 @@ def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
         assert row["error"] < 1e-6 and row["converged"] and 0 < row["iteration_s"] < math.inf
     assert len(report["scenes"]) == 2 and report["fall"] <= 1e-9
     assert 0 < report["within"] <= report["identified"] <= 12
+
+
+def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--scans", "20", "--block", "2"]
+    sets = ["sonar1", "sonar2", "lidar_wall", "intel", "s3000"]
+    chosen = [word for name in sets for word in ("--set", name)]
+    report = run_script("fit_real.py", *arguments, *chosen, "--discrete", "0.3", output=tmp_path / "fits")
+    assert [row["set"] for row in report["sets"]] == sets and str(data_dir) not in json.dumps(report)
+    for row in report["sets"]:
+        assert row["fit"]["converged"] and row["discrete"]["converged"] and row["held_out"][0]["name"] == "fitted"
+    # Both sonars sit a little off the reference; the laser's is a set-up error of millimetres.
+    bias = {row["set"]: row["fit"]["range_bias"] for row in report["sets"]}
+    assert abs(bias["sonar1"] + 0.027) < 0.01 and abs(bias["sonar2"]) < 0.01 and 0 < bias["lidar_wall"] < 0.01
+
+
+def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
+    command = [sys.executable, str(BENCH / "discrete_convergence.py"), "--output", str(tmp_path), "--most", "64"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert {path.name for path in tmp_path.iterdir()} == {"discrete_convergence.png", "discrete_rows.png"}
+    first, second = ([float(cell) for cell in line.split("|")[2:-1]] for line in done.stdout.splitlines()[2:])
+    assert all(1.3 < wide / narrow < 3 for wide, narrow in zip(first, second, strict=True))

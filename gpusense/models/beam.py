@@ -16,6 +16,7 @@ from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
 from gpusense.cloud import LEAST_ORDERED, Cloud, all_within, ordered, tiles_of
 from gpusense.cones import cones_of, require_exact
+from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
@@ -46,7 +47,8 @@ class BeamModel(ScanModel):
     Args:
         grid: The map.
         scanner: The scanner's geometry.
-        parameters: Weights and shapes of the mixture.
+        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, the table of a sensor of the
+            scanner's range_max, of which every beam is one look-up, max readings too.
         incidence: Instead of ``parameters``, those for each range of angles of incidence: between a beam and the normal
             of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has those of the first
             range. Where ``z_max`` differs between them, max readings depend on the pose, and are impossible where it
@@ -75,7 +77,7 @@ class BeamModel(ScanModel):
         self,
         grid: OccupancyGrid,
         scanner: Scanner,
-        parameters: BeamParameters | None = None,
+        parameters: BeamParameters | DiscreteBeamModel | None = None,
         *,
         incidence: IncidenceParameters | None = None,
         backend: str | Backend = "auto",
@@ -91,9 +93,14 @@ class BeamModel(ScanModel):
     ) -> None:
         peer = compat_module.choose(compat)
         default = BeamParameters() if peer is None else peer.beam
-        own = default if parameters is None else parameters
+        self._discrete = parameters if isinstance(parameters, DiscreteBeamModel) else None
+        if self._discrete is not None:
+            _check_discrete(self._discrete, scanner, compat, sensor_table)
+        # Of the mixture nothing is used where there is a discrete model.
+        own: object = default if parameters is None or self._discrete is not None else parameters
         if not isinstance(own, BeamParameters):
-            raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(parameters)}")
+            rule = "must be BeamParameters or a DiscreteBeamModel"
+            raise TypeError(f"parameters: {rule}, got {_checks.show(parameters)}")
         self.incidence_parameters = incidence
         # The parameters of each bin of angles of incidence.
         self._kinds: tuple[BeamParameters, ...] = (own,)
@@ -115,9 +122,9 @@ class BeamModel(ScanModel):
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize,
-            z_max=max(p.z_max for p in self._kinds), end_points=False,
+            z_max=max(p.z_max for p in self._kinds) if self._discrete is None else 1.0, end_points=False,
         )  # fmt: skip
-        self._max_depends = len({p.z_max for p in self._kinds}) > 1
+        self._max_depends = self._discrete is not None or len({p.z_max for p in self._kinds}) > 1
         self._cones = cones_of(scanner, method, incidence=incidence is not None)
         self._rays_each = self._cones.rays
         # The rays of each beam: one, or those of a cone.
@@ -138,15 +145,15 @@ class BeamModel(ScanModel):
         self._sensor, self._cells = self._tabulate(sensor_table)
 
     @property
-    def parameters(self) -> BeamParameters:
-        """Weights and shapes of the mixture.
+    def parameters(self) -> BeamParameters | DiscreteBeamModel:
+        """Weights and shapes of the mixture, or the table of a sensor.
 
         Raises:
             AttributeError: they depend on the angle of incidence; see ``incidence_parameters``.
         """
         if self.incidence_parameters is not None:
             raise AttributeError("parameters: depend on the angle of incidence here, see incidence_parameters")
-        return self._kinds[0]
+        return self._kinds[0] if self._discrete is None else self._discrete
 
     @property
     def table_bytes(self) -> int:
@@ -221,6 +228,7 @@ class BeamModel(ScanModel):
             ("z_max", "max readings altogether"),
         )
         components = [(name, max(getattr(p, name) for p in self._kinds), cost) for name, cost in costs]
+        components = components if self._discrete is None else []
         omissions = scene_omissions(
             components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
             precision=self.precision, ring=self._caster.method.ring,
@@ -237,12 +245,15 @@ class BeamModel(ScanModel):
             )
         if self._last_code and "ORIGINS_OUTSIDE" not in self._last_code:
             omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray"))
-        if self._last_code and "LINEAR" in self._last_code:
+        if self._last_code and "LINEAR" in self._last_code and self._discrete is None:
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
         if self._peer is not None:
             omissions.append(Omission("normalised density", f"compat='{self.compat}' sums cubes", "the likelihood"))
+        elif self._discrete is not None:
+            steps = f"{self._cells + 1} x {self._cells + 1} steps of readings and expected ranges, no return included"
+            omissions.append(Omission("mixture", f"the model is a table of {steps}", "all but 1 look-up a beam"))
         elif self.sensor_table is not None:
             why = f"log p is tabulated over {self._cells} x {self._cells + 1} bins of readings and expected ranges"
             omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
@@ -261,12 +272,13 @@ class BeamModel(ScanModel):
         if self.incidence_parameters is not None:
             how += f", parameters for {len(self._kinds)} ranges of the angle of incidence"
             how += " (max readings depend on it)" if self._max_depends else ""
-        title = f"beam model{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
+        name = "beam model" if self._discrete is None else "discrete beam model"
+        title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
 
     def _peer_mixture(self) -> tuple[frozenset[str], np.ndarray]:
         """Flags and numbers of the kernel file ``compat``."""
-        p, range_max = self.parameters, self.scanner.range_max
+        p, range_max = self._kinds[0], self.scanner.range_max
         flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}
         hit = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
         if self.compat == "amcl":
@@ -298,6 +310,8 @@ class BeamModel(ScanModel):
         terms = [self._terms_of(p, peak, "LINEAR" in flags) for p, peak in zip(kinds, peaks, strict=True)]
         if self.sensor_table is not None:
             flags = {"SENSOR_TABLE"} | (flags & {"LINEAR"})
+        if self._discrete is not None:
+            flags = {"SENSOR_TABLE"}
         return frozenset(flags), np.concatenate(terms)
 
     def _terms_of(self, p: BeamParameters, peak: float, linear: bool) -> np.ndarray:
@@ -313,6 +327,11 @@ class BeamModel(ScanModel):
 
     def _tabulate(self, width: float | None) -> tuple[Buffer, int]:
         """The sensor's table on the device, and its number of bins; no table and 0 where the mixture is evaluated."""
+        if self._discrete is not None:
+            table = self._discrete.sensor_table(self._real)
+            # Sums need no watch over impossible readings where there are none.
+            self._components |= {"LINEAR"} if np.isfinite(table).all() else set()
+            return self._backend.upload(table), self._discrete.bins
         if width is None:
             return self._backend.upload(np.zeros(1, self._real)), 0
         from gpusense.reference.densities import log_mixture  # loads SciPy
@@ -322,12 +341,12 @@ class BeamModel(ScanModel):
         cells = max(round(range_max / width), 1)
         middle = (np.arange(cells) + 0.5) * (range_max / cells)
         expected = np.append(middle, range_max)
-        table = np.empty((cells, cells + 1), self._real)
+        table = np.full((cells + 1, cells + 1), log_weight(self._kinds[0].z_max), self._real)
         # In blocks of rows: the densities need some forty numbers for each of theirs.
         for first in range(0, cells, 64):
             rows = slice(first, first + 64)
-            own = self.parameters.to_dict()
-            table[rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
+            own = self._kinds[0].to_dict()
+            table[:-1][rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
         return self._backend.upload(table), cells
 
     def _impossible(self) -> bool:
@@ -338,7 +357,12 @@ class BeamModel(ScanModel):
         space, real, backend = self._workspace, self._real, self._backend
         # Readings that share a ray, the axis of their cones, share these.
         vectors = scan.rays if self._cones.rays == 1 else self._cone_vectors[scan.columns[scan.first[:-1]]]
-        ray, reading = space.upload_all("scan", (vectors.astype(real), scan.readings.astype(real)))
+        values = scan.readings.astype(real)
+        if self._cells:
+            # A range below range_max that is rounded to it is still a range, and no max reading to the table.
+            top = np.nextafter(real.type(self.scanner.range_max), real.type(0))
+            values = np.where(np.isfinite(scan.readings), np.minimum(values, top), values)
+        ray, reading = space.upload_all("scan", (vectors.astype(real), values))
         shared = scan.shared or not self._specialize
         first = space.upload("first", scan.first) if scan.shared else self._one_each
         rays, readings = len(scan.rays), len(scan.readings)
@@ -350,7 +374,9 @@ class BeamModel(ScanModel):
             mount, count = self.scanner.mount, part[1] - part[0]
             poses = cloud.given(backend, space, part)
             flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
-            flags |= cloud.headings() | ({"ALL_READINGS"} if self._max_depends else set())
+            # A table has a row for max readings.
+            evaluated = self._max_depends and self._discrete is None
+            flags |= cloud.headings() | ({"ALL_READINGS"} if evaluated else set())
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
@@ -393,3 +419,17 @@ class BeamModel(ScanModel):
             return parts
 
         return launch
+
+
+def _check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:
+    """See that nothing contradicts a discrete model.
+
+    Raises:
+        ValueError: the scanner has another range_max, or an option is given that is for the mixture.
+    """
+    for name, value in (("compat", compat), ("sensor_table", sensor_table)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {_checks.show(value)}")
+    if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
+        rule = f"must have the scanner's range_max = {scanner.range_max}"
+        raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

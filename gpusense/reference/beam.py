@@ -76,7 +76,8 @@ def score_beams(
         else:
             term = log_density(flags, z, expected, own)
         if "ALL_READINGS" in flags:
-            term = np.where(np.isnan(z), 0, np.where(np.isinf(z), own[7], term)).astype(real)
+            atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), own[7], term)
+            term = np.where(np.isnan(z), 0, atom).astype(real)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
         log_p[begin:end] = sum_terms(flags, term, fixed, temperature)

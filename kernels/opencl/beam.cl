@@ -8,7 +8,9 @@ real reading_term(const real z, const real expected, global const real *terms, g
                   const int cells, const real per_metre, const real range_max) {
 #if ALL_READINGS
     if (isnan(z)) return 0;
+#if !SENSOR_TABLE
     if (isinf(z)) return terms[7];
+#endif
 #endif
 #if CUBES
     const real p = compat_density(z, expected, terms);

@@ -57,8 +57,9 @@ def make(name, flags):
         if ALL_READINGS:
             if wp.isnan(z):
                 return ZERO
-            if wp.isinf(z):
-                return terms[7]
+            if not SENSOR_TABLE:
+                if wp.isinf(z):
+                    return terms[7]
         if CUBES:
             p = compat_density(z, expected, terms)
             return p * p * p

@@ -10,6 +10,8 @@ Each set is fitted on one half and scored on the other:
 - lidar_wall: an LDS-02 before a wall at a taped distance, seven set-ups; every other scan is held out.
 - intel, freiburg-079, csail, aces (carmen_logs): SICK lasers in maps of 5 cm that were made of the even scans; expected
   ranges are those of the odd ones at their SLAM-corrected poses. Every other block of odd scans is held out.
+- pioneer8, pioneer8-cone (sonar_pioneer8): eight sonars in a map of 5 cm that was made of the even frames' readings;
+  expected ranges of the odd frames along the axis, or in a cone of 15 degrees. Every other odd frame is held out.
 - nav350, s3000 (jarvis_lab): two lasers with poses from reflectors, in maps of 3 cm that were made of the same run, so
   that both halves look better than a new run would. Every other block of scans is held out.
 
@@ -35,6 +37,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sonar_field import recorded, ring_of
 from speed import command_line, machine
 
 import gpusense as gs
@@ -115,9 +118,23 @@ def laser(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
     return RangeData(ranges.ravel(), expected.ravel(), None, block, top).halves()
 
 
+def ring(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
+    """The odd frames of the sonar ring in the map of the even ones."""
+    place = recorded(data / "sonar_pioneer8", arguments.scans or 1 << 30)
+    cone = {"cone": np.radians(15), "cone_rays": 7} if name.endswith("cone") else {}
+    model = gs.BeamModel(place.grid, ring_of(place, **cone), backend=arguments.backend)
+    halves = []
+    for poses, z in (place.tuning, place.scored):
+        expected = np.minimum(np.asarray(model.expected_ranges(poses), np.float64), place.ring.range_max)
+        block = np.repeat(np.arange(len(z)), z.shape[1])
+        halves.append(RangeData(z.ravel(), expected.ravel(), None, block, place.ring.range_max))
+    return halves[0], halves[1]
+
+
 Loader = Callable[[Path, str, argparse.Namespace], tuple[RangeData, RangeData]]
 SETS: dict[str, Loader] = {
     **dict.fromkeys(SONARS, sonar), "lidar_wall": wall, **dict.fromkeys(LOGS, log), **dict.fromkeys(LASERS, laser),
+    "pioneer8": ring, "pioneer8-cone": ring,
 }  # fmt: skip
 # Where sensor and reference are not mounted in the same place.
 BIASED = {*SONARS, "lidar_wall"}

@@ -41,7 +41,7 @@ from sonar_field import recorded, ring_of
 from speed import command_line, machine
 
 import gpusense as gs
-from gpusense import fitting
+from gpusense import fitting, held_out
 from gpusense.fitting import RangeData
 from gpusense.scoring import logged_scans
 
@@ -153,7 +153,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
     rows = [
         {"name": row.name, "parameters": row.parameters.to_dict(), **{key: finite(getattr(row, key)) for key in
          ("per_beam", "error", "gain", "gain_error", "impossible")}}
-        for row in fitting.compare_held_out(
+        for row in held_out.compare_held_out(
             fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias
         )
     ]  # fmt: skip
@@ -183,11 +183,11 @@ def discrete(
     begin = time.perf_counter()
     learned = gs.DiscreteBeamModel.learn(own.ranges, own.expected, half.range_max, bins)
     seconds = time.perf_counter() - begin
-    soft = fitting.softened(parameters, len(own.ranges))
+    soft = held_out.softened(parameters, len(own.ranges))
     mixture = gs.DiscreteBeamModel(soft, half.range_max, bins)
     gain = learned.log_likelihood(other.ranges, other.expected) - mixture.log_likelihood(other.ranges, other.expected)
     _, block = np.unique(other.block, return_inverse=True)
-    mean, error = fitting.block_mean(gain, block)
+    mean, error = held_out.block_mean(gain, block)
     assert learned.fit is not None
     return {
         "bins": bins, "causes": learned.causes.to_dict(), "converged": learned.fit.converged, "learn_s": seconds,

@@ -91,6 +91,15 @@ def test_max_readings_depend_on_what_is_expected(backend):
     assert (np.count_nonzero(parts, axis=1) == 3).all()
 
 
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_cones_are_looked_up_too(selection, needs):
+    grid, _, poses = scene()
+    ring = gs.Scanner([0.0, 0.5, math.pi], RANGE, cone=0.3, cone_rays=5)
+    one = gs.BeamModel(grid, ring, TABLES["separate"], backend=needs(selection))
+    _, parts = one.log_likelihood(poses, [1.3, INF, 3.9], per_beam=True)
+    np.testing.assert_array_equal(parts, looked_up(TABLES["separate"], [1.3, INF, 3.9], one.expected_ranges(poses)))
+
+
 def test_impossible_readings_are_minus_infinity(backend):
     """Without noise and random triggers nothing is measured behind the wall, and no return is impossible."""
     _, scanner, poses = scene()

@@ -24,7 +24,8 @@ from gpusense.commands._common import (
 )
 
 if TYPE_CHECKING:
-    from gpusense.fitting import HeldOut, RangeData
+    from gpusense.fitting import RangeData
+    from gpusense.held_out import HeldOut
     from gpusense.learning.incidence import IncidenceFit
     from gpusense.learning.result import BeamFit
 
@@ -165,7 +166,7 @@ def _read(args: argparse.Namespace) -> RangeData:
 
 
 def _fit(args: argparse.Namespace, data: RangeData) -> Result:
-    from gpusense.fitting import compare_held_out
+    from gpusense.held_out import compare_held_out
     from gpusense.learning.fit import fit_beam_parameters
     from gpusense.learning.incidence import fit_incidence_parameters
 

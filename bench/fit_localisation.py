@@ -24,7 +24,7 @@ import numpy as np
 from speed import command_line, machine
 
 import gpusense as gs
-from gpusense import fitting
+from gpusense import fitting, held_out
 from gpusense.scoring import BEAM_PARAMETERS, Cloud, logged_scans, score_log
 
 LOGS = ("intel", "freiburg-079", "csail", "aces")
@@ -43,7 +43,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
     pairs = fitting.data_of_log(grid, known, backend=arguments.backend)
     fit = gs.fit_beam_parameters(pairs.ranges, pairs.expected, pairs.range_max, backend=arguments.backend)
     candidates = {
-        "fitted": fitting.softened(fit.parameters, fit.hits + fit.max_readings), **fitting.peer_parameters(),
+        "fitted": held_out.softened(fit.parameters, fit.hits + fit.max_readings), **held_out.peer_parameters(),
         "gpusense's defaults": gs.BeamParameters(), "gpusense score's": BEAM_PARAMETERS,
     }  # fmt: skip
     cloud, rows = Cloud(arguments.particles), []

@@ -5,8 +5,10 @@
 
 Each set is fitted on one half and scored on the other:
 
-- sonar1, sonar2 (sonar_enmt482): a wall at a known distance; fitted on the recording "calibration", scored on
-  "training1". Readings of sonar2 with the wall nearer than 0.3 m, where it is blind, are left out.
+- sonar1, sonar2 (sonar_enmt482): a wall at a known distance, two recordings; every other block of 100 readings is held
+  out. Readings of sonar2 with the wall nearer than 0.3 m, where it is blind, are left out.
+- sonar1-transfer, sonar2-transfer: fitted on the recording "calibration", scored on "training1", in which the second
+  sonar has another offset and more noise.
 - lidar_wall: an LDS-02 before a wall at a taped distance, seven set-ups; every other scan is held out.
 - intel, freiburg-079, csail, aces (carmen_logs): SICK lasers in maps of 5 cm that were made of the even scans; expected
   ranges are those of the odd ones at their SLAM-corrected poses. Every other block of odd scans is held out.
@@ -66,7 +68,8 @@ def table(path: Path) -> dict[str, np.ndarray]:
 
 
 def sonar(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """The two recordings of a sonar."""
+    """The two recordings of a sonar, as halves or in blocks."""
+    name, transfer, _ = name.partition("-transfer")
     top, blind = SONARS[name]
     halves = []
     for file in ("calibration", "training1"):
@@ -74,7 +77,12 @@ def sonar(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
         seen = columns["range"] >= blind
         z, expected = columns[name][seen], columns["range"][seen]
         halves.append(RangeData(z, expected, None, np.arange(len(z)) // 100, top))
-    return halves[0], halves[1]
+    if transfer:
+        return halves[0], halves[1]
+    first, second = halves
+    block = np.concatenate([first.block, second.block + first.block[-1] + 1])
+    z, expected = (np.concatenate(pair) for pair in ((first.ranges, second.ranges), (first.expected, second.expected)))
+    return RangeData(z, expected, None, block, top).halves()
 
 
 def wall(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
@@ -133,7 +141,8 @@ def ring(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDat
 
 Loader = Callable[[Path, str, argparse.Namespace], tuple[RangeData, RangeData]]
 SETS: dict[str, Loader] = {
-    **dict.fromkeys(SONARS, sonar), "lidar_wall": wall, **dict.fromkeys(LOGS, log), **dict.fromkeys(LASERS, laser),
+    **dict.fromkeys((*SONARS, *(f"{name}-transfer" for name in SONARS)), sonar), "lidar_wall": wall,
+    **dict.fromkeys(LOGS, log), **dict.fromkeys(LASERS, laser),
     "pioneer8": ring, "pioneer8-cone": ring,
 }  # fmt: skip
 # Where sensor and reference are not mounted in the same place.
@@ -146,7 +155,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
     begin = time.perf_counter()
     fit = gs.fit_beam_parameters(
         half.ranges, half.expected, half.range_max, range_min=half.range_min, backend=arguments.backend,
-        range_bias=name in BIASED,
+        range_bias=name.removesuffix("-transfer") in BIASED,
     )  # fmt: skip
     seconds = time.perf_counter() - begin
     bias = fit.range_bias if fit.bias_fitted else 0.0

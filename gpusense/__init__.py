@@ -15,12 +15,14 @@ from gpusense._version import __version__
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.grid import OccupancyGrid
+    from gpusense.landmarks import LandmarkMap
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.beam import BeamModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
-    from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+    from gpusense.models.landmark import LandmarkModel
+    from gpusense.parameters import BeamParameters, IncidenceParameters, LandmarkParameters, LikelihoodFieldParameters
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
     from gpusense.weights import Weights, normalize_weights, resample
@@ -31,6 +33,9 @@ _HOME = {
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
     "IncidenceParameters": "gpusense.parameters",
+    "LandmarkMap": "gpusense.landmarks",
+    "LandmarkModel": "gpusense.models.landmark",
+    "LandmarkParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
@@ -56,6 +61,9 @@ __all__ = [
     "CasterMethod",
     "Device",
     "IncidenceParameters",
+    "LandmarkMap",
+    "LandmarkModel",
+    "LandmarkParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
     "OccupancyGrid",

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpusense import _checks, arrays
 from gpusense.backends.base import Backend, Buffer
-from gpusense.frames import Mount, frame_scalars, place_poses, to_grid
+from gpusense.frames import Cells, Mount, frame_scalars, place_poses, to_grid
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
 from gpusense.reference.heading import LIMIT
@@ -91,7 +91,7 @@ class Cloud:
         backend: Backend,
         space: Workspace,
         part: tuple[int, int],
-        frame: tuple[Region, OccupancyGrid, Mount],
+        frame: tuple[Region, Cells, Mount],
         real: np.dtype,
         *,
         careful: bool,
@@ -122,7 +122,7 @@ class Cloud:
         self,
         space: Workspace,
         part: tuple[int, int],
-        frame: tuple[Region, OccupancyGrid, Mount],
+        frame: tuple[Region, Cells, Mount],
         real: np.dtype,
         careful: bool,
     ) -> Placed:

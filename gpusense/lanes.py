@@ -10,6 +10,8 @@ _NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "SENSOR_TABLE", "CU
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "score_beams": ({"LINEAR"},),
+    # No body yet.
+    "score_features": (),
     "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),
 }
 

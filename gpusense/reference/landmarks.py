@@ -79,7 +79,7 @@ def offset(landmark: np.ndarray, place: Quad) -> Quad:
     return *x, *y
 
 
-def distance(off: Quad) -> Pair:
+def distance_pair(off: Quad) -> Pair:
     """Length of an offset: the rounded root, and what one step of Newton's method adds."""
     xx, yy = two_product(off[0], off[0]), two_product(off[2], off[2])
     d, total = np.sqrt(xx[0] + yy[0]), two_sum(xx[0], yy[0])
@@ -181,7 +181,7 @@ def log_detection(
     real = terms.dtype
     zero = np.zeros(len(off[0]), real)
     exponent, mass, norm = (zero, zero), np.ones(len(zero), real), zero
-    d = distance(off)
+    d = distance_pair(off)
     if "RANGE" in flags and feature[RANGE_SCALE] > 0:
         r = two_sum(d[0], -feature[RANGE_AT])
         r = two_sum(r[0], r[1] + (d[1] - feature[RANGE_LOW]))

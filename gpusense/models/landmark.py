@@ -23,7 +23,7 @@ from gpusense.features import (
 from gpusense.frames import split
 from gpusense.landmarks import LandmarkMap, make_buckets
 from gpusense.lanes import widened
-from gpusense.models.scan_model import HIGH_PEAK, chunk_of, in_chunks, log_weight, real_dtype
+from gpusense.models.scan_model import chunk_of, in_chunks, log_weight, real_dtype
 from gpusense.parameters import LandmarkParameters
 from gpusense.plan import Omission, Plan, share
 from gpusense.reference.landmarks import ARCS
@@ -196,18 +196,12 @@ class LandmarkModel:
         if silent:
             why = f"{silent} of {given} features do not depend on the pose"
             found.append(Omission("features", why, f"{share(silent, given)} of the features"))
-        if "SHARP" not in code:
-            why = f"densities are at most {HIGH_PEAK:g}"
-            found.append(Omission("exponents in two parts", why, "some 200 operations per landmark"))
         if "KNOWN" in code:
             found.append(Omission("search", "correspondences are known", f"{count - 1} of {count} landmarks"))
         elif len(prepared.columns) and np.isfinite(prepared.radius).any():
             looked = self._looked_at(prepared)
             why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
             found.append(Omission("far landmarks", why, f"about {share(count - looked, count)} of {count} landmarks"))
-        elif len(prepared.columns) and self.parameters.z_false == 0:
-            # Nothing is left out, and the plan should say why.
-            pass
         return found
 
     def _looked_at(self, prepared: PreparedFeatures) -> float:
@@ -250,9 +244,6 @@ class LandmarkModel:
         names = ("RANGE", "BEARING", "SIGNATURE")
         there = prepared.measured.any(axis=0)
         flags |= {name for name, used in zip(names, there, strict=True) if used or not self._specialize}
-        peaks = np.array(self._sensor.peaks) * np.array(self._sensor.scales, bool)
-        highest = max(float(peaks.max()), float((prepared.measured * peaks).sum(axis=1).max(initial=0.0)))
-        flags |= {"SHARP"} if highest > math.log(HIGH_PEAK) or not self._specialize else set()
         flags |= {"FIELD"} if not full_circle(self.parameters) else set()
         flags |= {"KNOWN"} if known else {"MARGINAL"} if self.association == "sum" else set()
         return frozenset(flags | ({"PER_BEAM"} if each else set()))

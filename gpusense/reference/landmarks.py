@@ -49,6 +49,8 @@ ARCS = (
     (1.5707963267948966, 6.123233995736766e-17),
     (3.141592653589793, 1.2246467991473532e-16),
 )
+# Nearer than a micrometre every bearing is as likely.
+ZERO_RANGE = 1e-6
 # arctan t = t + t^3 A(t^2), |t| <= 1 / 16, by its power series.
 ARC_POWERS = tuple((-1.0) ** (i + 1) / (2 * i + 3) for i in range(7))
 
@@ -157,11 +159,8 @@ def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: n
     return angle[0].dtype.type(0.5) * mass
 
 
-def add_square(flags: frozenset[str], total: Pair, residual: Pair, scale: np.floating, scale_low: np.floating) -> Pair:
-    """An exponent and one more (residual * scale)^2; in two parts where exponents and peaks nearly cancel."""
-    if "SHARP" not in flags:
-        u = residual[0] * scale
-        return total[0] + u * u, total[1]
+def add_square(total: Pair, residual: Pair, scale: np.floating, scale_low: np.floating) -> Pair:
+    """An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel."""
     u = pair_product(residual, (scale, scale_low))
     more = pair_sum(total, pair_product(u, u))
     # What overflows has no low part.
@@ -185,14 +184,13 @@ def log_detection(
     if "RANGE" in flags and feature[RANGE_SCALE] > 0:
         r = two_sum(d[0], -feature[RANGE_AT])
         r = two_sum(r[0], r[1] + (d[1] - feature[RANGE_LOW]))
-        exponent = add_square(flags, exponent, r, feature[RANGE_SCALE], feature[RANGE_SCALE_LOW])
+        exponent = add_square(exponent, r, feature[RANGE_SCALE], feature[RANGE_SCALE_LOW])
         mass = mass * range_mass(d, feature[RANGE_SCALE], terms)
     if "BEARING" in flags and feature[BEARING_SCALE] > 0:
-        side, ahead = across(off, turned), along(off, turned)
-        angle = angle_pair(side, ahead, arcs) if "SHARP" in flags else (np.arctan2(side[0], ahead[0]), zero)
-        squared = add_square(flags, exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
-        # At zero range every bearing is as likely: the density is 1 / field, which is the peak's times that.
-        there = d[0] > 0
+        angle = angle_pair(across(off, turned), along(off, turned), arcs)
+        squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
+        # At zero range the density is 1 / field, which is the peak over that.
+        there = d[0] > real.type(ZERO_RANGE)
         exponent = tuple(np.where(there, p, q) for p, q in zip(squared, exponent, strict=True))
         own = real.type(1)
         if "FIELD" in flags:
@@ -201,7 +199,7 @@ def log_detection(
     if "SIGNATURE" in flags and feature[SIGNATURE_SCALE] > 0:
         s = two_sum(feature[SIGNATURE_AT], -signature[:, 0])
         s = two_sum(s[0], s[1] + (feature[SIGNATURE_LOW] - signature[:, 1]))
-        exponent = add_square(flags, exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW])
+        exponent = add_square(exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW])
         norm = signature[:, 2]
     log_p = (feature[PEAK] - exponent[0]) + ((feature[PEAK_LOW] - exponent[1]) + norm)
     return np.where(mass == 1, log_p, log_p - np.log(mass)).astype(real)

@@ -42,6 +42,8 @@
 #define FEATURE 24
 // Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
 #define ARC_STEPS 8
+// Nearer than a micrometre every bearing is as likely.
+#define ZERO_RANGE ((real)1e-6)
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 
@@ -95,7 +97,6 @@ real2 along(const real4 off, const real4 turned) {
     return (real2)(sum.x, sum.y + ((x.y + y.y) + low));
 }
 
-#if SHARP
 // arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
 real arc_series(const real t) {
     const real z = t * t;
@@ -124,7 +125,6 @@ real2 angle_pair(const real2 side, const real2 ahead, global const real2 *arcs) 
     if (signbit(ahead.x)) arc = pair_sum(arcs[ARC_STEPS + 2], -arc);
     return signbit(side.x) ? -arc : arc;
 }
-#endif
 #endif
 
 #if RANGE
@@ -157,17 +157,12 @@ real field_mass(const real2 angle, const real upper, const real upper_low, const
 }
 #endif
 
-// An exponent and one more (residual * scale)^2; in two parts where exponents and peaks nearly cancel.
+// An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel.
 real2 add_square(const real2 total, const real2 residual, const real scale, const real scale_low) {
-#if SHARP
     const real2 u = pair_product(residual, (real2)(scale, scale_low));
     const real2 more = pair_sum(total, pair_product(u, u));
     // What overflows has no low part.
     return (real2)(more.x, isfinite(more.y) ? more.y : (real)0);
-#else
-    const real u = residual.x * scale;
-    return (real2)(total.x + u * u, 0);
-#endif
 }
 
 // log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
@@ -186,18 +181,14 @@ real log_detection(const real4 off, const real4 turned, global const real *featu
 #endif
 #if BEARING
     if (feature[BEARING_SCALE] > 0) {
-        if (d.x > 0) {
-#if SHARP
+        if (d.x > ZERO_RANGE) {
             const real2 angle = angle_pair(across(off, turned), along(off, turned), arcs);
-#else
-            const real2 angle = (real2)(atan2(across(off, turned).x, along(off, turned).x), 0);
-#endif
             exponent = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
 #if FIELD
             mass *= field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs);
 #endif
         } else {
-            // At zero range every bearing is as likely: the density is 1 / field, which is the peak's times that.
+            // The density is 1 / field, which is the peak over that.
             mass *= terms[3] * feature[BEARING_SCALE];
         }
     }

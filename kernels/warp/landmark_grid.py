@@ -21,7 +21,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
-    density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD", "SHARP"})
+    density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
     offset, log_detection = density.offset, density.log_detection
     MARGINAL = "MARGINAL" in flags
     ZERO, ONE = real(0.0), real(1.0)
@@ -131,7 +131,7 @@ def make(name, flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
-    density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD", "SHARP"})
+    density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
     sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
     log_detection, either = density.log_detection, density.either
     search = functions(flags - {"KNOWN", "PER_BEAM"}).search

@@ -20,7 +20,7 @@ def make(name, flags):
     """The kernel joint_features specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD", "SHARP"}
+    shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"}
     density = landmarks.functions(shape)
     sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
     log_detection, either = density.log_detection, density.either

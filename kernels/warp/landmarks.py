@@ -53,8 +53,9 @@ def functions(flags):
     BEARING = "BEARING" in flags
     SIGNATURE = "SIGNATURE" in flags
     FIELD = "FIELD" in flags
-    SHARP = "SHARP" in flags
     ZERO, HALF, ONE, TWO, STEPS = real(0.0), real(0.5), real(1.0), real(2.0), real(8.0)
+    # Nearer than a micrometre every bearing is as likely.
+    ZERO_RANGE = real(1e-6)
     # Above this the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
     A1, A2, A3, A4 = real(-1.0 / 3.0), real(1.0 / 5.0), real(-1.0 / 7.0), real(1.0 / 9.0)
@@ -203,27 +204,13 @@ def functions(flags):
             mass = mass + (wp.erf(half_turn * scale) - wp.erf((whole - right) * scale))
         return HALF * mass
 
-    # An exponent and one more (residual * scale)^2; in two parts where exponents and peaks nearly cancel.
+    # An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel.
     @wp.func
     def add_square(total: vec2, residual: vec2, scale: real, scale_low: real):
-        if SHARP:
-            u = pair_product(residual, vec2(scale, scale_low))
-            more = pair_sum(total, pair_product(u, u))
-            # What overflows has no low part.
-            return vec2(more[0], wp.where(wp.isfinite(more[1]), more[1], ZERO))
-        else:
-            plain = residual[0] * scale
-            return vec2(total[0] + plain * plain, ZERO)
-
-    # Angle of an offset from a direction, in two parts where exponents are.
-    @wp.func
-    def angle_from(off: vec4, turned: vec4, arcs: wp.array(dtype=vec2)):
-        if SHARP:
-            return angle_pair(across(off, turned), along(off, turned), arcs)
-        else:
-            side = across(off, turned)
-            ahead = along(off, turned)
-            return vec2(wp.atan2(side[0], ahead[0]), ZERO)
+        u = pair_product(residual, vec2(scale, scale_low))
+        more = pair_sum(total, pair_product(u, u))
+        # What overflows has no low part.
+        return vec2(more[0], wp.where(wp.isfinite(more[1]), more[1], ZERO))
 
     # log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
     @wp.func
@@ -248,15 +235,15 @@ def functions(flags):
                 mass = range_mass(d, feature[one + RANGE_SCALE], terms)
         if BEARING:
             if feature[one + BEARING_SCALE] > ZERO:
-                if d[0] > ZERO:
-                    angle = angle_from(off, turned, arcs)
+                if d[0] > ZERO_RANGE:
+                    angle = angle_pair(across(off, turned), along(off, turned), arcs)
                     exponent = add_square(exponent, angle, feature[one + BEARING_SCALE], feature[one + BEARING_SCALE_LOW])
                     if FIELD:
                         mass = mass * field_mass(
                             angle, feature[one + UPPER], feature[one + UPPER_LOW], feature[one + BEARING_SCALE], terms, arcs
                         )
                 else:
-                    # At zero range every bearing is as likely: the density is 1 / field, which is the peak's times that.
+                    # The density is 1 / field, which is the peak over that.
                     mass = mass * (terms[3] * feature[one + BEARING_SCALE])
         if SIGNATURE:
             if feature[one + SIGNATURE_SCALE] > ZERO:

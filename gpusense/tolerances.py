@@ -108,6 +108,10 @@ _ALL = (
         "end points near a cell's edge are found again with twice the digits, so float32 hits the cells of float64; "
         "nearer than 1e-13 cells per cell of range twice the digits cannot tell, and either cell is right",
     ),
+    Tolerance(
+        "landmark", 16, "eps (1 + |log p_k|) of the precision",
+        "exponents and angles in two numbers, so exp, log, log1p and erf within a few eps (16 eps for OpenCL's erf) are left",
+    ),
     Tolerance("specialize=False, float32", 32, "eps (1 + |log p_k|)", "both keep the bound of one beam"),
     Tolerance("specialize=False, float64", 2e-11, "1 + |log p_k|", "both keep the bound of one beam"),
     Tolerance("batching, order, repetition", 0, "values with other bits", "one work-item scores a particle by itself"),

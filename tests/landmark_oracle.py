@@ -6,6 +6,7 @@ positions, which no kernel can mend.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,9 @@ import gpusense as gs
 from gpusense.frames import place_poses
 from gpusense.reference import landmarks as at
 
-mp.mp.dps = 50
+mp.mp.dps = 36
+
+Table = tuple[list[Any], list[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,7 @@ def prepared(model: gs.LandmarkModel, features: Any) -> np.ndarray:
     return found.numbers
 
 
-def table(model: gs.LandmarkModel, world: World) -> tuple[list[Any], list[Any], Any]:
+def table(model: gs.LandmarkModel, world: World) -> Table:
     """(N, F, M) densities p(f | j), None where j is no candidate, and (F,) densities of false positives."""
     p = model.parameters
     span = span_of(p, model.landmarks.signatures) if p.sigma_signature is not None else (0, 1)
@@ -190,14 +193,11 @@ def table(model: gs.LandmarkModel, world: World) -> tuple[list[Any], list[Any], 
     return densities, [uniform(p, f, span) for f in world.features], span
 
 
-def likelihoods(
-    model: gs.LandmarkModel, poses: Any, features: Any, correspondence: Any = None, *, rounded: bool = True
-) -> np.ndarray:
+def likelihoods(model: gs.LandmarkModel, tabled: Table, correspondence: Any = None) -> np.ndarray:
     """(N, F) float64 log p of each feature; by itself, so not for a joint association."""
-    p, world = model.parameters, exact_inputs(model, poses, features, rounded=rounded)
-    densities, false, _ = table(model, world)
+    p, (densities, false, _) = model.parameters, tabled
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
-    found = np.empty((len(world.seen), len(world.features)))
+    found = np.empty((len(densities), len(false)))
     for n, rows in enumerate(densities):
         for k, row in enumerate(rows):
             if correspondence is not None:
@@ -210,21 +210,19 @@ def likelihoods(
     return found
 
 
-def joint(model: gs.LandmarkModel, poses: Any, features: Any) -> np.ndarray:
+def joint(model: gs.LandmarkModel, tabled: Table) -> np.ndarray:
     """(N,) float64 log p of the likeliest joint association, by trying all."""
-    p, world = model.parameters, exact_inputs(model, poses, features)
-    densities, false, _ = table(model, world)
+    p, (densities, false, _) = model.parameters, tabled
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
-    found = np.empty(len(world.seen))
+    found = np.full(len(densities), -np.inf)
     for n, rows in enumerate(densities):
-        def best(k: int, taken: frozenset[int], rows: Any = rows) -> Any:
-            if k == len(rows):
-                return mp.mpf(1)
-            options = [miss * false[k] * best(k + 1, taken)]
-            for j, (d, may) in enumerate(rows[k]):
-                if may and j not in taken:
-                    options.append((detect * d + miss * false[k]) * best(k + 1, taken | {j}))
-            return max(options)
-
-        found[n] = log(best(0, frozenset()))
+        # Of each feature what it adds as no landmark, and as each one that it may be.
+        options = [
+            [(-1, log(miss * none))] + [(j, log(detect * d + miss * none)) for j, (d, may) in enumerate(row) if may]
+            for row, none in zip(rows, false, strict=True)
+        ]
+        for chosen in itertools.product(*options):
+            landmarks = [j for j, _ in chosen if j >= 0]
+            if len(set(landmarks)) == len(landmarks):
+                found[n] = max(found[n], sum(value for _, value in chosen))
     return found

@@ -68,7 +68,7 @@ def make(name, flags):
         while i < sets:
             best[sums + i] = wp.where(i == 0, ZERO, NEVER)
             i += 1
-        i = 0
+        i = int(0)
         while i < sets * features:
             choice[who + i] = -1
             value[who + i] = NEVER
@@ -90,14 +90,14 @@ def make(name, flags):
             # From the full set down: the smaller sets do not have this landmark yet.
             s = sets - 1
             while s > 0:
-                k = 0
+                k = int(0)
                 while k < features:
                     if ((s >> k) & 1) != 0:
                         less = s ^ (1 << k)
                         joined = best[sums + less] + log_each[k]
                         if joined > best[sums + s]:
                             best[sums + s] = joined
-                            i = 0
+                            i = int(0)
                             while i < features:
                                 if i == k:
                                     choice[who + s * features + i] = j

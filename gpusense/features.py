@@ -99,12 +99,19 @@ def check_features(features: object, p: LandmarkParameters, span: tuple[float, f
     for column, sigma in enumerate((p.sigma_range, p.sigma_bearing, p.sigma_signature)):
         if sigma is None:
             full[:, column] = np.nan
-    _refuse(full[:, 0], full[:, 0] < 0, full[:, 0] > p.range_max, f"range must be in [0, {p.range_max:.15g}] (range_max)")
+    _refuse(
+        full[:, 0], full[:, 0] < 0, full[:, 0] > p.range_max, f"range must be in [0, {p.range_max:.15g}] (range_max)"
+    )
     _refuse(full[:, 1], np.isinf(full[:, 1]), np.False_, "bearing must be finite, or NaN where it was not measured")
     full[:, 1] = wrapped(full[:, 1])
     half = p.field_of_view / 2
     if not full_circle(p):
-        _refuse(full[:, 1], np.abs(full[:, 1]) > half, np.False_, f"bearing must be in [-{half:.15g}, {half:.15g}] (field_of_view)")
+        _refuse(
+            full[:, 1],
+            np.abs(full[:, 1]) > half,
+            np.False_,
+            f"bearing must be in [-{half:.15g}, {half:.15g}] (field_of_view)",
+        )
     rule = f"signature must be in [{span[0]:.15g}, {span[1]:.15g}] (signature_span)"
     _refuse(full[:, 2], full[:, 2] < span[0], full[:, 2] > span[1], rule)
     return full
@@ -139,7 +146,7 @@ def check_correspondence(correspondence: object, count: int, landmarks: int) -> 
 
 @dataclass(frozen=True)
 class Reach:
-    """Which landmarks can matter to a feature: within ``radius`` of the point ``reach`` ahead, no nearer than ``hole``."""
+    """Landmarks that can matter to a feature lie within ``radius`` of the point ``reach`` ahead, beyond ``hole``."""
 
     reach: float
     radius: float

@@ -110,7 +110,7 @@ _ALL = (
     ),
     Tolerance(
         "landmark", 16, "eps (1 + |log p_k|) of the precision",
-        "exponents and angles in two numbers, so exp, log, log1p and erf within a few eps (16 eps for OpenCL's erf) are left",
+        "exponents and angles in two numbers; what is left are exp, log, log1p and erf within a few eps",
     ),
     Tolerance("specialize=False, float32", 32, "eps (1 + |log p_k|)", "both keep the bound of one beam"),
     Tolerance("specialize=False, float64", 2e-11, "1 + |log p_k|", "both keep the bound of one beam"),

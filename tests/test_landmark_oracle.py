@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from itertools import pairwise
 
 import landmark_oracle as oracle
 import landmark_scenes as scenes
@@ -97,7 +98,9 @@ def test_joint_association_tries_all(backend, name, precision):
 def test_what_the_caller_gave(backend, precision):
     """Rounding of positions, directions and readings included: float32 keeps them in two numbers."""
     model, poses, features = scenes.model("everything", backend, precision=precision)
-    expected = oracle.likelihoods(model, oracle.table(model, oracle.exact_inputs(model, poses, features, rounded=False)))
+    expected = oracle.likelihoods(
+        model, oracle.table(model, oracle.exact_inputs(model, poses, features, rounded=False))
+    )
     found = model.associate(poses, features)[1]
     # float64 positions of up to 300 m, of which 16 eps are rounding, beside deviations of 0.2.
     allowed = (TOLERANCES["landmark"].value + (3e4 if precision == "float64" else 0)) * np.finfo(precision).eps
@@ -108,7 +111,7 @@ def test_what_the_caller_gave(backend, precision):
 @pytest.mark.parametrize("place", [(0.0, 0.0), (2.9, 0.9), (3.0, 1.0)])
 def test_the_mixture_integrates_to_1(name, place):
     """Over all that a feature can be, for a known landmark: also at zero range and near the limits of the sensor."""
-    landmarks, p, poses, features, options = scenes.make(name)
+    landmarks, p, _, _, options = scenes.make(name)
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", **{**options, "mount": (0, 0, 0)})
     half, (low, high), j = p.field_of_view / 2, model._sensor.span, 0 if place == (3.0, 1.0) else 2
     # The landmark is a little to the left; at zero range it is nowhere.
@@ -117,10 +120,14 @@ def test_the_mixture_integrates_to_1(name, place):
     pose = [[*place, np.arctan2(away[1], away[0]) - b]]
 
     def pieces(start, end, middle, sigma):
-        cuts = [start, *(middle + sigma * s for s in (-30, -8, -3, 0, 3, 8, 30) if start < middle + sigma * s < end), end]
+        cuts = [
+            start,
+            *(middle + sigma * s for s in (-30, -8, -3, 0, 3, 8, 30) if start < middle + sigma * s < end),
+            end,
+        ]
         nodes, weights = np.polynomial.legendre.leggauss(24)
-        x = np.concatenate([(e - s) / 2 * nodes + (e + s) / 2 for s, e in zip(cuts, cuts[1:], strict=False)])
-        w = np.concatenate([(e - s) / 2 * weights for s, e in zip(cuts, cuts[1:], strict=False)])
+        x = np.concatenate([(e - s) / 2 * nodes + (e + s) / 2 for s, e in pairwise(cuts)])
+        w = np.concatenate([(e - s) / 2 * weights for s, e in pairwise(cuts)])
         return x, w
 
     axes = [([NAN], [1.0])] * 3
@@ -148,7 +155,7 @@ def test_the_sum_over_landmarks_integrates_to_1():
     landmarks, _, poses, _, _ = scenes.make("ordinary")
     p = gs.LandmarkParameters(sigma_range=2.0, sigma_bearing=0.8)
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", association="sum")
-    # Bearings are wrapped where the landmarks are behind: a periodic function with as many breaks, by the midpoint rule.
+    # Bearings are wrapped where the landmarks are behind: a periodic function, by the midpoint rule.
     z, weights = np.polynomial.legendre.leggauss(24)
     z, weights = (z + 1) * p.range_max / 2, weights * p.range_max / 2
     b = (np.arange(120) + 0.5) / 120 * 2 * np.pi - np.pi

@@ -20,7 +20,9 @@ def forest(count: int, side: float, seed: int = 5) -> tuple[gs.LandmarkMap, np.n
     """Landmarks evenly spread, poses all over them, and what is seen from the middle."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-side / 2, side / 2, (count, 2))
-    poses = np.concatenate([rng.normal(0, (0.3, 0.3, 0.1), (25, 3)), rng.uniform(-1, 1, (25, 3)) * (side / 2, side / 2, 4)])
+    poses = np.concatenate(
+        [rng.normal(0, (0.3, 0.3, 0.1), (25, 3)), rng.uniform(-1, 1, (25, 3)) * (side / 2, side / 2, 4)]
+    )
     d = np.hypot(*xy.T)
     seen = np.argsort(d)[: min(5, np.count_nonzero(d < 19))]
     features = np.stack([d[seen], np.arctan2(*xy[seen].T[::-1]), seen % 7], axis=1)
@@ -97,7 +99,10 @@ def test_false_positives_and_impossible_features(backend):
     assert np.isneginf(empty.log_likelihood(poses, features)).all()
     # More features than landmarks, none of them false.
     few = gs.LandmarkModel(
-        gs.LandmarkMap(scenes.XY[:2]), gs.LandmarkParameters(z_detect=1, z_false=0), backend=backend, association="joint"
+        gs.LandmarkMap(scenes.XY[:2]),
+        gs.LandmarkParameters(z_detect=1, z_false=0),
+        backend=backend,
+        association="joint",
     )
     assert np.isneginf(few.log_likelihood(poses, features)).all()
 
@@ -132,7 +137,9 @@ def test_negative_information_by_counting(backend):
         expected = plain.log_likelihood(poses, features) + seen.sum(axis=1) * np.log(0.3)
         np.testing.assert_allclose(model.log_likelihood(poses, features), expected, rtol=1e-5, atol=1e-5)
     # Known ones, a sensor that misses nothing, and nothing seen at all.
-    sure = gs.LandmarkModel(gs.LandmarkMap([[3.0, 0.0], [0.0, 3.0]]), p.replace(p_detect=1.0), backend=backend, negative=True)
+    sure = gs.LandmarkModel(
+        gs.LandmarkMap([[3.0, 0.0], [0.0, 3.0]]), p.replace(p_detect=1.0), backend=backend, negative=True
+    )
     assert np.isfinite(sure.log_likelihood([[0, 0, 0.0]], [[3.0, 0.0]], [0])).all()
     assert np.isneginf(sure.log_likelihood([[0, 0, 0.0]], [[3.0, 0.0]], [1])).all()
     np.testing.assert_array_equal(sure.log_likelihood([[0, 0, 0.0], [0, 0, 3.0]], []), [-np.inf, 0])
@@ -163,7 +170,7 @@ def test_laws(backend, precision):
         near = np.arange(len(poses)) != 1  # the one on a landmark, of which the turned one may not be
         apart = np.abs(other.log_likelihood(moved, features) - found)
         assert (apart <= eps + lost * (1 + np.abs(found)))[near].all()
-    around = features + (0, 2 * np.pi)
+    around = features + np.array([0, 2 * np.pi])
     assert (np.abs(model.log_likelihood(poses, around) - found) <= eps + lost).all()
     mounted = gs.LandmarkModel(gs.LandmarkMap(scenes.XY), mount=(1.0, 2.0, 0.5), **own)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -231,7 +231,9 @@ class _Pieces:
         self._launch, self._row = launch, row
         self._axis = row.launch.index("particle")
         self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == "particles")
-        self._work = [i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")]
+        self._work = [
+            i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
+        ]
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         particles = size[self._axis]

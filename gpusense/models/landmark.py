@@ -49,8 +49,8 @@ class LandmarkModel:
         parameters: Deviations, weights and limits of the sensor.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
-        association: What a feature without a known landmark is: ``"nearest"`` is the likeliest landmark, each feature by
-            itself (the book's maximum likelihood); ``"sum"`` sums over all landmarks, each with the prior 1 / M;
+        association: What a feature without a known landmark is: ``"nearest"`` is the likeliest landmark of each
+            by itself (the book's maximum likelihood); ``"sum"`` sums over all landmarks, each with the prior 1 / M;
             ``"joint"`` is the likeliest assignment in which no two features are the same landmark, for at most 8
             features and 1024 landmarks.
         negative: Whether landmarks in view that no feature is add ``log(1 - p_detect)`` each; not with ``"sum"``.
@@ -106,11 +106,8 @@ class LandmarkModel:
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
         self._sensor = describe(p, landmarks)
-        with np.errstate(over="ignore"):
-            scales = np.array(self._sensor.scales).astype(self._real)
-        if np.isinf(scales).any() or any(s < np.finfo(self._real).tiny for s, own in zip(
-            scales, self._sensor.scales, strict=True) if own
-        ):  # fmt: skip
+        tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
+        if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
             raise ValueError(f"parameters: deviations must fit {self._real.name}, got {p}")
         self._buckets = make_buckets(landmarks)
         self._tables = self._upload()
@@ -140,8 +137,8 @@ class LandmarkModel:
 
         Raises:
             TypeError: an argument does not hold numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, a feature outside what the sensor can measure, an index
-                that is no landmark's, or more than 8 features for a joint association.
+            ValueError: a wrong shape, a pose that is not finite, a feature outside what the sensor can measure, an
+                index that is no landmark's, or more than 8 features for a joint association.
         """
         log_p, _, _ = self._score(poses, features, correspondence, each=False)
         return log_p
@@ -242,8 +239,8 @@ class LandmarkModel:
     def _flags(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
         flags = {"FLOAT64"} if self._real == np.float64 else set()
         names = ("RANGE", "BEARING", "SIGNATURE")
-        there = prepared.measured.any(axis=0)
-        flags |= {name for name, used in zip(names, there, strict=True) if used or not self._specialize}
+        there = np.asarray(prepared.measured.any(axis=0))
+        flags |= {name for name, used in zip(names, there.tolist(), strict=True) if used or not self._specialize}
         flags |= {"FIELD"} if not full_circle(self.parameters) else set()
         flags |= {"KNOWN"} if known else {"MARGINAL"} if self.association == "sum" else set()
         return frozenset(flags | ({"PER_BEAM"} if each else set()))

@@ -1,7 +1,7 @@
 """Likelihood of features by the landmarks near to where each of them points, book table 6.5.
 
-Landmarks lie in square buckets, row by row; ``start`` has the first of each bucket. A feature looks into the buckets that
-a disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
+Landmarks lie in square buckets, row by row; ``start`` has the first of each bucket. A feature looks into the buckets
+that a disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gpusense.reference.landmarks import (
     RADIUS,
     REACH,
     Quad,
+    at_places,
     direction,
     either,
     log_detection,
@@ -28,8 +29,6 @@ from gpusense.reference.landmarks import (
 # Pairs of a particle and a landmark that are evaluated at once, and particles.
 BLOCK_PAIRS = 1 << 18
 BLOCK = 1 << 14
-# A sum of densities is kept relative to one of them until another is e to this larger.
-RELATIVE = 4.0
 
 
 def bucket_at(position: np.ndarray, size: np.floating, count: int) -> np.ndarray:
@@ -105,9 +104,7 @@ def score_features(
                 one, turned = numbers[i], direction(pose[part], pose_low[part], numbers[i])
                 if "KNOWN" in flags:
                     j = np.full(count, partner[i])
-                    found = log_detection(
-                        flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs
-                    )
+                    found = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
                     best, chosen = found, j
                 else:
                     found, best, chosen = search(
@@ -138,7 +135,7 @@ def search(
     cols: int,
     size: np.floating,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each particle the log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place."""
+    """Per particle the log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place."""
     real, particles = terms.dtype, len(place[0])
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)
     if feature[RADIUS] < 0:
@@ -155,12 +152,12 @@ def search(
         runs_first, runs = first[begin:end].ravel(), (last - first)[begin:end].ravel()
         n = np.repeat(np.arange(begin, end), own[begin:end])
         j = np.arange(runs.sum()) + np.repeat(runs_first - (np.cumsum(runs) - runs), runs)
-        placed, rotated = tuple(p[n] for p in place), tuple(p[n] for p in turned)
+        placed, rotated = at_places(place, n), at_places(turned, n)
         off = offset(landmark[j], placed)
         kept = near(off, rotated, feature)
         n, j = n[kept], j[kept]
         if len(n):
-            off, rotated = tuple(p[kept] for p in off), tuple(p[kept] for p in rotated)
+            off, rotated = at_places(off, kept), at_places(rotated, kept)
             value = log_detection(flags, off, rotated, feature, signature[j], terms, arcs)
             heads = np.flatnonzero(np.append(True, n[1:] != n[:-1]))
             who, sizes = n[heads], np.diff(np.append(heads, len(n)))

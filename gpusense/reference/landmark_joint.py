@@ -1,8 +1,8 @@
 """The likeliest joint association of a few features, in which no two of them are the same landmark.
 
 Features without a landmark are false positives. Landmarks are taken one after the other; ``best[s]`` is the largest sum
-of log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may join
-one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+of log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may
+join one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
 """
 
 from __future__ import annotations

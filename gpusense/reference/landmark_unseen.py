@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.landmark_grid import BLOCK_PAIRS, bucket_at
-from gpusense.reference.landmarks import Quad, offset, sensor_place
+from gpusense.reference.landmarks import Quad, at_places, offset, sensor_place
 
 
 def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: np.floating, least: np.floating) -> np.ndarray:
@@ -44,7 +44,7 @@ def count_unseen(
         low, high = bucket_at(place[2] - range_max, size, rows), bucket_at(place[2] + range_max, size, rows)
         first, last = int(start[low.min() * cols]), int(start[(high.max() + 1) * cols])
         for n in range(len(low)):
-            own = tuple(p[n : n + 1] for p in place)
+            own = at_places(place, slice(n, n + 1))
             seen = in_view(offset(landmark[first:last], own), cosine[n], sine[n], range_max, least)
             at = (begin + n) * features
             taken = np.unique(which[at : at + features])

@@ -2,10 +2,10 @@
 
     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
 
-d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m is
-the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A part
-that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an error
-of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
+is the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A
+part that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an
+error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
 
 A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
 (x, its low part, y, its low part), and so are an offset and a direction.
@@ -22,7 +22,7 @@ Quad = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 # Range; cosine and sine of the bearing on the robot; signature.
 RANGE_AT, RANGE_LOW, COSINE, SINE, COSINE_LOW, SINE_LOW, SIGNATURE_AT, SIGNATURE_LOW = range(8)
-# 1 / (sigma sqrt 2), 0 for what was not measured; log of z_detect and of the components' peaks; log of the false positive.
+# 1 / (sigma sqrt 2), 0 for what was not measured; logs of z_detect and the components' peaks, of the false positive.
 RANGE_SCALE, RANGE_SCALE_LOW, BEARING_SCALE, BEARING_SCALE_LOW, SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = range(8, 14)
 PEAK, PEAK_LOW, FALSE_POSITIVE = 14, 15, 16
 # From the bearing to the upper end of the field of view.
@@ -53,6 +53,21 @@ ARCS = (
 ZERO_RANGE = 1e-6
 # arctan t = t + t^3 A(t^2), |t| <= 1 / 16, by its power series.
 ARC_POWERS = tuple((-1.0) ** (i + 1) / (2 * i + 3) for i in range(7))
+
+
+def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
+    """Of each pair of numbers the first or the second one."""
+    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
+
+
+def negative_where(when: np.ndarray, a: Pair) -> Pair:
+    """Pairs of numbers, some of them negated."""
+    return where_pair(when, (-a[0], -a[1]), a)
+
+
+def at_places(quad: Quad, places: np.ndarray | slice) -> Quad:
+    """Some of many offsets, places or directions."""
+    return quad[0][places], quad[1][places], quad[2][places], quad[3][places]
 
 
 def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, size: np.floating) -> Quad:
@@ -109,10 +124,9 @@ def along(off: Quad, turned: Quad) -> Pair:
 def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     """Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series."""
     real = arcs.dtype.type
-    a = tuple(np.where(np.signbit(ahead[0]), -part, part) for part in ahead)
-    b = tuple(np.where(np.signbit(side[0]), -part, part) for part in side)
+    a, b = negative_where(np.signbit(ahead[0]), ahead), negative_where(np.signbit(side[0]), side)
     steep = b[0] > a[0]
-    num, den = [tuple(np.where(steep, p, q) for p, q in zip(*both, strict=True)) for both in ((a, b), (b, a))]
+    num, den = where_pair(steep, a, b), where_pair(steep, b, a)
     safe = np.where(den[0] > 0, den[0], 1).astype(arcs.dtype)
     step = np.floor(num[0] / safe * real(ARC_STEPS) + real(0.5))
     slope = step / real(ARC_STEPS)
@@ -130,9 +144,8 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     total = two_sum(base[:, 0], t)
     arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * (square * series))))
     for when, whole in ((steep, arcs[ARC_STEPS + 1]), (np.signbit(ahead[0]), arcs[ARC_STEPS + 2])):
-        rest = pair_sum((whole[0], whole[1]), (-arc[0], -arc[1]))
-        arc = tuple(np.where(when, p, q) for p, q in zip(rest, arc, strict=True))
-    return tuple(np.where(np.signbit(side[0]), -part, part) for part in arc)
+        arc = where_pair(when, pair_sum((whole[0], whole[1]), (-arc[0], -arc[1])), arc)
+    return negative_where(np.signbit(side[0]), arc)
 
 
 def range_mass(d: Pair, scale: np.floating, terms: np.ndarray) -> np.ndarray:
@@ -161,7 +174,7 @@ def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: n
 
 def add_square(total: Pair, residual: Pair, scale: np.floating, scale_low: np.floating) -> Pair:
     """An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel."""
-    u = pair_product(residual, (scale, scale_low))
+    u = pair_product(residual, (np.asarray(scale), np.asarray(scale_low)))
     more = pair_sum(total, pair_product(u, u))
     # What overflows has no low part.
     return more[0], np.where(np.isfinite(more[1]), more[1], 0).astype(more[1].dtype)
@@ -191,7 +204,7 @@ def log_detection(
         squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
         # At zero range the density is 1 / field, which is the peak over that.
         there = d[0] > real.type(ZERO_RANGE)
-        exponent = tuple(np.where(there, p, q) for p, q in zip(squared, exponent, strict=True))
+        exponent = where_pair(there, squared, exponent)
         own = real.type(1)
         if "FIELD" in flags:
             own = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)

@@ -29,8 +29,8 @@ def functions(flags):
     # A sum of densities is kept relative to one of them until another is e to this larger.
     RELATIVE = real(4.0)
 
-    # What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place; and
-    # the sum of densities relative to found.
+    # What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place;
+    # and the sum of densities relative to found.
     @wp.struct
     class Match:
         found: real
@@ -110,9 +110,7 @@ def functions(flags):
             while j < last:
                 off = offset(landmark[j], place)
                 if near(off, turned, feature, one):
-                    match = with_landmark(
-                        match, log_detection(off, turned, feature, one, signature[j], terms, arcs), j
-                    )
+                    match = with_landmark(match, log_detection(off, turned, feature, one, signature[j], terms, arcs), j)
                 j += 1
             row += 1
         if MARGINAL:
@@ -209,9 +207,7 @@ def make(name, flags):
                     if KNOWN:
                         which[n * features + k] = chosen
                     else:
-                        which[n * features + k] = wp.where(
-                            best + share >= feature[one + FALSE_POSITIVE], chosen, -1
-                        )
+                        which[n * features + k] = wp.where(best + share >= feature[one + FALSE_POSITIVE], chosen, -1)
                 k += 1
             total = add_term(total, block)
             first = last

@@ -2,10 +2,10 @@
 
     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
 
-d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m is
-the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A part
-that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an error
-of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
+is the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A
+part that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an
+error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
 
 A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
 (x, its low part, y, its low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of
@@ -24,7 +24,7 @@ from .prelude import precision
 RANGE_AT, RANGE_LOW = wp.constant(0), wp.constant(1)
 COSINE, SINE, COSINE_LOW, SINE_LOW = wp.constant(2), wp.constant(3), wp.constant(4), wp.constant(5)
 SIGNATURE_AT, SIGNATURE_LOW = wp.constant(6), wp.constant(7)
-# 1 / (sigma sqrt 2), 0 for what was not measured; log of z_detect and of the components' peaks; log of the false positive.
+# 1 / (sigma sqrt 2), 0 for what was not measured; logs of z_detect and the components' peaks, of the false positive.
 RANGE_SCALE, RANGE_SCALE_LOW = wp.constant(8), wp.constant(9)
 BEARING_SCALE, BEARING_SCALE_LOW = wp.constant(10), wp.constant(11)
 SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = wp.constant(12), wp.constant(13)
@@ -237,10 +237,17 @@ def functions(flags):
             if feature[one + BEARING_SCALE] > ZERO:
                 if d[0] > ZERO_RANGE:
                     angle = angle_pair(across(off, turned), along(off, turned), arcs)
-                    exponent = add_square(exponent, angle, feature[one + BEARING_SCALE], feature[one + BEARING_SCALE_LOW])
+                    exponent = add_square(
+                        exponent, angle, feature[one + BEARING_SCALE], feature[one + BEARING_SCALE_LOW]
+                    )
                     if FIELD:
                         mass = mass * field_mass(
-                            angle, feature[one + UPPER], feature[one + UPPER_LOW], feature[one + BEARING_SCALE], terms, arcs
+                            angle,
+                            feature[one + UPPER],
+                            feature[one + UPPER_LOW],
+                            feature[one + BEARING_SCALE],
+                            terms,
+                            arcs,
                         )
                 else:
                     # The density is 1 / field, which is the peak over that.

@@ -124,3 +124,14 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert {"rays, global, 120 x 8", "field, tracking, 120 x 8", "preparation, beam model"} <= set(names)
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 for row in report["rows"])
     assert all(row["error"] < 1e-2 for row in report["rows"] if row["error"] is not None)
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_landmarks_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--repeats", "1", "--seconds", "0.01"]
+    report = run_script("landmarks.py", "--backend", needs(selection), *arguments, output=tmp_path / "landmarks")
+    rows = report["rows"]
+    assert {(row["what"], row["cloud"]) for row in rows} == {
+        ("known", "tracking"), ("known", "global"), ("nearest", "tracking"), ("nearest", "global"),
+    }  # fmt: skip
+    assert all(row["rate"] > 0 and row["error"] < 16 for row in rows)

@@ -58,7 +58,7 @@ TRACES = [
     ("score_features", "SIGNATURE", (), r"\bSIGNATURE_AT\]", r"pair_product_\d+\("),
     ("score_features", "FIELD", ("BEARING",), r"\bfield_mass\(", r"field_mass_\d+\("),
     ("score_features", "KNOWN", ("RANGE",), r"= partner\[k\]", r"address\(var_partner\b"),
-    ("score_features", "MARGINAL", ("RANGE",), r"\badd_term\(\*sum", r"(?:\bwp::exp\([\s\S]*){2}",
+    ("score_features", "MARGINAL", ("RANGE",), r"\badd_term\(\*sum", r"(?:\bwp::exp\([\s\S]*){2}"),
     ("score_features", "PER_BEAM", ("RANGE",), r"\bparts\[", r"array_store\(var_parts\b"),
     ("score_field", "HIT", ("LINEAR",), r"\bexp\(", r"\bwp::exp\("),
     ("score_field", "CAREFUL", ("LOG_TABLE",), r"\bcareful_offset\(", r"careful_offset_\d+\("),

@@ -2,8 +2,8 @@
 
 Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
 |r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);
-erf(x) = 1 - exp(-x W(x)) for x up to 4; arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that has products with counts without rounding and the
-rest.
+erf(x) = 1 - exp(-x W(x)) for x up to 4; arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that
+has products with counts without rounding and the rest.
 """
 
 from __future__ import annotations

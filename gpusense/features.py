@@ -173,8 +173,11 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
         return Reach(0.0, far, 0.0)
     angle = min(wide / sensor.scales[1], math.pi) if measured[1] else math.pi
     around = Reach(0.0, far, near)
-    if math.isinf(far) or not measured[1]:
+    if not measured[1]:
         return around
+    if math.isinf(far):
+        # Everything may matter, until a landmark is found that is likelier than all beyond some distance of the end point.
+        return Reach(z, far, 0.0)
     # Of the points of a ring's sector, a corner is farthest from its middle.
     if measured[0]:
         ahead = z
@@ -254,9 +257,14 @@ def prepare_features(
     numbers[:, at.AXIS] = np.where(limited, math.cos(p.field_of_view / 2), -2.0)
     least = np.array(sensor.least_masses) * (1.0, not full_circle(p), 0.0)
     highest = peak - (measured * least).sum(axis=1) + measured[:, 2] * norm
+    with np.errstate(divide="ignore"):
+        numbers[:, at.RANGE_SPREAD], numbers[:, at.BEARING_SPREAD] = 1 / scales[:, 0], 1 / scales[:, 1]
+    numbers[:, at.MOST] = highest
     # A landmark below this adds less than eps to what a false positive alone has.
     smallest = false[columns] + math.log(np.finfo(real).eps) - 1
     slack = 16 * np.finfo(real).eps * (extent + 2 * p.range_max)
+    # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
+    numbers[:, at.SLACK] = 101 * slack**2
     for i in range(len(columns)):
         bound = -math.inf if np.isneginf(highest[i]) else float(highest[i] - smallest[i])
         reach = reach_of(p, sensor, float(values[i, 0]), measured[i], bound if gated else math.inf)

@@ -151,7 +151,7 @@ _CHANGED = (
 _RANGE = ("real limit", "real resolution", "real range_max")
 _LANDMARKS = ("real4 landmark [landmarks]", "real4 signature [landmarks]")
 _PLACED = (*_POSES, "real4 pose_low [particles]")
-_FEATURES = ("real feature [24 * features]",)
+_FEATURES = ("real feature [28 * features]",)
 _MIXTURE = ("real terms [4]", "real2 arcs [11]")
 _FEATURE_RESULT = (
     "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",
@@ -256,7 +256,7 @@ KERNELS: dict[str, Kernel] = {
         "int readings", "real guard", "real fixed", "real temperature", wide=True,
     ),
     "score_features": _kernel(
-        "landmark_grid", "particle", *_LANDMARKS, "int start [rows * cols + 1]", *_PLACED, *_FEATURES,
+        "landmark_score", "particle", *_LANDMARKS, "int start [rows * cols + 1]", *_PLACED, *_FEATURES,
         "int partner [features]", *_MIXTURE, *_FEATURE_RESULT, *_MAP, "int landmarks", "int particles", "int features",
         "real size", "real share", "real fixed", "real temperature", wide=True,
     ),

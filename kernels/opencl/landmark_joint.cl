@@ -28,7 +28,7 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
             global const real *one = feature + FEATURE * k;
             const real4 turned = direction(own, low, one);
             log_each[k] = -INFINITY;
-            if (one[RADIUS] >= 0 && near(off, turned, one))
+            if (one[RADIUS] >= 0 && near(off, turned, one, INFINITY))
                 log_each[k] = either(log_detection(off, turned, one, signature[j], terms, arcs), one[FALSE_POSITIVE]);
         }
         // From the full set down: the smaller sets do not have this landmark yet.

@@ -39,7 +39,13 @@
 // What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
 #define FARTHEST 22
 #define AXIS 23
-#define FEATURE 24
+// sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be; and what
+// squares of distances are off at most.
+#define RANGE_SPREAD 24
+#define BEARING_SPREAD 25
+#define MOST 26
+#define SLACK 27
+#define FEATURE 28
 // Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
 #define ARC_STEPS 8
 // Nearer than a micrometre every bearing is as likely.

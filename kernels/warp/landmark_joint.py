@@ -26,7 +26,7 @@ def make(name, flags):
     log_detection, either = density.log_detection, density.either
     near = landmark_grid.functions(shape).near
     PER_BEAM = "PER_BEAM" in flags
-    ZERO, NEVER = real(0.0), real(-math.inf)
+    ZERO, NEVER, EVERYWHERE = real(0.0), real(-math.inf), real(math.inf)
     # Features that a work-item has room for.
     LogEach = wp.types.vector(length=8, dtype=real)
 
@@ -83,7 +83,7 @@ def make(name, flags):
                 turned = direction(own, low, feature, one)
                 log_each[k] = NEVER
                 if feature[one + RADIUS] >= ZERO:
-                    if near(off, turned, feature, one):
+                    if near(off, turned, feature, one, EVERYWHERE):
                         found = log_detection(off, turned, feature, one, signature[j], terms, arcs)
                         log_each[k] = either(found, feature[one + FALSE_POSITIVE])
                 k += 1

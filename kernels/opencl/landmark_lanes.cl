@@ -33,11 +33,6 @@ Two lane_product(const lanes a, const lanes b) {
     return (Two){product, fma(a, b, -product)};
 }
 
-Two lane_pair_product(const Two a, const Two b) {
-    const Two product = lane_product(a.hi, b.hi);
-    return lane_sum(product.hi, product.lo + (a.hi * b.lo + a.lo * b.hi));
-}
-
 // c - a, a positive number in two parts less another.
 Two lane_rest(const float c, const float c_low, const Two a) {
     const Two sum = lane_sum((lanes)c, -a.hi);
@@ -109,9 +104,10 @@ Two lane_angle(const Spot off, const Spot turned) {
 
 // (residual * scale)^2 added to an exponent.
 Two lane_add_square(const Two total, const Two residual, const float scale, const float scale_low) {
-    const Two u = lane_pair_product(residual, (Two){(lanes)scale, (lanes)scale_low}), square = lane_pair_product(u, u);
-    const Two sum = lane_sum(total.hi, square.hi);
-    const lanes low = sum.lo + (total.lo + square.lo);
+    const Two u = lane_product(residual.hi, (lanes)scale);
+    const lanes u_low = u.lo + (residual.hi * scale_low + residual.lo * scale);
+    const Two square = lane_product(u.hi, u.hi), sum = lane_sum(total.hi, square.hi);
+    const lanes low = sum.lo + (total.lo + (square.lo + 2.0f * u.hi * u_low));
     // What overflows has no low part.
     return (Two){sum.hi, low - low == 0 ? low : (lanes)0};
 }
@@ -164,6 +160,29 @@ real2 lane_ends(const lanes a) {
     return ends;
 }
 
+// One more landmark: the best log densities so far, and the squared radius of what may still be likelier.
+void lane_landmark(const real4 landmark, const Spot place, const Spot turned, const lanes end_x, const lanes end_y,
+                   global const real *feature, global const real *terms, lanes *best, lanes *most) {
+    // The disc is wide enough for what is rounded here.
+    const lanes apart_x = landmark.x - end_x, apart_y = landmark.y - end_y;
+    const lanes apart = apart_x * apart_x + apart_y * apart_y;
+    if (!some(apart <= *most)) return;
+    const float hole = feature[HOLE] * feature[HOLE], farthest = feature[FARTHEST] * feature[FARTHEST];
+    const Spot off = lane_offset(landmark, place);
+    const lanes squared = off.x.hi * off.x.hi + off.y.hi * off.y.hi;
+    const ilanes seen = (apart <= *most) & (squared >= hole) & (squared <= farthest);
+    if (!some(seen)) return;
+    const lanes log_p = lane_detection(off, turned, feature, terms);
+    *best = seen & (log_p > *best) ? log_p : *best;
+    const float reach = feature[REACH];
+    if (reach > 0 && reach == feature[RANGE_AT]) {
+        const lanes rest = feature[MOST] - *best, root = sqrt(rest > 0 ? rest : (lanes)0);
+        const lanes r = root * feature[RANGE_SPREAD], b = root * feature[BEARING_SPREAD];
+        const lanes far = 1.01f * (r * r + reach * (reach + r) * (b * b)) + feature[SLACK];
+        *most = far < *most ? far : *most;
+    }
+}
+
 // Log densities of the likeliest landmarks. Where the discs of the particles touch few more buckets together than each of
 // them alone, they look at them together.
 lanes lane_search(global const real4 *landmark, global const real4 *signature, global const int *start,
@@ -187,31 +206,26 @@ lanes lane_search(global const real4 *landmark, global const real4 *signature, g
                               (real4)(p[4][i], p[5][i], p[6][i], p[7][i]), feature, terms, arcs, rows, cols, size).found;
         return load_lanes(0, found);
     }
-    const int bounded = reach > 0 && reach == feature[RANGE_AT];
-    const float hole = feature[HOLE] * feature[HOLE], farthest = feature[FARTHEST] * feature[FARTHEST];
-    const lanes end_x = place.x.hi + reach * turned.x.hi, end_y = place.y.hi + reach * turned.y.hi;
-    lanes most = radius * radius;
+    // The landmark nearest to the middle of the end points comes first: most others are then too far to be likelier.
+    int nearest = -1;
+    float least = INFINITY;
     for (int row = low; row <= high; ++row) {
         const int last = start[row * cols + right + 1];
         for (int j = start[row * cols + left]; j < last; ++j) {
-            const real4 one = landmark[j];
-            // The disc is wide enough for what is rounded here.
-            const lanes apart_x = one.x - end_x, apart_y = one.y - end_y;
-            const lanes apart = apart_x * apart_x + apart_y * apart_y;
-            if (!some(apart <= most)) continue;
-            const Spot off = lane_offset(one, place);
-            const lanes squared = off.x.hi * off.x.hi + off.y.hi * off.y.hi;
-            const ilanes seen = (apart <= most) & (squared >= hole) & (squared <= farthest);
-            if (!some(seen)) continue;
-            const lanes log_p = lane_detection(off, turned, feature, terms);
-            best = seen & (log_p > best) ? log_p : best;
-            if (bounded) {
-                const lanes rest = feature[MOST] - best, exponent = rest > 0 ? rest : (lanes)0, root = sqrt(exponent);
-                const lanes r = root * feature[RANGE_SPREAD], b = root * feature[BEARING_SPREAD];
-                const lanes far = 1.01f * (r * r + reach * (reach + r) * (b * b)) + feature[SLACK];
-                most = far < most ? far : most;
-            }
+            const float off_x = landmark[j].x - 0.5f * (x.x + x.y), off_y = landmark[j].y - 0.5f * (y.x + y.y);
+            const float squared = off_x * off_x + off_y * off_y;
+            nearest = squared < least ? j : nearest;
+            least = squared < least ? squared : least;
         }
+    }
+    if (nearest < 0) return best;
+    const lanes end_x = place.x.hi + reach * turned.x.hi, end_y = place.y.hi + reach * turned.y.hi;
+    lanes most = radius * radius;
+    lane_landmark(landmark[nearest], place, turned, end_x, end_y, feature, terms, &best, &most);
+    for (int row = low; row <= high; ++row) {
+        const int last = start[row * cols + right + 1];
+        for (int j = start[row * cols + left]; j < last; ++j)
+            if (j != nearest) lane_landmark(landmark[j], place, turned, end_x, end_y, feature, terms, &best, &most);
     }
     return best;
 }

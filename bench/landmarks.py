@@ -6,7 +6,8 @@
 Writes a Markdown table and a JSON file with machine, sizes, times, errors and the command. There is a landmark in every
 16 m2, 100 in a square of 40 m; features are those nearest to a pose within 20 m, with noise. Known: it is given which
 landmark each feature is; nearest: the likeliest of all. Clouds are around the pose (tracking) or all over the map
-(global). Errors are of log p against the float64 reference on the first particles, in eps (1 + |log p|) of float32 and a feature.
+(global). Errors are of log p against the float64 reference on the first particles, in eps (1 + |log p|) of float32 and
+a feature.
 """
 
 from __future__ import annotations

@@ -176,7 +176,7 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
     if not measured[1]:
         return around
     if math.isinf(far):
-        # Everything may matter, until a landmark is found that is likelier than all beyond some distance of the end point.
+        # Everything may matter until a landmark is found that is likelier than all beyond some distance.
         return Reach(z, far, 0.0)
     # Of the points of a ring's sector, a corner is farthest from its middle.
     if measured[0]:

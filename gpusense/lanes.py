@@ -18,10 +18,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 
 def widened(info: BackendInfo, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
     """The flags of a launch on a device, with WIDE where it asks for lanes and the scene has such a kernel."""
-    if (
-        info.lanes == 1
-        or flags & (_NEVER | _NEVER_OF.get(kernel, set()))
-        or not any(needed <= flags for needed in _NEEDED[kernel])
-    ):
+    never = _NEVER | _NEVER_OF.get(kernel, set())
+    if info.lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED[kernel]):
         return frozenset(flags)
     return frozenset(flags) | {"WIDE"}

@@ -1,4 +1,4 @@
-"""Likelihood of a set of features for each particle, log p(f | x, m): the sum over features, book tables 6.4 and 6.5."""
+"""Likelihood of a set of features for each particle, log p(f | x, m): the sum over features (tables 6.4 and 6.5)."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ typedef struct {
 #define HALF_TURN 3.14159274f
 #define HALF_TURN_LOW -8.74227766e-08f
 // Landmarks that 16 particles look at together, at most so many times as many as each of them.
-#define TOGETHER 8
+#define TOGETHER 16
 
 Two lane_sum(const lanes a, const lanes b) {
     const lanes sum = a + b, shift = sum - a;
@@ -173,7 +173,7 @@ void lane_landmark(const real4 landmark, const Spot place, const Spot turned, co
     const ilanes seen = (apart <= *most) & (squared >= hole) & (squared <= farthest);
     if (!some(seen)) return;
     const lanes log_p = lane_detection(off, turned, feature, terms);
-    *best = seen & (log_p > *best) ? log_p : *best;
+    *best = (seen & (log_p > *best)) ? log_p : *best;
     const float reach = feature[REACH];
     if (reach > 0 && reach == feature[RANGE_AT]) {
         const lanes rest = feature[MOST] - *best, root = sqrt(rest > 0 ? rest : (lanes)0);
@@ -183,49 +183,64 @@ void lane_landmark(const real4 landmark, const Spot place, const Spot turned, co
     }
 }
 
-// Log densities of the likeliest landmarks. Where the discs of the particles touch few more buckets together than each of
-// them alone, they look at them together.
-lanes lane_search(global const real4 *landmark, global const real4 *signature, global const int *start,
-                  const Spot place, const Spot turned, global const real *feature, global const real *terms,
-                  global const real2 *arcs, const int rows, const int cols, const real size) {
-    const real reach = feature[REACH], radius = feature[RADIUS];
-    lanes best = -INFINITY;
-    if (radius < 0) return best;
-    const real2 x = lane_ends(place.x.hi + reach * turned.x.hi), y = lane_ends(place.y.hi + reach * turned.y.hi);
-    const int left = bucket_at(x.x - radius, size, cols), right = bucket_at(x.y + radius, size, cols);
-    const int low = bucket_at(y.x - radius, size, rows), high = bucket_at(y.y + radius, size, rows);
-    const int across = min((int)(2 * fmin(radius, size * cols) / size) + 2, cols);
-    const int up = min((int)(2 * fmin(radius, size * rows) / size) + 2, rows);
-    if ((long)(right - left + 1) * (high - low + 1) > TOGETHER * (long)across * up) {
-        real found[LANES], p[8][LANES];
-        const lanes all[8] = {place.x.hi,  place.x.lo,  place.y.hi,  place.y.lo,
-                              turned.x.hi, turned.x.lo, turned.y.hi, turned.y.lo};
-        for (int i = 0; i < 8; ++i) store_lanes(all[i], 0, p[i]);
-        for (int i = 0; i < LANES; ++i)
-            found[i] = search(landmark, signature, start, (real4)(p[0][i], p[1][i], p[2][i], p[3][i]),
-                              (real4)(p[4][i], p[5][i], p[6][i], p[7][i]), feature, terms, arcs, rows, cols, size).found;
-        return load_lanes(0, found);
-    }
-    // The landmark nearest to the middle of the end points comes first: most others are then too far to be likelier.
+// The landmarks of some buckets: that nearest to (x, y), the middle of the end points, comes first, since most others are
+// then too far to be likelier.
+void lane_buckets(global const real4 *landmark, global const int *start, const int4 buckets, const int cols,
+                  const float x, const float y, const Spot place, const Spot turned, const lanes end_x,
+                  const lanes end_y, global const real *feature, global const real *terms, lanes most, lanes *best) {
     int nearest = -1;
     float least = INFINITY;
-    for (int row = low; row <= high; ++row) {
-        const int last = start[row * cols + right + 1];
-        for (int j = start[row * cols + left]; j < last; ++j) {
-            const float off_x = landmark[j].x - 0.5f * (x.x + x.y), off_y = landmark[j].y - 0.5f * (y.x + y.y);
-            const float squared = off_x * off_x + off_y * off_y;
+    for (int row = buckets.z; row <= buckets.w; ++row) {
+        const int last = start[row * cols + buckets.y + 1];
+        for (int j = start[row * cols + buckets.x]; j < last; ++j) {
+            const float off_x = landmark[j].x - x, off_y = landmark[j].y - y, squared = off_x * off_x + off_y * off_y;
             nearest = squared < least ? j : nearest;
             least = squared < least ? squared : least;
         }
     }
-    if (nearest < 0) return best;
-    const lanes end_x = place.x.hi + reach * turned.x.hi, end_y = place.y.hi + reach * turned.y.hi;
-    lanes most = radius * radius;
-    lane_landmark(landmark[nearest], place, turned, end_x, end_y, feature, terms, &best, &most);
-    for (int row = low; row <= high; ++row) {
-        const int last = start[row * cols + right + 1];
-        for (int j = start[row * cols + left]; j < last; ++j)
-            if (j != nearest) lane_landmark(landmark[j], place, turned, end_x, end_y, feature, terms, &best, &most);
+    if (nearest < 0) return;
+    lane_landmark(landmark[nearest], place, turned, end_x, end_y, feature, terms, best, &most);
+    for (int row = buckets.z; row <= buckets.w; ++row) {
+        const int last = start[row * cols + buckets.y + 1];
+        for (int j = start[row * cols + buckets.x]; j < last; ++j)
+            if (j != nearest) lane_landmark(landmark[j], place, turned, end_x, end_y, feature, terms, best, &most);
+    }
+}
+
+// First and last column and row of the buckets that discs touch.
+int4 lane_touched(const real2 x, const real2 y, const float radius, const int rows, const int cols, const float size) {
+    return (int4)(bucket_at(x.x - radius, size, cols), bucket_at(x.y + radius, size, cols),
+                  bucket_at(y.x - radius, size, rows), bucket_at(y.y + radius, size, rows));
+}
+
+// Log densities of the likeliest landmarks. Where the discs of the particles touch few more buckets together than each of
+// them alone, the particles look at landmarks together, else one after the other; a lane has the same bits either way.
+lanes lane_search(global const real4 *landmark, global const int *start, const Spot place, const Spot turned,
+                  global const real *feature, global const real *terms, const int rows, const int cols,
+                  const real size) {
+    const real radius = feature[RADIUS];
+    lanes best = -INFINITY;
+    if (radius < 0) return best;
+    const lanes end_x = place.x.hi + feature[REACH] * turned.x.hi, end_y = place.y.hi + feature[REACH] * turned.y.hi;
+    const real2 x = lane_ends(end_x), y = lane_ends(end_y);
+    const int4 all = lane_touched(x, y, radius, rows, cols, size);
+    const int across = min((int)(2 * fmin(radius, size * cols) / size) + 2, cols);
+    const int up = min((int)(2 * fmin(radius, size * rows) / size) + 2, rows);
+    const lanes most = radius * radius;
+    if ((long)(all.y - all.x + 1) * (all.w - all.z + 1) <= TOGETHER * (long)across * up) {
+        lane_buckets(landmark, start, all, cols, 0.5f * (x.x + x.y), 0.5f * (y.x + y.y), place, turned, end_x, end_y,
+                     feature, terms, most, &best);
+        return best;
+    }
+    real each_x[LANES], each_y[LANES];
+    store_lanes(end_x, 0, each_x);
+    store_lanes(end_y, 0, each_y);
+    for (int i = 0; i < LANES; ++i) {
+        const int4 own = lane_touched((real2)each_x[i], (real2)each_y[i], radius, rows, cols, size);
+        const ilanes mine = (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) == i;
+        // No square is negative, so nothing matters to the others.
+        lane_buckets(landmark, start, own, cols, each_x[i], each_y[i], place, turned, end_x, end_y, feature, terms,
+                     mine ? most : (lanes)-1, &best);
     }
     return best;
 }

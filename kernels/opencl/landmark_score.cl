@@ -33,8 +33,7 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
 #if KNOWN
             const lanes found = lane_detection(lane_offset(landmark[partner[k]], place), turned, one, terms);
 #else
-            const lanes found =
-                lane_search(landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size);
+            const lanes found = lane_search(landmark, start, place, turned, one, terms, rows, cols, size);
 #endif
             const lanes value = lane_either(found, one[FALSE_POSITIVE]);
             const ilanes never = !(value > -INFINITY);

@@ -40,10 +40,15 @@ GATED = {
 }
 
 
+SUMMED = ("range and bearing", "exact")
+
+
 @on_every_backend(
-    on_warp=lambda name, association: name == "range and bearing", name=GATED, association=("nearest", "sum")
+    on_warp=lambda case: case[0] == "range and bearing",
+    case=[(name, "nearest") for name in GATED] + [(name, "sum") for name in SUMMED],
 )
-def test_the_gate_leaves_out_nothing_that_matters(backend, name, association):
+def test_the_gate_leaves_out_nothing_that_matters(backend, case):
+    name, association = case
     landmarks, poses, features = forest(500, 90.0)
     p = gs.LandmarkParameters(**GATED[name])
     features = features if p.sigma_signature else features[:, :2]
@@ -230,3 +235,21 @@ def test_wrong_signatures_are_other_landmarks(backend):
     model = gs.LandmarkModel(landmarks, gs.LandmarkParameters(sigma_signature=0.5), backend=backend)
     which, _ = model.associate([[0, 0, 0]], [[5.0, 0.0, 20.0], [5.0, 0.02, 10.0], [5.0, 0.0, NAN], [5.0, 0.0, 15.0]])
     assert which.tolist() == [[1, 0, 0, -1]]
+
+
+@on_every_backend(on_warp=lambda false: False, false=(0.05, 0.0))
+def test_a_particle_has_the_same_bits_among_any_others(backend, false):
+    """Particles that are computed together look at landmarks together only where they are near to each other."""
+    landmarks, _, features = forest(800, 110.0)
+    rng = np.random.default_rng(3)
+    near, far = rng.normal(0, (0.3, 0.3, 0.1), (40, 3)), rng.uniform(-50, 50, (60, 3))
+    model = gs.LandmarkModel(landmarks, gs.LandmarkParameters(z_detect=1 - false, z_false=false), backend=backend)
+    alone = model.log_likelihood(near, features[:, :2])
+    mixed = np.concatenate([near, far])
+    order = rng.permutation(len(mixed))
+    found = np.empty(len(mixed), np.float32)
+    found[order] = model.log_likelihood(mixed[order], features[:, :2])
+    np.testing.assert_array_equal(found[: len(near)], alone)
+    exact = gs.LandmarkModel(landmarks, model.parameters, backend="numpy", **FLOAT64)
+    truth, parts = exact.log_likelihood(mixed, features[:, :2]), exact.associate(mixed, features[:, :2])[1]
+    assert (np.abs(found - truth) <= 17 * np.finfo(np.float32).eps * (1 + np.abs(parts)).sum(axis=1)).all()

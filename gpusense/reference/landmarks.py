@@ -32,8 +32,8 @@ UPPER, UPPER_LOW = 17, 18
 REACH, RADIUS, HOLE = 19, 20, 21
 # What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
 FARTHEST, AXIS = 22, 23
-# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be; and
-# what squares of distances are off at most.
+# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be;
+# and what squares of distances are off at most.
 RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = 24, 25, 26, 27
 FEATURE = 28
 

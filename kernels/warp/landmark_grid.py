@@ -75,8 +75,8 @@ def functions(flags):
         return d <= feature[one + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[one + AXIS] * d
 
     # Square of the radius around a feature's end point outside which exponents are larger than some: with r the error
-    # of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b) is
-    # at most b^2. A little is added for what rounding takes from such distances.
+    # of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b)
+    # is at most b^2. A little is added for what rounding takes from such distances.
     @wp.func
     def squared_reach(exponent: real, feature: wp.array(dtype=real), one: wp.int32):
         found = real(0.0)

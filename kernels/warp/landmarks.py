@@ -36,8 +36,8 @@ UPPER, UPPER_LOW = wp.constant(17), wp.constant(18)
 REACH, RADIUS, HOLE = wp.constant(19), wp.constant(20), wp.constant(21)
 # What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
 FARTHEST, AXIS = wp.constant(22), wp.constant(23)
-# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be; and
-# what squares of distances are off at most.
+# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be;
+# and what squares of distances are off at most.
 RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = wp.constant(24), wp.constant(25), wp.constant(26), wp.constant(27)
 FEATURE = wp.constant(28)
 # Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].

@@ -28,8 +28,11 @@ Function = Callable[[mp.mpf], mp.mpf]
 
 
 def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
-    """Its value; lowest power first."""
-    return mp.polyval(powers[::-1], z)
+    """Its value by Horner's rule; lowest power first."""
+    value = mp.mpf(0)
+    for power in reversed(powers):
+        value = value * z + power
+    return value
 
 
 def remez(f: Function, weight: Function, low: mp.mpf, high: mp.mpf, count: int) -> tuple[list[float], float]:

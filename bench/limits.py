@@ -38,9 +38,7 @@ class Bench:
     def add(self, what: str, work: float, run: Callable[[], Any], check: Callable[[], float] | None = None) -> None:
         """A row of a call that does so much work: its own time, and that of its launches."""
         run()
-        self.device.launches.clear()
-        run()
-        launches = list(self.device.launches)
+        launches = self.device.launches_of(run)
         least, median = best(run, self.arguments.repeats, self.arguments.seconds)
 
         def again() -> None:

@@ -32,7 +32,7 @@ far as the probes are good: where a time is below it the report says so.
 Operations are counted in kernels/opencl, as the fewest instructions: a multiplication is not merged with an addition
 (ranges have the same bits everywhere), sizes and signs are free, a rounded division is 8, exp 8, log 15.
 
-    field.cl, rounded_cell and table_cell: 8 of the rotation, 2 of rounding, 4 of the distance from the middle,
+    end_point.cl, rounded_cell and table_cell: 8 of the rotation, 2 of rounding, 4 of the distance from the middle,
         2 maxima, 2 of the cell, 1 of the index, 1 address, 1 load, 1 addition                                      22
     raycast.cl, a step: 4 of the two counts and 2 of the index, 1 load, 1 branch; 8 of the sides; 4 of the crossing
         distances, 2 to choose, 2 of the limit; 3 selections, 10 of crossed, 4 of the new counts                    41
@@ -57,98 +57,15 @@ from typing import Any
 
 import numpy as np
 from probes import Figures, probe, rate
+from scaling_report import KINDS, draw, figures_markdown, table_line
+from scaling_scenes import CHECKED, RANGE_MAX, Scene, count_reads, make_scene
 from speed import Recorder, best, command_line, machine
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.frames import place_poses, ray_vectors
-from gpusense.prepare import empty_rectangles, sectors_of
-from gpusense.reference import raycast
-from gpusense.worlds import building, cloud_around, free_pose
+from gpusense.prepare import sectors_of
 
-RANGE_MAX, RESOLUTION, LARGEST_BUILDING = 30.0, 0.05, 2000
-CHECKED, COUNTED, WINDOW = 8, 512, 1400
 OPERATIONS = {"field": 22, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
-KINDS = ("rays", "beam model", "field")
-AXES = {"particles": "particles", "beams": "beams", "side": "side of the map [cells]"}
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A map, a pose in it, and what casting costs there."""
-
-    grid: gs.OccupancyGrid
-    pose: np.ndarray
-    near: gs.OccupancyGrid
-    seconds: float
-
-    def cloud(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Poses over the free cells; the first of them around the pose."""
-        rows, cols = self.grid.shape
-        cells = np.empty((0, 2))
-        while len(cells) < count:
-            row, col = rng.integers(rows, size=2 * count + 64), rng.integers(cols, size=2 * count + 64)
-            free = self.grid.cells[row, col] == 0
-            cells = np.concatenate([cells, np.stack([col[free], row[free]], axis=1)])
-        places = (cells[:count] + rng.uniform(0.001, 0.999, (count, 2))) * self.grid.resolution
-        poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, count)])
-        poses[:CHECKED] = cloud_around(self.pose, CHECKED, 0.1, 0.1, rng)[:count]
-        return poses
-
-
-def make_scene(side: int) -> Scene:
-    """The built-in building of that many cells, many of them side by side where it is larger than one."""
-    start = time.perf_counter()
-    rng = np.random.default_rng(0)
-    resolution = RESOLUTION if side * RESOLUTION >= 10 else 10 / side
-    one = building(0, (min(side, LARGEST_BUILDING) * resolution,) * 2, resolution)
-    pose = free_pose(one, rng, 0.3)
-    times = -(-side // LARGEST_BUILDING)
-    grid = one
-    if times > 1:
-        grid = gs.OccupancyGrid(np.tile(one.cells, (times, times))[:side, :side], resolution)
-    # All that the first particles can see, so that float64 NumPy need not prepare the whole map.
-    reach = int((RANGE_MAX + 5) / resolution)
-    col, row = (max(int(place / resolution) - reach, 0) for place in pose[:2])
-    right, top = (int(place / resolution) + reach for place in pose[:2])
-    near = grid.cells[row:top, col:right]
-    part = gs.OccupancyGrid(np.ascontiguousarray(near), resolution, (col * resolution, row * resolution, 0.0))
-    return Scene(grid, pose, part, time.perf_counter() - start)
-
-
-class Counted:
-    """A table that counts how often it is read."""
-
-    def __init__(self, table: np.ndarray) -> None:
-        self.table, self.reads = table, 0
-
-    def __getitem__(self, at: np.ndarray) -> np.ndarray:
-        self.reads += len(at)
-        return self.table[at]
-
-
-def count_reads(scene: Scene, backend: Any) -> tuple[float, float]:
-    """Mean reads and mean steps of a ray, in the middle of the map at most: where rays end early, too few."""
-    rows, cols = (min(side, WINDOW) for side in scene.grid.shape)
-    row, col = ((whole - part) // 2 for whole, part in zip(scene.grid.shape, (rows, cols), strict=True))
-    size = scene.grid.resolution
-    grid = gs.OccupancyGrid(
-        np.ascontiguousarray(scene.grid.cells[row : row + rows, col : col + cols]), size, (0.0, 0.0, 0.0)
-    )
-    rng = np.random.default_rng(1)
-    poses = Scene(grid, np.array([0.5 * cols * size, 0.5 * rows * size, 0.0]), grid, 0.0).cloud(COUNTED, rng)[CHECKED:]
-    sectors = sectors_of(backend, *scene.grid.shape)
-    planes = empty_rectangles(backend, grid.obstacles("free"), sectors)
-    table = Counted(backend.download(planes, np.empty(4 * sectors * (rows + 2) * (cols + 2), np.uint16)))
-    placed = place_poses(poses, grid, (0.0, 0.0, 0.0), np.dtype(np.float32))
-    rays = ray_vectors(rng.uniform(-np.pi, np.pi, len(poses)), (0.0, 0.0, 0.0)).astype(np.float32)
-    limit = np.float32(RANGE_MAX / size)
-    flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
-    found = raycast.cast_ray(
-        flags, table, rows, cols, placed.cell, placed.pose, rays, limit, 0, np.float32(0), np.float32(0)
-    )  # type: ignore[arg-type]
-    # The read that finds an obstacle is no step.
-    return table.reads / len(poses), (table.reads - np.count_nonzero(found < limit)) / len(poses)
 
 
 @dataclass(frozen=True)
@@ -288,11 +205,10 @@ class Device:
         start = time.perf_counter()
         call(poses)
         first = time.perf_counter() - start
-        self.backend.launches.clear()
+        launches = self.backend.launches_of(lambda: call(poses))
         start = time.perf_counter()
         result = call(poses)
         once = time.perf_counter() - start
-        launches = list(self.backend.launches)
         seconds = min(self.arguments.seconds, self.arguments.total)
         least, median = best(lambda: call(poses), self.arguments.repeats, seconds) if once < seconds else (once, once)
 
@@ -367,95 +283,6 @@ def host_memory() -> float:
 def note(text: str) -> None:
     """A line for who waits."""
     print(text, file=sys.stderr, flush=True)
-
-
-HEAD = (
-    "| backend | what | particles x beams | map | ms a call (median) | ms, launches alone | floor of both, ms | set by "
-    "| M/s, call | M/s, launches | share of the floor's rate | max error |\n" + "| --- " * 12 + "|"
-)
-
-
-def table_line(r: dict[str, Any]) -> str:
-    """A row of the table; a time below the floor is marked."""
-    work = r["particles"] * r["beams"] / 1e6
-    share = r["floor_launch_s"] / r["launch_s"]
-    return (
-        f"| {r['backend']} | {r['what']} | {r['particles']} x {r['beams']} | {r['side']} x {r['side']} "
-        f"| {r['call_s'] * 1e3:.4g} ({r['median_s'] * 1e3:.4g}) | {r['launch_s'] * 1e3:.4g} "
-        f"| {r['floor_call_s'] * 1e3:.3g}, {r['floor_launch_s'] * 1e3:.3g} | {r['cause']} | {work / r['call_s']:.4g} "
-        f"| {work / r['launch_s']:.4g} | {share:.0%}{' (below the floor)' if share > 1 else ''} | {r['error']:.1e} |"
-    )
-
-
-def figures_markdown(device: dict[str, Any]) -> str:
-    """What the probes found, and what was left out."""
-    f = device["figures"]
-    sizes = ", ".join(f"{size >> 10} KiB {value / 1e9:.3g} G/s" for size, value in f["scattered"].items())
-    copies = ", ".join(f"{size >> 20} MiB {value / 1e9:.4g} GB/s" for size, value in f["copy"].items())
-    lines = [
-        f"## {device['device']}, {device['backend']}", "",
-        f"Floor of {f['source']}: launch {f['launch_s'] * 1e6:.3g} us, round trip {f['round_trip_s'] * 1e6:.3g} us; "
-        f"additions {f['issue'] / 1e9:.4g} G/s; look-ups nearest {f['together'] / 1e9:.4g} G/s, at random in {sizes}; "
-        f"copies of {copies}; upload {f['upload'] / 1e9:.3g} GB/s, download {f['download'] / 1e9:.3g} GB/s.", "",
-        HEAD, *(table_line(row) for row in device["rows"]), "",
-        f"Left out: {len(device['left_out'])} points." if device["left_out"] else "No point was left out.",
-        *(f"- {line}" for line in device["left_out"] + f["left_out"]), "",
-    ]  # fmt: skip
-    return "\n".join(lines)
-
-
-def draw(device: dict[str, Any], path: Path) -> None:
-    """Three panels: nanoseconds per ray or particle-beam over particles, beams and the map's side."""
-    from gpusense.plots import new_figure
-
-    colours = dict(zip(KINDS, ("#0072b2", "#d55e00", "#009e73"), strict=True))
-    figure = new_figure(15.0, 5.6)
-    for ax, axis in zip(figure.subplots(1, 3, sharey=True), AXES, strict=True):
-        for kind in KINDS:
-            rows = [row for row in device["rows"] if row["axis"] == axis and row["what"] == kind]
-            if not rows:
-                continue
-            x = [row["value"] for row in rows]
-            y = {
-                name: [1e9 * row[name] / (row["particles"] * row["beams"]) for row in rows]
-                for name in ("call_s", "launch_s", "floor_launch_s", "floor_call_s", "scattered_s")
-            }
-            ax.plot(x, y["call_s"], "-o", color=colours[kind], ms=4, lw=1.3)
-            ax.plot(x, y["launch_s"], "--s", color=colours[kind], ms=4, lw=1.1, mfc="none")
-            ax.plot(x, y["floor_launch_s"], ":", color=colours[kind], lw=1.6)
-            ax.plot(x, y["floor_call_s"], "-.", color=colours[kind], lw=0.8)
-            ax.fill_between(x, y["floor_launch_s"], y["scattered_s"], color=colours[kind], alpha=0.12, lw=0)
-        fixed = [row for row in device["rows"] if row["axis"] == axis][:1]
-        told = {
-            "particles": "{beams} beams, map of {side} cells",
-            "beams": "{particles} particles, map of {side} cells",
-            "side": "{particles} particles, {beams} beams",
-        }[axis]
-        ax.set(xlabel=AXES[axis])
-        if fixed:
-            ax.set(xscale="log", yscale="log")
-        ax.set_title(told.format(**fixed[0]) if fixed else "every point left out", loc="left", fontsize="medium")
-        ax.grid(True, which="major", color="#e3e7ed", lw=0.6)
-    figure.axes[0].set_ylabel("time per ray or particle-beam [ns]")
-    _legend(figure, colours)
-    figure.suptitle(f"{device['device']}, {device['backend']}", x=0.01, ha="left", fontsize="medium")
-    figure.savefig(path)
-
-
-def _legend(figure: Any, colours: dict[str, str]) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    grey = "#4a5568"
-    handles: list[Any] = [Line2D([], [], color=colour, lw=2, label=kind) for kind, colour in colours.items()]
-    handles += [
-        Line2D([], [], color=grey, ls="-", marker="o", ms=4, label="call, NumPy in and out"),
-        Line2D([], [], color=grey, ls="--", marker="s", ms=4, mfc="none", label="launches alone"),
-        Line2D([], [], color=grey, ls=":", lw=1.6, label="floor of launches"),
-        Line2D([], [], color=grey, ls="-.", lw=0.8, label="floor of a call"),
-        Patch(color=grey, alpha=0.15, label="to look-ups at random"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=8, fontsize="small", frameon=False)
 
 
 def numbers(text: str) -> list[int]:

@@ -37,6 +37,22 @@ class Recorder:
     def __init__(self, backend: Any) -> None:
         self._backend = backend
         self.launches: list[Callable[[], None]] = []
+        self._listening = False
+
+    def mark(self) -> object | None:
+        """The backend's; what it would repeat is not repeated while each launch is to be heard of."""
+        return None if self._listening else self._backend.mark()
+
+    def launches_of(self, run: Callable[[], Any]) -> list[Callable[[], None]]:
+        """The launches of a call."""
+        self.launches.clear()
+        self._listening = True
+        try:
+            run()
+        finally:
+            self._listening = False
+        launches, self.launches = self.launches, []
+        return launches
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
@@ -78,9 +94,7 @@ def measure(
     result = call(model, poses)
     first = time.perf_counter() - start
     least, median = best(lambda: call(model, poses), arguments.repeats, arguments.seconds)
-    device.launches.clear()
-    call(model, poses)
-    launches = list(device.launches)
+    launches = device.launches_of(lambda: call(model, poses))
 
     def launch() -> None:
         for one in launches:

@@ -14,24 +14,38 @@ from gpusense._version import __version__
 
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
+    from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
     from gpusense.landmarks import LandmarkMap
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.beam import BeamModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.models.landmark import LandmarkModel
+    from gpusense.normals import surface_normals
     from gpusense.parameters import BeamParameters, IncidenceParameters, LandmarkParameters, LikelihoodFieldParameters
+    from gpusense.positions.bearings import triangulate, triangulate_triangle
+    from gpusense.positions.both import locate
+    from gpusense.positions.fix import PositionFix
+    from gpusense.positions.ranges import trilaterate
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "DiscreteBeamModel": "gpusense.discrete",
+    "DiscreteCauses": "gpusense.discrete",
+    "DiscreteFit": "gpusense.discrete",
+    "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LandmarkMap": "gpusense.landmarks",
     "LandmarkModel": "gpusense.models.landmark",
@@ -40,6 +54,7 @@ _HOME = {
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
     "Odometry": "gpusense.logs",
+    "PositionFix": "gpusense.positions.fix",
     "RayCaster": "gpusense.models.caster",
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
@@ -48,18 +63,30 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "fit_beam_parameters": "gpusense.learning.fit",
+    "fit_incidence_parameters": "gpusense.learning.incidence",
+    "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
+    "surface_normals": "gpusense.normals",
+    "triangulate": "gpusense.positions.bearings",
+    "triangulate_triangle": "gpusense.positions.bearings",
+    "trilaterate": "gpusense.positions.ranges",
     "write_map": "gpusense.map_io",
 }
 
 __all__ = [
+    "BeamFit",
     "BeamModel",
     "BeamParameters",
     "CasterMethod",
     "Device",
+    "DiscreteBeamModel",
+    "DiscreteCauses",
+    "DiscreteFit",
+    "IncidenceFit",
     "IncidenceParameters",
     "LandmarkMap",
     "LandmarkModel",
@@ -68,6 +95,7 @@ __all__ = [
     "LikelihoodFieldParameters",
     "OccupancyGrid",
     "Odometry",
+    "PositionFix",
     "RayCaster",
     "Reading",
     "Scan",
@@ -77,10 +105,17 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "fit_beam_parameters",
+    "fit_incidence_parameters",
+    "locate",
     "normalize_weights",
     "read_log",
     "read_map",
     "resample",
+    "surface_normals",
+    "triangulate",
+    "triangulate_triangle",
+    "trilaterate",
     "write_map",
 ]
 

@@ -5,6 +5,7 @@ Two protocols are understood: DLPack (PyTorch, CuPy, JAX, Warp, NumPy) and the C
 
 from __future__ import annotations
 
+import functools
 import sys
 from typing import Any
 
@@ -26,20 +27,34 @@ def on_device(array: object) -> bool:
     return hasattr(array, "__cuda_array_interface__")
 
 
-def to_host(array: object) -> object:
-    """A NumPy view of an array of another library in host memory, anything else as it is."""
+def to_host(array: object, name: str = "poses") -> object:
+    """A NumPy view of an array of another library in host memory, anything else as it is.
+
+    Raises:
+        TypeError: a tensor whose gradients are recorded.
+    """
     if isinstance(array, (np.ndarray, list, tuple)) or not hasattr(array, "__dlpack__"):
         return array
     try:
         return np.from_dlpack(array)
-    except (BufferError, RuntimeError, TypeError, AttributeError):
+    except (BufferError, RuntimeError, TypeError, AttributeError) as error:
+        _check_gradients(array, name, error)
         return array
+
+
+def _check_gradients(array: object, name: str, error: Exception) -> None:
+    """Say why an array is not exported where its library records its gradients, which are not computed here."""
+    if getattr(array, "requires_grad", False) is True:
+        raise TypeError(
+            f"{name}: must not require gradients, which are not computed here, got a "
+            f"{type(array).__module__}.{type(array).__name__} that does: pass {name}.detach()"
+        ) from error
 
 
 def copied_to_host(array: object, backend: Backend, name: str) -> object:
     """Readings as NumPy has them; those on the device are copied, which waits for it."""
     if not on_device(array):
-        return to_host(array)
+        return to_host(array, name)
     return _adopt(array, backend, name).numpy()
 
 
@@ -60,7 +75,11 @@ def _adopt(array: Any, backend: Backend, name: str) -> Any:
     if isinstance(array, wp.array):
         found = array
     elif hasattr(array, "__dlpack__"):
-        found = wp.from_dlpack(array)
+        try:
+            found = wp.from_dlpack(array)
+        except (BufferError, RuntimeError, TypeError) as error:
+            _check_gradients(array, name, error)
+            raise
     else:
         interface = array.__cuda_array_interface__
         dtype = {"<f4": wp.float32, "<f8": wp.float64, "<i4": wp.int32, "<i8": wp.int64}.get(interface["typestr"])
@@ -79,8 +98,16 @@ def _adopt(array: Any, backend: Backend, name: str) -> Any:
     return found
 
 
-def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int, bool]:
-    """(N, 3) poses on the device as a flat buffer, their number, and whether they are float32.
+@functools.lru_cache(maxsize=64)
+def _flat(address: int, count: int, dtype: Any, device: str) -> Buffer:
+    """Memory on the device as a flat buffer that does not own it."""
+    import warp as wp
+
+    return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
+
+
+def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int, bool, object]:
+    """(N, 3) poses on the device as a flat buffer, their number, whether they are float32, and what owns the memory.
 
     Raises:
         TypeError: not float32 or float64, or not on the backend's device.
@@ -95,7 +122,9 @@ def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int
         raise TypeError(f"{name}: must hold float32 or float64, got {found.dtype.__name__}")
     if not found.is_contiguous:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {found.strides}")
-    return found.flatten(), found.shape[0], found.dtype == wp.float32
+    count = found.shape[0]
+    flat = _flat(found.ptr, 3 * count, found.dtype, found.device.alias) if count else found.flatten()
+    return flat, count, found.dtype == wp.float32, found
 
 
 def blank(backend: Backend, count: int, real: np.dtype) -> Buffer:
@@ -137,20 +166,21 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, given: object
         raise TypeError("out: must be in the memory where the poses are, got one that is not")
     if on_device(out):
         found = _adopt(out, backend, "out")
-        dtype, contiguous = np.dtype(str(found.dtype.__name__)), found.is_contiguous
-        writeable, found_shape = True, found.shape
+        dtype, contiguous = found.dtype.__name__, found.is_contiguous
+        same, writeable, found_shape = dtype == real.name, True, found.shape
     else:
-        found = to_host(out)
+        found = to_host(out, "out")
         if not isinstance(found, np.ndarray):
             raise TypeError(f"out: must be an array, got {show(out)}")
         if not found.flags.writeable and found is not out:
             # Exporters of the first DLPack cannot say that memory may be written; NumPy's own protocols can.
             plain = np.asarray(out)
             found = plain if plain.ctypes.data == found.ctypes.data else found
-        dtype, found_shape = found.dtype, found.shape
+        same, found_shape = found.dtype == real, found.shape
+        dtype = "" if same else found.dtype.name
         contiguous, writeable = found.flags.c_contiguous, found.flags.writeable
-    if dtype != real:
-        raise TypeError(f"out: must hold {real.name}, got {dtype.name}")
+    if not same:
+        raise TypeError(f"out: must hold {real.name}, got {dtype}")
     if tuple(found_shape) != shape:
         raise ValueError(f"out: shape must be {shape_text(shape)}, got {shape_text(found_shape)}")
     if not contiguous or not writeable:

@@ -5,23 +5,28 @@ NumPy arrays are checked and bounded here; arrays that are on the device already
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpusense import _checks, arrays
 from gpusense.backends.base import Backend, Buffer
-from gpusense.frames import Cells, Mount, frame_scalars, place_poses, to_grid
+from gpusense.frames import Cells, Mount, frame_scalars, place_poses
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
 from gpusense.reference.heading import LIMIT
 from gpusense.reference.order import ALL_BINS, STRETCH
 from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
-from gpusense.region import Region
+from gpusense.region import Corners, Region, extent
 from gpusense.workspace import Workspace
 
 _INT = np.dtype(np.int32)
+_PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
+_SINGLE = _HUGE | {"POSES_FLOAT32"}
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
+# Poses whose bounds are found at once.
+_BOUNDED = 8192
 # Particle-beams from which the time that an order saves is more than what it takes, and as many particles.
 LEAST_ORDERED = (1 << 22, 1 << 12)
 
@@ -52,13 +57,13 @@ class Cloud:
         self.host: np.ndarray | None = None
         self.on_device = arrays.on_device(poses)
         if self.on_device:
-            self._buffer, self.count, self._single = arrays.adopt_poses(poses, backend, name)
+            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name)
             return
-        given = arrays.to_host(poses)
+        given = arrays.to_host(poses, name)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
             self.host = np.ascontiguousarray(given, np.float64)
             self._corners = self._bounds(0, len(given))
-            if not np.isfinite(self._corners).all():
+            if not all(map(math.isfinite, (*self._corners[0], *self._corners[3]))):
                 self.host = _checks.array(name, given, ("N", 3))
         else:
             self.host = np.ascontiguousarray(_checks.array(name, given, ("N", 3)))
@@ -68,52 +73,63 @@ class Cloud:
     def __len__(self) -> int:
         return self.count
 
-    def corners(self, begin: int, end: int) -> np.ndarray:
-        """(4, 3) corners of the box that holds some poses; the corners of no poses are at 0."""
+    def corners(self, begin: int, end: int) -> Corners:
+        """Four corners of the box that holds some poses; the corners of no poses are at 0."""
         return self._corners if end - begin == self.count else self._bounds(begin, end)
 
-    def _bounds(self, begin: int, end: int) -> np.ndarray:
+    def _bounds(self, begin: int, end: int) -> Corners:
         assert self.host is not None
         if begin == end:
-            return np.zeros((4, 3))
+            return ((0.0, 0.0, 0.0),) * 4
         low, high = _bounds(self.host[begin:end])
-        return np.array([low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high])
+        return low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high
 
-    def ensure(self, table: ReachableMap, begin: int, end: int) -> tuple[Buffer, Region, np.ndarray | None]:
+    def ensure(self, table: ReachableMap, begin: int, end: int) -> tuple[Buffer, Region, Corners | None]:
         """The map's table for some poses, its window, and the corners of these poses where they are known."""
         if self.host is None:
             return *table.ensure(None), None
         corners = self.corners(begin, end)
         return *table.ensure(corners), corners
 
+    def given(self, backend: Backend, space: Workspace, part: tuple[int, int]) -> Buffer:
+        """Poses part[0] to part[1] - 1 on the device, as they were given; None where the host is to place them."""
+        begin, count = part[0], part[1] - part[0]
+        if self.host is None:
+            return backend.part(self._buffer, 3 * begin, 3 * count)
+        return space.upload("poses", self.host[begin : part[1]]) if backend.info.float64 else None
+
+    def code(self) -> frozenset[str]:
+        """The flags of ``place_poses`` that these poses need."""
+        if self.host is None:
+            return _SINGLE if self._single else _HUGE
+        return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LIMIT else _PLAIN
+
+    def headings(self) -> frozenset[str]:
+        """The flag of headings that may be huge; nobody has looked at those of poses on the device."""
+        return self.code() & _HUGE
+
     def place(
         self,
         backend: Backend,
         space: Workspace,
+        given: Buffer,
         part: tuple[int, int],
         frame: tuple[Region, Cells, Mount],
         real: np.dtype,
         *,
         careful: bool,
     ) -> Placed:
-        """Poses part[0] to part[1] - 1 in the frame of a window."""
+        """Poses part[0] to part[1] - 1, which are ``given``, in the frame of a window."""
         (begin, end), (region, grid, mount) = part, frame
         count = end - begin
-        if not backend.info.float64:
+        if given is None:
             return self._place_on_host(space, part, frame, real, careful)
-        flags = {"FLOAT64"} if real == np.float64 else set()
-        flags |= {"CAREFUL"} if careful else set()
-        if self.host is None:
-            given, flags = self._buffer, flags | {"HUGE_HEADINGS"} | ({"POSES_FLOAT32"} if self._single else set())
-            given = backend.part(given, 3 * begin, 3 * count)
-        else:
-            given = space.upload("poses", self.host[begin:end])
-            flags |= {"HUGE_HEADINGS"} if np.abs(self._corners[:, 2]).max() > LIMIT else set()
+        flags = self.code() | ({"FLOAT64"} if real == np.float64 else set()) | ({"CAREFUL"} if careful else set())
         cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
         low = space.empty("pose_low", 4 * count if careful else 4, real)
         verdict = space.empty("verdict", 2, _INT, zero=True)
         window = (region.col, region.row, region.rows, region.cols)
-        backend.compile("place_poses", frozenset(flags))(
+        backend.compile("place_poses", flags)(
             (count,), given, cell, pose, low, verdict, *frame_scalars(grid, mount), *window, count
         )
         return Placed(cell, pose, low)
@@ -151,34 +167,31 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
         raise ValueError(f"{name}: must be finite, got a pose on the device that is not")
 
 
-def _bounds(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and largest of each column of (N, 3) numbers, NaN where there is one.
+def _bounds(poses: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Least and largest of each column of (N, 3) numbers, N > 0, NaN where there is one.
 
-    Columns of three are slow to reduce, so 64 rows at a time are taken for one.
+    Columns of three are slow to reduce: turned into rows, as many at a time as the nearest cache holds, they are not.
     """
-    whole = len(poses) // 64 * 64
-    parts = [poses[whole:]] if whole < len(poses) else []
-    if whole:
-        wide = poses[:whole].reshape(-1, 192)
-        parts += [np.minimum.reduce(wide).reshape(64, 3), np.maximum.reduce(wide).reshape(64, 3)]
-    few = np.concatenate(parts)
-    return few.min(axis=0), few.max(axis=0)
-
-
-def extent(corners: np.ndarray, grid: OccupancyGrid, mount: Mount) -> tuple[float, float, float, float]:
-    """Least and largest column and row, in cells, that a sensor of poses within these corners can have."""
-    x, y = to_grid(grid, corners[:, 0] - grid.origin[0], corners[:, 1] - grid.origin[1])
-    margin = float(np.hypot(mount[0], mount[1])) / grid.resolution + 1
-    return x.min() - margin, x.max() + margin, y.min() - margin, y.max() + margin
+    lows, highs = [], []
+    for begin in range(0, len(poses), _BOUNDED):
+        rows = np.ascontiguousarray(poses[begin : begin + _BOUNDED].T)
+        lows.append(np.minimum.reduce(rows, axis=1))
+        highs.append(np.maximum.reduce(rows, axis=1))
+    # Several blocks: NaN stays.
+    low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
+    high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
+    (x, y, turn), (far_x, far_y, far_turn) = low.tolist(), high.tolist()
+    return (x, y, turn), (far_x, far_y, far_turn)
 
 
 def all_within(
-    corners: np.ndarray | None, grid: OccupancyGrid, mount: Mount, region: Region, reach: float, ring: int = 0
+    corners: Corners | None, grid: OccupancyGrid, mount: Mount, region: Region, reach: float, ring: int = 0
 ) -> bool:
     """Whether everything within reach cells of the sensors surely lies in a window and a ring around it."""
     if corners is None:
         return False
-    left, right, low, high = extent(corners, grid, mount)
+    left, right, low, high = extent(grid, corners, mount)
+    reach += 1
     return bool(
         left - reach >= region.col - ring
         and right + reach <= region.col + region.cols + ring

@@ -6,7 +6,7 @@ from gpusense.backends.base import BackendInfo
 from gpusense.signatures import CASTER_FLAGS
 
 # A kernel has no such variant with these flags, some of them of its own, or without all of some set of those.
-_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
+_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
 _NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"}}
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),

@@ -86,3 +86,40 @@ def scene_omissions(
             )
         )
     return found
+
+
+def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None = None) -> list[Omission]:
+    """What the cloud of the last call makes unnecessary; nothing before there is one.
+
+    Args:
+        code: The flags of the last call.
+        least_ordered: Rays and particles from which a device puts the particles of a beam model in order; None for a
+            device or a model that never does.
+    """
+    found = []
+    if code and "HUGE_HEADINGS" not in code:
+        why = "no heading is beyond 2^20 rad"
+        found.append(Omission("reduction of huge headings", why, "192 bits of 2 / pi and 12 products per such heading"))
+    if "QUICK" in code:
+        found.append(
+            Omission(
+                "guard of each end point",
+                "cells are found by rounding, and again where one of 16 end points is near an edge",
+                "a branch per particle-beam",
+            )
+        )
+    if "INSIDE" in code:
+        found.append(
+            Omission(
+                "clamps to the table",
+                "no end point of the cloud leaves the table",
+                "four comparisons per particle-beam",
+            )
+        )
+    if code and least_ordered is not None and "ORDERED" not in code:
+        rays, particles = least_ordered
+        why = f"a launch has fewer than {rays} rays or {particles} particles"
+        if "PER_BEAM" in code:
+            why = "parts are wanted, particle by particle"
+        found.append(Omission("order of particles", why, "4 launches that sort by place and heading"))
+    return found

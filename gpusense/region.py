@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from gpusense.frames import Mount, to_grid
+from gpusense.frames import Mount
 from gpusense.grid import OccupancyGrid
 
+# Poses that enclose others.
+Corners = Sequence[tuple[float, float, float]]
 # Maps smaller than this are prepared faster than it takes to think about it.
 SMALLEST_CELLS = 1 << 20
 # Distances in cells are squared in 32 bits, so no window may be longer.
@@ -78,35 +82,53 @@ def whole(grid: OccupancyGrid) -> Region:
     return Region(0, 0, *grid.shape)
 
 
-def needed(grid: OccupancyGrid, poses: np.ndarray, mount: Mount, reach: float, slack: float = 0.0) -> Region:
+def extent(grid: OccupancyGrid, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
+    """Least and largest column and row, in cells, that a sensor of poses within these corners can have.
+
+    A call has four corners: numbers of Python's are faster than arrays of four.
+    """
+    from_x, from_y, yaw = grid.origin
+    size, margin = grid.resolution, math.hypot(mount[0], mount[1]) / grid.resolution
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    cols, rows = [], []
+    for corner in corners:
+        x, y = corner[0] - from_x, corner[1] - from_y
+        if yaw != 0.0:
+            x, y = cos * x + sin * y, cos * y - sin * x
+        cols.append(x / size)
+        rows.append(y / size)
+    return min(cols) - margin, max(cols) + margin, min(rows) - margin, max(rows) + margin
+
+
+def needed(grid: OccupancyGrid, corners: Corners, mount: Mount, reach: float, slack: float = 0.0) -> Region:
     """Smallest window that holds all cells within ``reach`` cells of any sensor, at least one cell.
 
     Args:
         grid: The map.
-        poses: (N, 3) float64 robot poses, N > 0.
+        corners: Poses [m, m, rad], at least one, between which all others lie.
         mount: The sensor's pose on the robot.
         reach: Longest distance in cells that matters, ring and rounding included.
         slack: Cells added on every side.
     """
-    x, y = to_grid(grid, poses[:, 0] - grid.origin[0], poses[:, 1] - grid.origin[1])
-    margin = reach + slack + np.hypot(mount[0], mount[1]) / grid.resolution + 3
+    left, right, low, high = extent(grid, corners, mount)
+    margin = reach + slack + 3
     rows, cols = grid.shape
-    low_col, high_col = (int(np.clip(v, 0, cols)) for v in (x.min() - margin, x.max() + margin))
-    low_row, high_row = (int(np.clip(v, 0, rows)) for v in (y.min() - margin, y.max() + margin))
+    low_col, high_col = (int(min(max(v, 0), cols)) for v in (left - margin, right + margin))
+    low_row, high_row = (int(min(max(v, 0), rows)) for v in (low - margin, high + margin))
     low_col, low_row = min(low_col, cols - 1), min(low_row, rows - 1)
     return Region(low_row, low_col, max(high_row - low_row, 1), max(high_col - low_col, 1))
 
 
-def choose(grid: OccupancyGrid, current: Region | None, poses: np.ndarray, mount: Mount, reach: float) -> Region:
-    """The window to prepare for a cloud of N > 0 poses: the current one where it suffices, else one with room."""
+def choose(grid: OccupancyGrid, current: Region | None, corners: Corners, mount: Mount, reach: float) -> Region:
+    """The window to prepare for a cloud within these corners: the current one where it suffices, else one with room."""
     everything = whole(grid)
     long = max(grid.shape) > LONGEST_SIDE
     if current == everything or (everything.cells < SMALLEST_CELLS and not long):
         return everything
-    least = needed(grid, poses, mount, reach)
+    least = needed(grid, corners, mount, reach)
     if current is not None and current.contains(least):
         return current
-    roomy = needed(grid, poses, mount, reach, SLACK * reach)
+    roomy = needed(grid, corners, mount, reach, SLACK * reach)
     if max(roomy.rows, roomy.cols) > LONGEST_SIDE:
         roomy = least
     if current is not None:

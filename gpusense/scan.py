@@ -5,6 +5,7 @@ Readings are classed first and thinned afterwards, so that ``beams=60`` means 60
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -106,6 +107,7 @@ def prepare_scan(
     specialize: bool,
     *,
     max_is_range: bool = False,
+    max_depends: bool = False,
     distinct: bool = False,
 ) -> PreparedScan:
     """Class, choose and group the readings of one scan.
@@ -118,9 +120,10 @@ def prepare_scan(
         beams: Which beams are used.
         specialize: False keeps readings without information, and casts equal bearings one by one.
         max_is_range: Evaluate finite max readings like ranges, at range_max.
+        max_depends: The probability of a max reading depends on the pose, so such readings are evaluated too.
         distinct: No two bearings are known to be the same.
     """
-    if specialize and distinct and beams is None and not max_is_range:
+    if specialize and distinct and beams is None and not (max_is_range or max_depends):
         return _plain_scan(ranges, scanner, vectors, z_max)
     kinds = classify(ranges, scanner)
     if max_is_range:
@@ -130,14 +133,13 @@ def prepare_scan(
     is_max = used & (kinds == Reading.MAX)
     hit = used & (kinds == Reading.HIT)
     informative = int(np.count_nonzero((kinds == Reading.HIT) | ((kinds == Reading.MAX) & (z_max > 0))))
-    values = np.where(hit, ranges, 0).astype(np.float64)
-    if specialize:
+    values = np.where(hit, ranges, np.nan).astype(np.float64)
+    values[is_max] = np.inf
+    if specialize and not max_depends:
         columns = np.flatnonzero(hit)
         constant = float(np.count_nonzero(is_max) * np.log(z_max)) if is_max.any() else 0.0
     else:
-        columns = np.arange(len(kinds))
-        values[~hit] = np.nan
-        values[is_max] = np.inf
+        columns = np.flatnonzero(hit | is_max) if specialize else np.arange(len(kinds))
         constant = 0.0
         is_max = np.zeros_like(is_max)
     rays, first, order = _group(vectors[columns], specialize and not distinct)
@@ -155,14 +157,25 @@ def prepare_scan(
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _limits(range_min: float, range_max: float, dtype: np.dtype) -> tuple[np.floating, np.floating]:
+    """The scanner's limits as readings of a type compare with them."""
+    with np.errstate(over="ignore"):
+        return dtype.type(range_min), dtype.type(range_max)
+
+
 def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float) -> PreparedScan:
     """``prepare_scan`` where all beams are used and none repeats another: what filters do at every step."""
-    with np.errstate(over="ignore"):
-        nearest, farthest = ranges.dtype.type(scanner.range_min), ranges.dtype.type(scanner.range_max)
-    far = ranges >= farthest
-    near_enough = (ranges >= nearest) & (ranges > 0) if scanner.range_min > 0 else ranges >= 0
-    columns, count = np.flatnonzero(near_enough & ~far), int(np.count_nonzero(far))
+    nearest, farthest = _limits(scanner.range_min, scanner.range_max, ranges.dtype)
+    hit = ranges >= nearest
+    if nearest == 0 < scanner.range_min:
+        hit &= ranges > 0
+    hit &= ranges < farthest
+    columns, count = hit.nonzero()[0], 0
+    far = columns[:0]
     if len(columns) < len(ranges):
+        far = (ranges >= farthest).nonzero()[0]
+        count = len(far)
         ranges, vectors = ranges[columns], vectors[columns]
     return PreparedScan(
         columns=columns,
@@ -171,7 +184,7 @@ def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max
         rays=vectors,
         first=np.arange(len(columns) + 1, dtype=np.int32),
         constant=float(count * np.log(z_max)) if count and z_max > 0 else 0.0,
-        max_columns=np.flatnonzero(far) if z_max > 0 else columns[:0],
+        max_columns=far if z_max > 0 else columns[:0],
         missing=scanner.count - len(columns) - count,
         ignored_max=0 if z_max > 0 else count,
         thinned=0,

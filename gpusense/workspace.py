@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable, Sequence
+from typing import cast
+
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Backend, Buffer, Gathering
+
+# Calls whose launches are kept.
+_MOST_KEPT = 64
+# Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
+_ALIGNED = 64
 
 
 class Workspace:
@@ -15,12 +23,62 @@ class Workspace:
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that copies under way read or write.
         self._busy: list[np.ndarray] = []
+        self._gathering = cast(Gathering, backend) if hasattr(backend, "gather") else None
+        # Launches of earlier calls by all that they depend on, and that of which some have begun.
+        self._kept: dict[Hashable, object] = {}
+        self._begun: tuple[Hashable, object] | None = None
+        self._parts: dict[Hashable, list[Buffer]] = {}
+
+    def __enter__(self) -> Workspace:
+        """Begin a call: where that is faster, the device may do all that it starts in one go."""
+        if self._gathering is not None:
+            self._gathering.gather()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._gathering is not None:
+            self._gathering.scatter()
+
+    def start(self) -> None:
+        """Let the device begin with what the call has started so far."""
+        if self._gathering is not None:
+            self._gathering.start()
+
+    def again(self, buffers: Iterable[Buffer], *key: Hashable) -> bool:
+        """Repeat launches of an earlier call, if it has been seen; otherwise they follow, and ``keep``.
+
+        Args:
+            buffers: Those of the launches that are not of this workspace and may be others in another call.
+            key: All else that differs between calls: sizes, numbers, flags.
+        """
+        self._begun = None
+        gathering = self._gathering
+        if gathering is None or (mark := gathering.mark()) is None:
+            return False
+        key += tuple([gathering.address(buffer) for buffer in buffers])
+        kept = self._kept.get(key)
+        if kept is None:
+            self._begun = (key, mark)
+            return False
+        gathering.repeat(kept)
+        return True
+
+    def keep(self) -> None:
+        """Keep the launches since ``again``."""
+        if self._begun is not None and self._gathering is not None:
+            key, mark = self._begun
+            kept = self._gathering.kept(mark)
+            if kept is not None:
+                if len(self._kept) >= _MOST_KEPT:
+                    del self._kept[next(iter(self._kept))]
+                self._kept[key] = kept
+        self._begun = None
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """A buffer of at least ``count`` numbers; what it held is lost. A new one is cleared where asked."""
-        dtype = np.dtype(dtype)
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
+            self._forget()
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
@@ -34,6 +92,28 @@ class Workspace:
         self._busy.append(array)
         return self._backend.upload(array, self.empty(name, array.size, array.dtype), wait=False)
 
+    def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
+        """Upload arrays of one dtype, none of them empty: as one where the device does in one go what a call starts."""
+        if self._gathering is None or self._gathering.mark() is None:
+            return [self.upload(f"{name} {i}", array) for i, array in enumerate(arrays)]
+        sizes = tuple([array.size for array in arrays])
+        firsts, total = [], 0
+        for size in sizes:
+            firsts.append(total)
+            total += -(-size // _ALIGNED) * _ALIGNED
+        packed = np.empty(total, arrays[0].dtype)
+        for first, array in zip(firsts, arrays, strict=True):
+            packed[first : first + array.size] = array.reshape(-1)
+        buffer = self.upload(name, packed)
+        key = (name, packed.dtype, sizes)
+        parts = self._parts.get(key)
+        if parts is None:
+            if len(self._parts) >= _MOST_KEPT:
+                self._parts.clear()
+            parts = [self._backend.part(buffer, first, size) for first, size in zip(firsts, sizes, strict=True)]
+            self._parts[key] = parts
+        return parts
+
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""
         self._busy.append(out)
@@ -44,7 +124,13 @@ class Workspace:
         self._backend.synchronize()
         self._busy.clear()
 
+    def _forget(self) -> None:
+        """What was kept of buffers is no longer right."""
+        self._kept.clear()
+        self._parts.clear()
+
     def release(self, keep: str = "") -> None:
         """Wait, and give the memory back, but for that of one name; the next call allocates anew."""
         self.wait()
+        self._forget()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}

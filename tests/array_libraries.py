@@ -41,6 +41,21 @@ class OldArray(Array):
         return self.held
 
 
+class Recorded(Array):
+    """One whose gradients are recorded, as PyTorch's are: it is not exported, and does not become NumPy's."""
+
+    requires_grad = True
+
+    def __dlpack__(self, **options: Any) -> Any:
+        raise BufferError("Can't export tensors that require gradient, use tensor.detach()")
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad. Use tensor.detach().numpy() instead.")
+
+    def detach(self) -> Array:
+        return Array(self.held, self.device)
+
+
 def from_dlpack(held: Any) -> Array:
     return Array(held)
 
@@ -52,3 +67,4 @@ def installed(monkeypatch: Any) -> None:
     monkeypatch.setitem(sys.modules, "fakelib", module)
     monkeypatch.setattr(Array, "__module__", "fakelib")
     monkeypatch.setattr(OldArray, "__module__", "fakelib")
+    monkeypatch.setattr(Recorded, "__module__", "fakelib")

@@ -97,7 +97,7 @@ MODEL_CASES = [
         "beam-parameters-dict",
         beam(parameters={"z_hit": 1}),
         TypeError,
-        "parameters: must be BeamParameters, got {'z_hit': 1}",
+        "parameters: must be BeamParameters or a DiscreteBeamModel, got {'z_hit': 1}",
     ),
     (
         "field-parameters-of-the-beam-model",

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
+from map_files import yaml_text
 
 from gpusense.backends import Backend, get_backend
 
@@ -99,3 +100,18 @@ def data_dir() -> Path:
 def no_data(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without recorded data, whatever the environment names."""
     monkeypatch.delenv("GPUSENSE_DATA", raising=False)
+
+
+@pytest.fixture
+def place(tmp_path):
+    """Write an image (bytes, or something to save) and its YAML; give the YAML's path."""
+
+    def write(content, image="map.pgm", save=None, **changes):
+        if isinstance(content, bytes):
+            (tmp_path / image).write_bytes(content)
+        else:
+            content.save(tmp_path / image, **(save or {}))
+        (tmp_path / "map.yaml").write_text(yaml_text(image, **changes))
+        return tmp_path / "map.yaml"
+
+    return write

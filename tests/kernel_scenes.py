@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,12 @@ def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tup
 
 # The exact caster's bins, slack and tolerance.
 EXACT = (0, 0.0, 0.0)
+# Kinds of terms, rays of a cone and the least cosine of an incidence, where no incidence matters; and what is not read.
+LASER = (1, 1, 0.0)
+
+
+def nothing(real: type, numbers: int = 1) -> np.ndarray:
+    return np.zeros((1, numbers) if numbers > 1 else 1, real)
 
 
 def scene_flags(real: type, *names: str) -> frozenset[str]:
@@ -108,12 +115,19 @@ def sector_flags(sectors: int) -> frozenset[str]:
 
 def planes_of(occupied: np.ndarray, sectors: int = 1, kind: str = "cpu") -> np.ndarray:
     """(4, sectors, rows + 2, cols + 2) rectangles by the reference's kernels for processors or for GPUs."""
-    rows, cols = occupied.shape
+    return _planes(occupied.tobytes(), occupied.shape, sectors, kind)
+
+
+@functools.lru_cache(maxsize=32)
+def _planes(cells: bytes, shape: tuple[int, int], sectors: int, kind: str) -> np.ndarray:
     # A backend of its own: that of the tests may pretend to be a GPU.
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind=kind)
-    planes = np.empty((4, sectors, rows + 2, cols + 2), np.uint16)
-    return backend.download(empty_rectangles(backend, occupied, sectors), planes)
+    planes = np.empty((4, sectors, shape[0] + 2, shape[1] + 2), np.uint16)
+    occupied = np.frombuffer(cells, bool).reshape(shape)
+    backend.download(empty_rectangles(backend, occupied, sectors), planes)
+    planes.flags.writeable = False
+    return planes
 
 
 def ranges_on_both(

@@ -7,7 +7,7 @@ import types
 
 import numpy as np
 import pytest
-from array_libraries import CUDA, Array, OldArray, installed
+from array_libraries import CUDA, Array, OldArray, Recorded, installed
 
 import gpusense as gs
 from gpusense import arrays
@@ -80,6 +80,24 @@ def test_float32_poses_are_the_numbers_they_are(method, backend):
 def test_readings_of_another_library(backend):
     call, _ = call_of("log_likelihood", backend, Array(SCAN))
     assert differing(call(POSES), call_of("log_likelihood", backend)[0](POSES)) == 0
+
+
+def test_arrays_whose_gradients_are_recorded_are_refused_with_the_remedy():
+    model = gs.BeamModel(GRID, SCANNER, backend="numpy")
+    poses, scan, out = Recorded(POSES), Recorded(SCAN), Recorded(np.empty(COUNT, np.float32))
+    several = Recorded(np.stack([POSES, POSES]))
+    for name, call in (
+        ("poses", lambda: model.log_likelihood(poses, SCAN)),
+        ("poses", lambda: model.expected_ranges(poses)),
+        ("poses", lambda: model.log_likelihood(several, [SCAN, SCAN])),
+        ("ranges", lambda: model.log_likelihood(POSES, scan)),
+        ("out", lambda: model.log_likelihood(POSES, SCAN, out=out)),
+    ):
+        message = f"{name}: must not require gradients, .*, got a fakelib.Recorded that does: pass {name}.detach()"
+        with pytest.raises(TypeError, match=re.escape(message).replace(re.escape(".*"), ".*")):
+            call()
+    found = model.log_likelihood(poses.detach(), scan.detach())
+    assert differing(found.held, model.log_likelihood(POSES, SCAN)) == 0
 
 
 def test_a_batch_of_another_library(backend):

@@ -14,6 +14,7 @@ import pytest
 import gpusense as gs
 from gpusense import backends
 from gpusense.backends import BackendInfo, cache, get_backend
+from gpusense.backends._pocl import is_pocl
 from gpusense.backends.cache import ProgramCache
 
 
@@ -153,11 +154,13 @@ def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
 
 
 _COUNT = """
+import sys
 import numpy as np, gpusense as gs
 from gpusense.backends import _opencl
-built = []
-assemble = _opencl.assemble
 import pyopencl as cl
+if "kept by us" in sys.argv:
+    _opencl._program_cache = lambda info, device: _opencl.ProgramCache(info)
+built = []
 build = cl.Program.build
 def counted(self, *a, **k):
     built.append(self._prg is None)
@@ -169,19 +172,37 @@ print(caster.cast([[2.5, 1.5, 1.5707963267948966]], [0.0])[0, 0], sum(built), le
 """
 
 
+def counted_builds(*arguments):
+    command = [sys.executable, "-c", _COUNT, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+
 def test_a_second_process_compiles_nothing(folder, needs):
+    """Of drivers whose programs we keep; PoCL stands for them."""
     needs("opencl")
-    runs = []
-    for _ in range(2):
-        result = subprocess.run([sys.executable, "-c", _COUNT], capture_output=True, text=True, check=True)
-        runs.append(result.stdout.split())
+    runs = [counted_builds("kept by us") for _ in range(2)]
     assert runs[0] == ["3.5", "3", "3"]
     assert runs[1] == ["3.5", "0", "3"]
     for entry in folder.glob("*.bin"):
         data = entry.read_bytes()
         entry.write_bytes(data[:60] + bytes(len(data) - 60))
-    result = subprocess.run([sys.executable, "-c", _COUNT], capture_output=True, text=True, check=True)
-    assert result.stdout.split() == ["3.5", "3", "3"]
+    assert counted_builds("kept by us") == ["3.5", "3", "3"]
+
+
+def test_pocl_keeps_its_programs_itself(folder, tmp_path, monkeypatch, needs):
+    """A second process finds all that it compiles in PoCL's cache, and nothing is kept twice."""
+    needs("opencl")
+    if not is_pocl(get_backend("opencl")._device):
+        pytest.skip("the driver is not PoCL")
+    monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "pocl"))
+    kept = []
+    for _ in range(2):
+        assert counted_builds() == ["3.5", "3", "3"]
+        files = [path for path in (tmp_path / "pocl").rglob("*") if path.suffix in (".bc", ".so")]
+        kept.append({path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in files})
+    assert len([path for path in kept[0] if path.suffix == ".bc"]) == 3
+    assert kept[0] == kept[1]
+    assert not folder.exists()
 
 
 def test_a_buffer_beyond_the_device_is_a_memory_error(backend, monkeypatch):

@@ -35,6 +35,9 @@ TRACES = [
     ("score_beams", "SHARED_RAYS", ("RAND", "LINEAR"), r"\bfirst\[", r"address\(var_first\b"),
     ("score_beams", "ALL_READINGS", ("RAND", "LINEAR"), r"\bisnan\(", r"\bwp::isnan\("),
     ("score_beams", "PER_BEAM", ("RAND", "LINEAR"), r"\bparts\[\(long\)n \* readings", r"array_store\(var_parts\b"),
+    ("score_beams", "ECHO", ("RAND", "LINEAR"), r"\bnearest_echo\(map_table", r"nearest_echo_\d+\("),
+    ("score_beams", "INCIDENCE", ("RAND", "LINEAR", "ECHO"), r"\bincidence_terms\(", r"incidence_terms_\d+\("),
+    ("beam_tiles", "ECHO", ("RAND", "LINEAR"), r"\bnearest_echo\(map_table", r"nearest_echo_\d+\("),
     ("place_poses", "CAREFUL", (), r"\bpose_low\[", r"array_store\(var_pose_low\b"),
     ("place_poses", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32>"),
     ("place_poses", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
@@ -64,6 +67,7 @@ TRACES = [
     ("score_field", "CAREFUL", ("LOG_TABLE",), r"\bcareful_offset\(", r"careful_offset_\d+\("),
     ("score_field", "BILINEAR", ("LINEAR",), r"\bbilinear\(", r"bilinear_\d+\("),
     ("score_field", "ALL_READINGS", ("LOG_TABLE",), r"\bisnan\(", r"\bwp::isnan\("),
+    ("e_step", "INFORMATION", ("HIT", "SHORT", "RAND"), r"\bsums\[39\]", r"\bvec_t<40\b"),
     ("score_field", "PER_BEAM", ("LOG_TABLE",), r"\bparts\[\(long\)n \* readings", r"array_store\(var_parts\b"),
 ]
 traces = pytest.mark.parametrize(

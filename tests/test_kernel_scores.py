@@ -9,12 +9,13 @@ import pytest
 from kernel_scenes import (
     EXACT,
     GRIDS,
+    LASER,
     LIMIT,
-    PRECISIONS,
     RESOLUTION,
     adversarial_poses,
     assert_near,
     directions,
+    nothing,
     on_both,
     planes_of,
     ranges_on_both,
@@ -78,9 +79,14 @@ def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
     return reading
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("names", [(), ("ALL_READINGS", "ORIGINS_OUTSIDE", "SHARED_RAYS")])
-@pytest.mark.parametrize("name", list(MIXTURES))
+# Each set of flags is compiled. The lines of the components, of the precision and of the rest of the kernel are apart,
+# so each mixture has a plain scene in float32 and a full one in float64, and two mixtures have all four.
+FULL = ("ALL_READINGS", "ORIGINS_OUTSIDE", "SHARED_RAYS")
+BEAMS = [*((name, *case) for name in MIXTURES for case in (((), np.float32), (FULL, np.float64)))]
+BEAMS += [(name, *case) for name in ("book", "hit and short") for case in (((), np.float64), (FULL, np.float32))]
+
+
+@pytest.mark.parametrize(("name", "names", "real"), BEAMS)
 def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     occupied = GRIDS["rooms"]
     flags, terms = mixture(name, real, z_max=0.05)
@@ -98,9 +104,9 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     count, readings, fixed, temperature = len(pose), len(reading), -3.25, 0.5
     parts = np.full((count, readings), np.nan, real)
     found = run(
-        device, "score_beams", flags, (count,), planes_of(occupied), cell, pose, ray, first, reading, terms,
-        np.zeros(1, real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings, *EXACT, 0, 0.0,
-        LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
+        device, "score_beams", flags, (count,), planes_of(occupied), nothing(real, 2), cell, pose, ray, first, reading,
+        terms, nothing(real), nothing(real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings,
+        *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
     )  # fmt: skip
 
     # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
@@ -120,9 +126,9 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     cell, pose = adversarial_poses(occupied, real, outside=False)
     count, none = len(pose), np.zeros(0, real)
     found = run(
-        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), cell, pose, np.zeros((0, 2), real),
-        np.zeros(1, np.int32), none, terms, none, np.empty(count, real), none, *occupied.shape, count, 0, 0, *EXACT,
-        0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
+        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), nothing(real, 2), cell, pose,
+        np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, np.empty(count, real), none,
+        *occupied.shape, count, 0, 0, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
     )  # fmt: skip
     assert (found["log_p"] == -1.5).all()
 
@@ -195,9 +201,14 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
     )
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("names", [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")])
-@pytest.mark.parametrize("name", list(FIELDS))
+# As models have them: float32 is careful, float64 needs no second look.
+FIELD_SCENES = [
+    *((name, names, np.float32) for name in FIELDS for names in (("CAREFUL",), ("ALL_READINGS", "CAREFUL"))),
+    *((name, names, np.float64) for name in FIELDS for names in ((), ("ALL_READINGS",))),
+]
+
+
+@pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     flags = scene_flags(real, "PER_BEAM", *FIELDS[name], *names)
     scene = field_scene(name, real, all_readings="ALL_READINGS" in names)

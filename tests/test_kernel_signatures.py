@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import re
@@ -17,13 +18,18 @@ from gpusense.signatures import KERNELS, Argument
 each_kernel = pytest.mark.parametrize("kernel", list(KERNELS))
 
 
-def opencl_declarations() -> dict[str, tuple[str, str]]:
-    """Parameters and body of every kernel in the OpenCL files, by name."""
-    found = {}
-    for file in sorted({row.file for row in KERNELS.values()}):
+# Vector types are OpenCL's own: Warp's compiler is left to make vectors of scalar code.
+LANE_FILES = {"lanes", "lane_math", "field_lanes", "landmark_lanes"}
+
+
+@functools.cache
+def opencl_declarations() -> dict[str, list[tuple[str, str]]]:
+    """Parameters and body of every kernel in the OpenCL files, by name; some have a second body for vectors."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for file in sorted({row.file for row in KERNELS.values()} | LANE_FILES):
         text = opencl_source(file)
         for match in re.finditer(r"kernel void (\w+)\((.*?)\) \{(.*?)^\}", text, re.DOTALL | re.MULTILINE):
-            found[match.group(1)] = (match.group(2), match.group(3))
+            found.setdefault(match.group(1), []).append((match.group(2), match.group(3)))
     return found
 
 
@@ -47,12 +53,17 @@ def test_every_opencl_kernel_has_a_row_and_every_row_a_kernel() -> None:
 
 @each_kernel
 def test_opencl_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
-    parameters, body = opencl_declarations()[kernel]
-    assert [opencl_argument(one) for one in parameters.split(",")] == [
-        row_argument(argument) for argument in KERNELS[kernel].arguments
-    ]
-    axes = {int(axis) for axis in re.findall(r"get_global_id\((\d)\)", body)}
-    assert axes == set(range(len(KERNELS[kernel].launch)))
+    for parameters, body in opencl_declarations()[kernel]:
+        assert [opencl_argument(one) for one in parameters.split(",")] == [
+            row_argument(argument) for argument in KERNELS[kernel].arguments
+        ]
+        axes = {int(axis) for axis in re.findall(r"get_global_id\((\d)\)", body)}
+        assert axes == set(range(len(KERNELS[kernel].launch)))
+
+
+def test_four_kernels_have_a_second_body_for_vectors() -> None:
+    twice = {name for name, bodies in opencl_declarations().items() if len(bodies) > 1}
+    assert twice == {"cast_ranges", "score_beams", "score_features", "score_field"}
 
 
 @each_kernel
@@ -88,6 +99,5 @@ def test_warp_kernels_have_the_arguments_of_their_row(
 
 
 def test_both_languages_have_the_same_files() -> None:
-    # Vector types are OpenCL's own: Warp's compiler is left to make vectors of scalar code.
-    names = {path.stem for path in (kernel_root() / "opencl").glob("*.cl")} - {"lanes", "lane_math", "landmark_lanes"}
+    names = {path.stem for path in (kernel_root() / "opencl").glob("*.cl")} - LANE_FILES
     assert {path.stem for path in (kernel_root() / "warp").glob("*.py")} == names | {"__init__", "prelude"}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -246,6 +248,22 @@ def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Region]:
     return windows
 
 
+@functools.cache
+def made_anew(
+    shape: tuple[int, int], share: float, sectors: int, kind: str
+) -> list[tuple[np.ndarray, Region | None, bytes]]:
+    """A map and its edits one after the other: the map, what has changed, and the compressed rectangles made anew."""
+    rng = np.random.default_rng(5)
+    occupied = rng.random(shape) < share
+    found: list[tuple[np.ndarray, Region | None, bytes]] = []
+    for number, changed in enumerate([None, *edits(rng, shape)], -1):
+        if changed is not None:
+            part = changed.cut(occupied)
+            part[...] = ~part if changed.cells == 1 else rng.random(part.shape) < [0, 0.02, 1][number % 3]
+        found.append((occupied.copy(), changed, zlib.compress(planes_of(occupied, sectors, kind).tobytes(), 1)))
+    return found
+
+
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize(
     ("shape", "share"), [((610, 590), 0.0), ((610, 590), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)]
@@ -253,16 +271,14 @@ def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Region]:
 def test_mended_rectangles_are_those_made_anew(
     shape: tuple[int, int], share: float, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
-    device, rng = as_kind(kind), np.random.default_rng(5)
-    occupied, sectors = rng.random(shape) < share, 2
-    rectangles = empty_rectangles(device, occupied, sectors)
-    planes = np.empty((4, sectors, shape[0] + 2, shape[1] + 2), np.uint16)
-    for number, changed in enumerate(edits(rng, shape)):
-        part = changed.cut(occupied)
-        part[...] = ~part if changed.cells == 1 else rng.random(part.shape) < [0, 0.02, 1][number % 3]
-        assert empty_rectangles(device, occupied, sectors, rectangles, changed) is rectangles
+    device, sectors = as_kind(kind), 2
+    rectangles, planes = None, np.empty((4, sectors, shape[0] + 2, shape[1] + 2), np.uint16)
+    for occupied, changed, anew in made_anew(shape, share, sectors, kind):
+        mended = empty_rectangles(device, occupied, sectors, *(() if changed is None else (rectangles, changed)))
+        assert changed is None or mended is rectangles
+        rectangles = mended
         device.download(rectangles, planes)
-        np.testing.assert_array_equal(planes, planes_of(occupied, sectors, kind))
+        np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
 
 
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])

@@ -10,6 +10,7 @@ import pytest
 from kernel_scenes import (
     EXACT,
     GRIDS,
+    LASER,
     LIMIT,
     PRECISIONS,
     RESOLUTION,
@@ -17,13 +18,14 @@ from kernel_scenes import (
     adversarial_poses,
     assert_near,
     directions,
+    nothing,
     on_both,
     planes_of,
     run,
     scene_flags,
     sector_flags,
 )
-from test_kernel_scores import FIELDS, MIXTURES, field_scene, mixture, scan
+from test_kernel_scores import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mixture, scan
 
 from gpusense.backends import Backend, get_backend
 from gpusense.models.field import _GUARD
@@ -147,9 +149,9 @@ def beam_tiles(
     reading = scan(np.linspace(0, RANGE, first[-1]), real, all_readings="ALL_READINGS" in names)
     readings, order = len(reading), an_order(count)
     expected, found = on_both(
-        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), cell, pose, order, ray, first, reading,
-        terms, np.zeros(1, real), room_for(count, readings, way, real), *OCCUPIED.shape, count, rays, readings, *EXACT,
-        0, 0.0, LIMIT, RESOLUTION, RANGE, *strides(count, readings, way), spread,
+        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
+        ray, first, reading, terms, nothing(real), nothing(real), room_for(count, readings, way, real), *OCCUPIED.shape,
+        count, rays, readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE, *strides(count, readings, way), spread,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -164,8 +166,11 @@ def test_tiles_of_beams(way: str, names: tuple[str, ...], device: Backend) -> No
         assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, np.float32))
 
 
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize("names", [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")])
+# Each set of flags is compiled: as in test_kernel_scores, each mixture once plain in float32 and once full in float64.
+TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
+
+
+@pytest.mark.parametrize(("names", "real"), [*zip(TILED, PRECISIONS, strict=True)])
 @pytest.mark.parametrize("name", ["book", "hit", "short", "hardly any rand"])
 def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     assert name in MIXTURES
@@ -205,9 +210,7 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 
 # ---- the likelihood field
 
-CAREFUL = [(), ("CAREFUL",), ("ALL_READINGS", "CAREFUL")]
-# float64 needs no second look.
-BLOCKED = [*itertools.product(FIELDS, CAREFUL, PRECISIONS), ("log table", ("CAREFUL", "QUICK"), np.float32)]
+BLOCKED = [*FIELD_SCENES, ("log table", ("CAREFUL", "QUICK"), np.float32)]
 
 
 def guards_of(point: np.ndarray) -> np.ndarray:

@@ -118,10 +118,11 @@ for method, outside in itertools.product((*CASTERS, March(0.5, "centre"), Lookup
     wrong += np.count_nonzero(casts[0] != casts[1])
 worst = 0.0
 field = gs.LikelihoodFieldParameters
-for parameters, precision, specialize in itertools.product(
+# What is accessed does not depend on the precision, so each kind of scene has one of its own.
+for parameters, (precision, specialize) in itertools.product(
     (gs.BeamParameters(), gs.BeamParameters(0.8, 0.1, 0.1, 0.0), gs.BeamParameters(1.0, 0.0, 0.0, 0.0),
      field(), field(0.9, 0.1, 0.0), field(interpolation="bilinear"), field(0.9, 0.1, 0.0, interpolation="bilinear")),
-    ("float32", "float64"), (True, False),
+    (("float32", True), ("float64", False)),
 ):
     kind = gs.BeamModel if isinstance(parameters, gs.BeamParameters) else gs.LikelihoodFieldModel
     both = [kind(grid, scanner, parameters, backend=b, precision=precision, specialize=specialize)

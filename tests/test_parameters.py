@@ -81,7 +81,7 @@ def test_parameters_for_each_angle_of_incidence():
         ((0, 1), TWO.parameters[:1], ValueError, "edges: must rise from 0 to pi / 2, got (0, 1)"),
         ((0, 1, 0.5, np.pi / 2), TWO.parameters, ValueError, "edges: must rise from 0 to pi / 2, got"),
         ((0.1, np.pi / 2), TWO.parameters[:1], ValueError, "edges: must rise from 0 to pi / 2, got"),
-        ((0, np.nan, np.pi / 2), TWO.parameters, ValueError, "edges: must be finite"),
+        ((0, np.nan, np.pi / 2), TWO.parameters, ValueError, "edges: every value must be finite"),
         (TWO.edges, TWO.parameters[:1], ValueError, "parameters: must be one for each of 2 bins, got 1"),
         (TWO.edges, (BeamParameters(), 3), TypeError, "parameters: must be BeamParameters, got 3"),
     ],

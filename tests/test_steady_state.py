@@ -78,7 +78,13 @@ class Watch:
                     self.allocated.append(size)
                     super().__init__(context, flags, size, **options)
 
+            class CountedShared(_opencl._Shared):
+                def __init__(own, context, size, settle):
+                    self.allocated.append(size)
+                    super().__init__(context, size, settle)
+
             monkeypatch.setattr(_opencl, "_Buffer", Counted)
+            monkeypatch.setattr(_opencl, "_Shared", CountedShared)
         if device.info.backend == "warp":
             import warp as wp
 

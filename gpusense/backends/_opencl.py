@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import warnings
-import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
 from gpusense.backends import _pocl
-from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
+from gpusense.backends.base import BackendInfo, Buffer, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel, lanes_of
 from gpusense.sources import assemble, relevant, uses_double, with_places
@@ -23,6 +24,8 @@ _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_H
 # One driver's own clearing hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
+# Bytes: a cache line, and more than any type of a kernel asks for.
+_ALIGNMENT = 128
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
@@ -63,17 +66,58 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
 
 def _lanes(device: cl.Device) -> int:
     """PoCL compiles loops in kernels as they are written; other drivers make vectors of neighbouring work-items."""
-    if "Portable Computing Language" not in device.platform.name or not device.type & cl.device_type.CPU:
+    if not _pocl.is_pocl(device) or not device.type & cl.device_type.CPU:
         return 1
     return 16 if device.native_vector_width_float >= 16 else 8
 
 
+def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
+    """Where programs are kept; None for PoCL, which keeps them itself.
+
+    Asked for a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size. That
+    takes three times as long as all it does unasked.
+    """
+    return None if _pocl.is_pocl(device) else ProgramCache(info)
+
+
+def _shares_memory(device: cl.Device) -> bool:
+    """Whether host and device may look at the same memory between commands, and neither is far from it: a processor."""
+    try:
+        if not device.type & cl.device_type.CPU or not device.host_unified_memory:
+            return False
+        return bool(device.svm_capabilities & cl.device_svm_capabilities.FINE_GRAIN_BUFFER)
+    except cl.Error:
+        return False
+
+
 class _Buffer(cl.Buffer):
-    """A buffer that can be referred to without being kept alive."""
+    """A buffer in the device's memory."""
+
+
+class _Shared(cl.SVMAllocation):
+    """Memory that host and device share."""
+
+    def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
+        flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
+        super().__init__(context, size, _ALIGNMENT, flags)
+        # By address, since a view of this object that it keeps would be a cycle.
+        self.bytes = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
+        self._settle = settle
+
+    def __del__(self) -> None:
+        # Unlike a buffer, the driver does not keep it for what was started. To free it through the queue, pyopencl's
+        # other way, ended in a corrupted heap with PoCL 3.
+        # What could not be made has nothing to wait for.
+        if (settle := getattr(self, "_settle", None)) is not None:
+            settle()
 
 
 class OpenCLBackend(ProcessBound):
-    """One OpenCL device: a context, an in-order queue and the programs compiled for it."""
+    """One OpenCL device: a context, an in-order queue and the programs compiled for it.
+
+    A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, copies are
+    NumPy's instead: they wait for all commands before them, and are done when they return.
+    """
 
     def __init__(self, info: BackendInfo, device: cl.Device) -> None:
         super().__init__()
@@ -82,23 +126,32 @@ class OpenCLBackend(ProcessBound):
         _pocl.mend(device)
         self._context = cl.Context([device])
         self._queue = cl.CommandQueue(self._context)
+        self._shared = _shares_memory(device)
+        # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
+        self._count = threading.RLock()
+        self._queued = self._ended = 0
         self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
-        self._cache = ProgramCache(info)
+        self._cache = _program_cache(info, device)
         # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
 
-    def upload(self, array: np.ndarray, out: cl.Buffer | None = None, *, wait: bool = True) -> cl.Buffer:
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
         self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
+            array = np.ascontiguousarray(array)
+            if isinstance(buffer, _Shared):
+                self._settle()
+                buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
+                return buffer
             with _driver_errors():
-                cl.enqueue_copy(self._queue, buffer, np.ascontiguousarray(array), is_blocking=wait)
+                cl.enqueue_copy(self._queue, buffer, array, is_blocking=wait)
         return buffer
 
-    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> cl.Buffer:
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """See Backend.empty."""
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         if size > self.info.max_buffer:
@@ -106,6 +159,11 @@ class OpenCLBackend(ProcessBound):
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
             )
         with _driver_errors():
+            if self._shared:
+                shared = _Shared(self._context, size, self._settle)
+                if zero:
+                    shared.bytes[:] = 0
+                return shared
             buffer = _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
             if zero:
                 self._clear(buffer, size)
@@ -120,14 +178,18 @@ class OpenCLBackend(ProcessBound):
             kernel.set_args(buffer, np.uint64(first))
             cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
 
-    def download(self, buffer: cl.Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
+            if isinstance(buffer, _Shared):
+                self._settle()
+                out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
+                return out
             with _driver_errors():
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
 
-    def part(self, buffer: cl.Buffer, first: int, count: int) -> cl.Buffer:
+    def part(self, buffer: Buffer, first: int, count: int) -> Buffer:
         """See Backend.part."""
         raise TypeError("buffer: parts of OpenCL buffers are not used")
 
@@ -141,8 +203,23 @@ class OpenCLBackend(ProcessBound):
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""
+        with self._count:
+            queued = self._queued
         with _driver_errors():
             self._queue.finish()
+        with self._count:
+            self._ended = max(self._ended, queued)
+
+    def _settle(self) -> None:
+        """Wait until no command of this thread can be under way."""
+        if self._ended != self._queued:
+            self.synchronize()
+
+    def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
+        """Queue a launch of a kernel whose arguments are set."""
+        cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+        with self._count:
+            self._queued += 1
 
     def _launcher(self, kernel: str, flags: frozenset[str]) -> _Launch:
         row = KERNELS[kernel]
@@ -150,7 +227,7 @@ class OpenCLBackend(ProcessBound):
         program = self._programs.get((row.file, flags))
         if program is None:
             program = self._programs[row.file, flags] = self._build(row.file, flags)
-        return _Launch(self._queue, cl.Kernel(program, kernel), row, flags)
+        return _Launch(self, cl.Kernel(program, kernel), row, flags)
 
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:
@@ -158,20 +235,28 @@ class OpenCLBackend(ProcessBound):
         if not self.info.float64 and uses_double(file, flags):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
-        binary = self._cache.load(source, self.options)
-        if binary is not None:
-            try:
-                return self._built(cl.Program(self._context, [self._device], [binary]))
-            except cl.Error:
-                self._cache.discard(source, self.options)
+        if (program := self._kept(source)) is not None:
+            return program
         try:
             program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
             log = with_places(str(error), source)
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
-        binaries: Any = program.get_info(cl.program_info.BINARIES)
-        self._cache.store(source, self.options, binaries[0])
+        if self._cache is not None:
+            binaries: Any = program.get_info(cl.program_info.BINARIES)
+            self._cache.store(source, self.options, binaries[0])
         return program
+
+    def _kept(self, source: str) -> cl.Program | None:
+        """The program as an earlier run compiled it, where there is one that the driver still takes."""
+        binary = None if self._cache is None else self._cache.load(source, self.options)
+        if self._cache is None or binary is None:
+            return None
+        try:
+            return self._built(cl.Program(self._context, [self._device], [binary]))
+        except cl.Error:
+            self._cache.discard(source, self.options)
+            return None
 
     def _built(self, program: cl.Program) -> cl.Program:
         with warnings.catch_warnings():
@@ -180,40 +265,26 @@ class OpenCLBackend(ProcessBound):
             return program.build(self.options, [self._device])
 
 
-def _nothing() -> None:
-    """What an argument is bound to at first."""
-
-
 class _Launch:
     """Binds arguments by the signature table and enqueues."""
 
-    def __init__(self, queue: cl.CommandQueue, kernel: cl.Kernel, row: Kernel, flags: frozenset[str]) -> None:
-        self._queue, self._kernel = queue, kernel
+    def __init__(self, backend: OpenCLBackend, kernel: cl.Kernel, row: Kernel, flags: frozenset[str]) -> None:
+        self._backend, self._kernel = backend, kernel
         self._lanes, self._group = (1, row.group)
         if "WIDE" in flags:
             self._lanes, self._group = (lanes_of(flags) if row.wide else 1), row.wide_group
-        float64 = "FLOAT64" in flags
         self._lock = threading.Lock()
-        real = np.dtype(np.float64 if float64 else np.float32)
-        self._scalars = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
-        # What the kernel has; most calls change a few of many arguments. Of buffers a weak reference, so that one that
-        # is given up is free, and another in its place is told from it.
-        self._bound: list[Any] = [_nothing] * len(self._scalars)
+        real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
+        # Told the types, pyopencl sets all arguments in 1 us; a single number without takes it 6 us.
+        kernel.set_arg_types([a.dtype(real).type if a.shape is None else None for a in row.arguments])
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         group = (self._group, *(1 for _ in size[1:]))
         rounded = (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:])
         # Arguments belong to the kernel object, so two threads must not interleave here.
         with self._lock, _driver_errors():
-            for i, (scalar, value, last) in enumerate(zip(self._scalars, arguments, self._bound, strict=True)):
-                if scalar is None:
-                    if last() is not value:
-                        self._kernel.set_arg(i, value)
-                        self._bound[i] = weakref.ref(value)
-                elif last is _nothing or last != value:
-                    self._kernel.set_arg(i, scalar(value))
-                    self._bound[i] = value
-            cl.enqueue_nd_range_kernel(self._queue, self._kernel, rounded, group)
+            self._kernel.set_args(*arguments)
+            self._backend.enqueue(self._kernel, rounded, group)
 
 
 class _driver_errors:

@@ -1,8 +1,9 @@
-"""A processor that is newer than the PoCL of the wheel, whose compiler then refuses to compile for it.
+"""What is particular to PoCL, the OpenCL driver for processors that comes as a wheel.
 
-PoCL asks LLVM for the processor's name and hands the name back to it. LLVM 14 calls what it does not know (AMD's Zen 5,
-say) "generic", and takes no such name: "unknown target CPU 'generic'" (pocl issue 1049). PoCL has no setting for the
-name, so it is replaced where PoCL keeps it, by one that LLVM knows with the instruction sets of PoCL's own library.
+A processor may be newer than the PoCL of the wheel, whose compiler then refuses to compile for it. PoCL asks LLVM for
+the processor's name and hands the name back to it. LLVM 14 calls what it does not know (AMD's Zen 5, say) "generic",
+and takes no such name: "unknown target CPU 'generic'" (pocl issue 1049). PoCL has no setting for the name, so it is
+replaced where PoCL keeps it, by one that LLVM knows with the instruction sets of PoCL's own library.
 """
 
 from __future__ import annotations
@@ -27,6 +28,11 @@ _WORDS = 256
 _NAME = 24
 
 
+def is_pocl(device: cl.Device) -> bool:
+    """Whether a device is one of PoCL's."""
+    return "Portable Computing Language" in device.platform.name
+
+
 def known_processor(flags: set[str]) -> str:
     """A processor LLVM 14 knows, with no instruction set that is not in ``flags``."""
     return next(name for needed, name in _PROCESSORS if needed <= flags)
@@ -38,7 +44,7 @@ def mend(device: cl.Device) -> str | None:
     The name stands behind that of the target, ``x86_64-...``, in the device's description; where the two are not found
     nothing is touched. Memory is read through the kernel, which answers an address that is none with an error.
     """
-    if "Portable Computing Language" not in device.platform.name or not os.path.exists("/proc/self/mem"):
+    if not is_pocl(device) or not os.path.exists("/proc/self/mem"):
         return None
     with open("/proc/self/mem", "rb", buffering=0) as memory:
         words = struct.unpack(f"<{_WORDS}Q", os.pread(memory.fileno(), 8 * _WORDS, device.int_ptr))

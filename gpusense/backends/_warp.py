@@ -17,7 +17,7 @@ import math
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ import warp as wp
 
 from gpusense._kernel_files import warp_module
 from gpusense.backends._numpy import _memory
+from gpusense.backends._warp_queue import Graphs, Group, Queue
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import cache_folder
 from gpusense.signatures import KERNELS, Argument, Kernel
@@ -44,6 +45,8 @@ _VECTORS = {
     (wp.float64, 2): wp.vec2d,
     (wp.float64, 4): wp.vec4d,
 }
+# The axes of a launch that threads may share, and the argument that counts each.
+_SHARED = {"particle": "particles", "block": "blocks"}
 _MOST_NUMBERS = (1 << 31) - 1
 # Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: threads
 # that others hold up take fewer.
@@ -86,6 +89,11 @@ class WarpBackend(ProcessBound):
         self.info = info
         self._device = wp.get_device(device)
         # By the flags that change code, and by those that were asked for.
+        self._gathers = self._device.is_cuda
+        self._graphs = Graphs(self._device)
+        # One for each thread of a call, and those that no call has now.
+        self._thread = threading.local()
+        self._queues: list[Queue] = []
         self._launchers: dict[tuple[str, frozenset[str]], Launcher] = {}
         self._asked: dict[tuple[str, frozenset[str]], Launcher] = {}
 
@@ -95,6 +103,11 @@ class WarpBackend(ProcessBound):
         array = np.ascontiguousarray(array)
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
+            queue = self.gathering()
+            if queue is not None:
+                if not wait and queue.upload(array, buffer):
+                    return buffer
+                self._flush(queue)
             wp.copy(buffer, _host(array), count=array.size)
             if wait:
                 # Page-locked host memory is still being read when the copy returns.
@@ -121,6 +134,11 @@ class WarpBackend(ProcessBound):
     def download(self, buffer: wp.array, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
+            queue = self.gathering()
+            if queue is not None:
+                if not wait and queue.download(buffer, out):
+                    return out
+                self._flush(queue)
             wp.copy(_host(out), buffer, count=out.size)
             if wait:
                 self._wait()
@@ -146,7 +164,80 @@ class WarpBackend(ProcessBound):
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""
-        wp.synchronize_device(self._device)
+        queue = self.gathering()
+        if queue is not None:
+            self._flush(queue)
+        self._wait()
+        if queue is not None:
+            queue.deliver()
+
+    def gather(self) -> None:
+        """See Gathering.gather."""
+        if not self._gathers:
+            return
+        try:
+            queue = self._queues.pop()
+        except IndexError:
+            queue = Queue(self._device, _SCALARS)
+        if not queue.settled:
+            # An error ended the call before, and something of it may be under way.
+            self._wait()
+        queue.begin()
+        self._thread.queue = queue
+
+    def start(self) -> None:
+        """See Gathering.start."""
+        queue = self.gathering()
+        if queue is not None:
+            self._flush(queue)
+
+    def scatter(self) -> None:
+        """See Gathering.scatter."""
+        queue = self.gathering()
+        if queue is not None:
+            self._thread.queue = None
+            try:
+                self._flush(queue)
+            finally:
+                self._queues.append(queue)
+
+    def mark(self) -> object | None:
+        """See Gathering.mark."""
+        queue = self.gathering()
+        return None if queue is None else (queue.started, len(queue.steps))
+
+    def kept(self, mark: object) -> object | None:
+        """See Gathering.kept."""
+        queue = self.gathering()
+        assert queue is not None and isinstance(mark, tuple)
+        started, first = mark
+        steps = queue.steps[first:]
+        if started != queue.started or not all(isinstance(step, _LaunchStep) for step in steps):
+            return None
+        group = Group([step.alone() for step in steps if isinstance(step, _LaunchStep)])
+        queue.steps[first:] = [group]
+        return group
+
+    def repeat(self, kept: object) -> None:
+        """See Gathering.repeat."""
+        queue = self.gathering()
+        assert queue is not None and isinstance(kept, Group)
+        queue.steps.append(kept)
+
+    def address(self, buffer: wp.array) -> int:
+        """See Gathering.address."""
+        return int(buffer.ptr or 0)
+
+    def gathering(self) -> Queue | None:
+        """What this thread gathers in, if it does."""
+        return getattr(self._thread, "queue", None)
+
+    def _flush(self, queue: Queue) -> None:
+        """Start what was gathered."""
+        if queue.steps:
+            steps, queue.steps = queue.steps, []
+            queue.started += 1
+            self._graphs.start(steps)
 
     def _wait(self) -> None:
         """Wait for the current stream; the processor has none and works at once."""
@@ -161,7 +252,7 @@ class WarpBackend(ProcessBound):
                 wp.load_module(made.module, device=self._device, block_dim=group)
             except Exception as error:
                 raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
-        launch = _Launch(self._device, made, row, group)
+        launch = _Launch(self._device, made, row, group, self.gathering)
         if self._device.is_cuda or _threads() == 1 or not _independent(row):
             return launch
         return _Pieces(launch, row)
@@ -174,8 +265,15 @@ class _Launch:
     launch takes. It knows buffers by their address, so it keeps none alive. Every thread has its own.
     """
 
-    def __init__(self, device: wp.Device, kernel: wp.Kernel, row: Kernel, group: int) -> None:
-        self._device, self._kernel, self._group = device, kernel, group
+    def __init__(
+        self,
+        device: wp.Device,
+        kernel: wp.Kernel,
+        row: Kernel,
+        group: int,
+        gathering: Callable[[], Queue | None],
+    ) -> None:
+        self._device, self._kernel, self._group, self._gathering = device, kernel, group, gathering
         self._binds = [_binding(argument) for argument in row.arguments]
         self._thread = threading.local()
 
@@ -183,6 +281,14 @@ class _Launch:
         if 0 in size:
             return
         keys = [(value.ptr, value.size) if isinstance(value, wp.array) else value for value in arguments]
+        queue = self._gathering()
+        if queue is None:
+            self.start(size, arguments, keys, None)
+        else:
+            queue.steps.append(_LaunchStep(self, size, arguments, keys))
+
+    def start(self, size: tuple[int, ...], arguments: tuple[Any, ...], keys: list[Any], stream: Any) -> None:
+        """Launch on a stream, or on the device's current one; the keys are those of the arguments."""
         recorded = getattr(self._thread, "recorded", None)
         if recorded is None:
             bound = [bind(value) for bind, value in zip(self._binds, arguments, strict=True)]
@@ -197,19 +303,43 @@ class _Launch:
             for i, (key, last) in enumerate(zip(keys, last_keys, strict=True)):
                 if key != last:
                     command.set_param_at_index(i, self._binds[i](arguments[i]))
-        command.launch()
+        command.launch(stream)
         self._thread.recorded = (command, size, keys)
 
 
-def _per_particle(argument: Argument) -> bool:
-    """Whether an argument has one row a particle."""
-    return argument.shape is not None and argument.shape.split(" ")[0] == "particles"
+class _LaunchStep:
+    """A launch that is gathered; see Step."""
+
+    def __init__(self, launch: _Launch, size: tuple[int, ...], arguments: tuple[Any, ...], keys: list[Any]) -> None:
+        self._given = (size, arguments, keys)
+        self._launch = launch
+        self.key: Hashable = (id(launch), size, *keys)
+
+    def alone(self) -> _LaunchStep:
+        """The same launch, which keeps no array alive."""
+        size, arguments, keys = self._given
+        own = [_slice(value, 0, value.size) if isinstance(value, wp.array) else value for value in arguments]
+        return _LaunchStep(self._launch, size, tuple(own), keys)
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """See Step.start."""
+        self._launch.start(*self._given, stream)
+
+
+def _shared_axis(row: Kernel) -> str | None:
+    """The axis of a launch, particles or blocks of pairs, that threads may share."""
+    return next((axis for axis in _SHARED if axis in row.launch), None)
+
+
+def _has_rows(argument: Argument, axis: str) -> bool:
+    """Whether an argument has one row for each index of an axis."""
+    return argument.shape is not None and argument.shape.split(" ")[0] == _SHARED[axis]
 
 
 def _independent(row: Kernel) -> bool:
-    """Whether a kernel writes to nothing but the rows of its own particles."""
-    outputs = [argument for argument in row.arguments if argument.output]
-    return "particle" in row.launch and all(_per_particle(argument) for argument in outputs)
+    """Whether a kernel writes to nothing but the rows of its own particles or blocks."""
+    axis = _shared_axis(row)
+    return axis is not None and all(_has_rows(argument, axis) for argument in row.arguments if argument.output)
 
 
 @functools.cache
@@ -225,12 +355,13 @@ def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
 
 
 class _Pieces:
-    """A launch over particles, cut into pieces that several threads take one after the other."""
+    """A launch over particles or blocks of pairs, cut into pieces that several threads take one after the other."""
 
     def __init__(self, launch: _Launch, row: Kernel) -> None:
         self._launch, self._row = launch, row
-        self._axis = row.launch.index("particle")
-        self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == "particles")
+        self._name = _shared_axis(row) or ""
+        self._axis = row.launch.index(self._name)
+        self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
         self._work = [
             i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
         ]
@@ -275,11 +406,11 @@ class _Pieces:
                 helper.result()
 
     def _rows(self, arguments: tuple[Any, ...]) -> list[tuple[int, int]]:
-        """The arrays that hold something of every particle, and how many numbers of each."""
+        """The arrays that hold something of every particle or block, and how many numbers of each."""
         named = {argument.name: value for argument, value in zip(self._row.arguments, arguments, strict=True)}
         found = []
         for i, argument in enumerate(self._row.arguments):
-            if argument.shape is not None and _per_particle(argument):
+            if argument.shape is not None and _has_rows(argument, self._name):
                 factors = argument.shape.split(" * ")[1:]
                 each = math.prod(int(factor) if factor.isdigit() else int(named[factor]) for factor in factors)
                 if arguments[i].size >= argument.width * each * arguments[self._count]:

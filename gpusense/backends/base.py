@@ -70,6 +70,34 @@ class Launcher(Protocol):
         """Start one launch; buffers and scalars in the order of the signature table."""
 
 
+class Gathering(Protocol):
+    """What a backend may have besides, where to start things takes longer than small ones last."""
+
+    def gather(self) -> None:
+        """From now on this thread's launches and copies may wait until ``synchronize``, and are done in their order.
+
+        Nothing else changes: what must be done at once is done at once, after all before it.
+        """
+
+    def start(self) -> None:
+        """Start what still waits."""
+
+    def scatter(self) -> None:
+        """Start what still waits, and gather no more."""
+
+    def mark(self) -> object | None:
+        """Where in what this thread gathers it is now; None where it does not."""
+
+    def kept(self, mark: object) -> object | None:
+        """The launches since a mark, to be repeated; None if there was anything else. It keeps no buffer alive."""
+
+    def repeat(self, kept: object) -> None:
+        """Gather such launches once more: with the same memory and numbers."""
+
+    def address(self, buffer: Buffer) -> int:
+        """Where a buffer lies."""
+
+
 class Backend(Protocol):
     """A device that holds buffers and runs kernels."""
 

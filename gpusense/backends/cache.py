@@ -3,7 +3,7 @@
 The folder is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else ``~/.cache/gpusense``;
 ``GPUSENSE_CACHE=off`` switches it off. Entries are keyed by device, driver, options and source, are written by
 rename, carry a checksum, and the oldest go when the folder holds more than it may. A cache that cannot be read or
-written never stops a run. Warp keeps a cache of its own in the same manner.
+written never stops a run. Warp and PoCL keep caches of their own in the same manner.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from gpusense.models.scan_model import (
     sums_linearly,
 )
 from gpusense.parameters import LikelihoodFieldParameters
-from gpusense.plan import Omission, scene_omissions
+from gpusense.plan import Omission, launch_omissions, scene_omissions
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
@@ -94,7 +94,10 @@ class LikelihoodFieldModel(ScanModel):
         self._bilinear = p.interpolation == "bilinear"
         self._lead = 0.0 if peer is None else 1.0
         self._log_table = (specialize or peer is not None) and not self._bilinear
+        self._guard = _GUARD * float(np.finfo(self._real).eps)
+        self._firsts = np.arange(0, scanner.count, BLOCK_TERMS)
         self._flags, terms = self._mixture()
+        self._quick, self._inside = self._flags | {"QUICK"}, self._flags | {"QUICK", "INSIDE"}
         self._terms_there = self._backend.upload(terms)
         self._none = self._backend.upload(np.zeros(1, np.int32))
         table = FieldTable(
@@ -161,6 +164,7 @@ class LikelihoodFieldModel(ScanModel):
             omissions.append(Omission("exponents in two parts", why, "some 200 operations per particle-beam"))
         if not self._bilinear:
             omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))
+        omissions += launch_omissions(self._last_code)
         if (far := self._map.omission(self._real.itemsize)) is not None:
             omissions.append(far)
         title = f"likelihood field{self._peer_note()}, {self.precision}, {self.device.selection} ({self.device.name})"
@@ -194,34 +198,46 @@ class LikelihoodFieldModel(ScanModel):
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
         cells = scan.readings / self.grid.resolution
-        finite = np.isfinite(cells)
-        high, low = split(scan.vectors * np.where(finite, cells, 0.0)[:, None], real)
-        high[~finite] = cells[~finite, None]
-        point, point_low = space.upload("point", high), space.upload("point_low", low)
-        longest = np.max(cells, initial=0.0, where=finite)
+        lengths = cells
+        if not self._specialize:
+            # Missing and max readings are no lengths, and stay what they are as points.
+            finite = np.isfinite(cells)
+            lengths = np.where(finite, cells, 0.0)
+        high, low = split(scan.vectors * lengths[:, None], real)
+        if not self._specialize:
+            high[~finite] = cells[~finite, None]
+        longest = float(np.maximum.reduce(lengths))
         # What products of rounded factors and their sums can be off: 3.12 eps of the longest reading, and 1.5 eps.
-        guard = _GUARD * np.finfo(real).eps * (longest + 2)
+        guard = self._guard * (longest + 2)
         if backend.info.kind == "gpu":
-            firsts = np.arange(0, len(cells), BLOCK_TERMS)
-            longest_each = np.maximum.reduceat(np.where(finite, cells, 0.0), firsts)
-            guards = space.upload("guards", (_GUARD * np.finfo(real).eps * (longest_each + 2)).astype(real))
+            longest_each = np.maximum.reduceat(lengths, self._firsts[: -(-len(cells) // BLOCK_TERMS)])
+            guard_each = (self._guard * (longest_each + 2)).astype(real)
+            point, point_low, guards = space.upload_all("points", (high, low, guard_each))
+        else:
+            point, point_low = space.upload_all("points", (high, low))
         readings = len(scan.readings)
 
         careful = "CAREFUL" in self._flags
         scalars = (scan.constant + self._lead, self.temperature)
-        reach = float(longest) + 2
+        reach = longest + 2
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._map, *part)
             mount, count = self.scanner.mount, part[1] - part[0]
-            placed = cloud.place(backend, space, part, (region, self.grid, mount), real, careful=careful)
-            flags = self._flags | ({"PER_BEAM"} if per_beam else set())
-            given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
-            if backend.info.kind == "gpu" and not per_beam:
+            poses = cloud.given(backend, space, part)
+            flags, gpu = self._flags, backend.info.kind == "gpu" and not per_beam
+            if gpu:
                 if careful and self._log_table and self._specialize:
                     inside = all_within(corners, self.grid, mount, region, reach, _RING)
-                    flags |= {"QUICK", "INSIDE"} if inside else {"QUICK"}
-                self._last_code = flags
+                    flags = self._inside if inside else self._quick
+                self._last_code = flags | cloud.headings()
+                if space.again(
+                    (poses, result, table), cloud.code(), flags, self._map.preparations, count, readings, scalars
+                ):
+                    return None
+            placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=careful)
+            given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
+            if gpu:
                 blocks = -(-readings // BLOCK_TERMS)
                 parts = space.empty("parts", count * blocks, real)
                 spread = spread_of(count, blocks)
@@ -232,7 +248,9 @@ class LikelihoodFieldModel(ScanModel):
                 backend.compile("sum_parts", flags)(
                     (count,), parts, self._none, result, count, blocks, 1, 1, count, *scalars
                 )
+                space.keep()
                 return parts
+            flags |= cloud.headings() | ({"PER_BEAM"} if per_beam else set())
             flags = self._last_code = widened(backend.info, "score_field", flags)
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             backend.compile("score_field", flags)(

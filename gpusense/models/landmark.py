@@ -311,7 +311,8 @@ class LandmarkModel:
 
         def run(begin: int, end: int) -> None:
             frame = (Region(0, 0, *self._buckets.shape), self._buckets, self.mount)
-            placed = cloud.place(backend, space, (begin, end), frame, real, careful=True)
+            given = cloud.given(backend, space, (begin, end))
+            placed = cloud.place(backend, space, given, (begin, end), frame, real, careful=True)
             size = (end - begin) * count
             result = space.empty("log_p", end - begin, real)
             part = space.empty("parts", size if "PER_BEAM" in flags else 1, real)

@@ -12,7 +12,7 @@ from gpusense.backends.base import Buffer
 from gpusense.frames import Mount
 from gpusense.grid import OccupancyGrid
 from gpusense.plan import Omission, share
-from gpusense.region import Region
+from gpusense.region import Corners, Region
 
 
 class TableMemoryError(MemoryError):
@@ -51,14 +51,14 @@ class ReachableMap:
         self.region: Region | None = None
         self.preparations = 0
 
-    def ensure(self, poses: np.ndarray | None) -> tuple[Buffer, Region]:
-        """The table and its window, made anew if these (N, 3) poses, N > 0, can reach beyond it; None may be anywhere.
+    def ensure(self, corners: Corners | None) -> tuple[Buffer, Region]:
+        """The table and its window, made anew if poses within these corners can reach beyond it; None may be anywhere.
 
         Raises:
             TableMemoryError: the device cannot hold the table.
         """
-        if self._crop and poses is not None:
-            wanted = region.choose(self._grid, self.region, poses, self._mount, self._reach)
+        if self._crop and corners is not None:
+            wanted = region.choose(self._grid, self.region, corners, self._mount, self._reach)
         else:
             wanted = region.whole(self._grid)
         if wanted != self.region or self._table is None:

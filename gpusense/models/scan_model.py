@@ -182,6 +182,8 @@ class ScanModel(ABC):
         self._peer = compat_module.choose(compat)
         # What the sum over beams begins with, and whether readings are end points.
         self._lead, self._end_points = 0.0, end_points
+        # Rays of each beam, and whether the probability of a max reading depends on the pose.
+        self._rays_each, self._max_depends = 1, False
         # Numbers that GPUs keep for each reading until they are summed.
         self._kept_parts = 1 / BLOCK_TERMS if end_points else 1.0
         self.compat = compat
@@ -269,11 +271,13 @@ class ScanModel(ABC):
             flat = (np.empty(shape, self._real) if given is None else given).reshape(-1)
         parts = np.zeros((*shape, self.scanner.count if per_beam else 0), self._real)
         each_parts = parts.reshape(len(clouds), count, parts.shape[-1])
-        with self._lock:
+        with self._lock, self._workspace:
             for i, cloud in enumerate(clouds):
                 own = (i * count, (i + 1) * count)
                 target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)
                 self._score_scan(cloud, scans if single else scans[i], target, each_parts[i], per_beam)
+                if not single:
+                    self._workspace.start()
             finish(self._workspace, any(cloud.on_device for cloud in clouds))
         if out is not None:
             log_p = out
@@ -293,7 +297,7 @@ class ScanModel(ABC):
             ranges = self._peer.readings(ranges, self.scanner, self._end_points)
         scan = prepare_scan(
             ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize,
-            max_is_range=self._peer is not None, distinct=self._distinct,
+            max_is_range=self._peer is not None, max_depends=self._max_depends, distinct=self._distinct,
         )  # fmt: skip
         self._last_scan = scan
         if per_beam and len(scan.max_columns):
@@ -314,7 +318,7 @@ class ScanModel(ABC):
         launch = self._prepare_launch(scan)
         space, backend = self._workspace, self._backend
         kept = 1.0 if per_beam else self._kept_parts if backend.info.kind == "gpu" else 0.0
-        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize * kept)
+        chunk = chunk_of(backend, len(scan.readings) * self._rays_each, self._real.itemsize * kept)
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:
@@ -334,7 +338,9 @@ class ScanModel(ABC):
         """Place poses on the device for nothing but to learn whether they are finite."""
         if cloud.on_device and cloud.count:
             frame = (Region(0, 0, *self.grid.shape), self.grid, self.scanner.mount)
-            cloud.place(self._backend, self._workspace, (0, cloud.count), frame, self._real, careful=False)
+            part = (0, cloud.count)
+            given = cloud.given(self._backend, self._workspace, part)
+            cloud.place(self._backend, self._workspace, given, part, frame, self._real, careful=False)
 
     def _fill(self, log_p: Any, value: float) -> None:
         if isinstance(log_p, np.ndarray):

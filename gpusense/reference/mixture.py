@@ -38,11 +38,33 @@ def hit_exponent(
     return product[0], product[1] + (square[1] * terms[1] + square[0] * terms[9])
 
 
+def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Terms of the log domain: log of ``z_hit p_hit(z | z*)``."""
+    exponent = hit_exponent(flags, z, expected, terms)
+    log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
+    return log_p - np.log(hit_mass(expected, terms[2], terms[6]))
+
+
 def short_factor(x: np.ndarray) -> np.ndarray:
     """``x / (1 - exp(-x))`` for x >= 0 as h / tanh(h) + h with h = x / 2."""
     h = x.dtype.type(0.5) * x
     safe = np.where(h > TINY, h, 1)
     return np.where(h > TINY, safe / np.tanh(safe) + h, x.dtype.type(1))
+
+
+def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Terms of the log domain: log of ``z_short p_short(z | z*)``."""
+    inside = (z <= expected) & (expected > 0)
+    x = terms[4] * expected
+    log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
+    return np.where(inside, log_p, -np.inf)
+
+
+def short_peak(decay: np.floating, expected: np.ndarray) -> np.ndarray:
+    """``lambda / (1 - exp(-2 h))`` as lambda (1 + t) / (2 t) with h = lambda z* / 2 and t = tanh(h); 1 / z* at 0."""
+    h = expected.dtype.type(0.5) * (decay * expected)
+    t = np.tanh(np.where(h > TINY, h, 1))
+    return np.where(h > TINY, decay * (1 + t), 1) / np.where(h > TINY, 2 * t, np.maximum(expected, SMALLEST_RANGE))
 
 
 def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
@@ -51,14 +73,9 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
         return _linear(flags, z, expected, terms)
     parts = []
     if "HIT" in flags:
-        exponent = hit_exponent(flags, z, expected, terms)
-        log_hit = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
-        parts.append(log_hit - np.log(hit_mass(expected, terms[2], terms[6])))
+        parts.append(log_hit(flags, z, expected, terms))
     if "SHORT" in flags:
-        inside = (z <= expected) & (expected > 0)
-        x = terms[4] * expected
-        log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
-        parts.append(np.where(inside, log_p, -np.inf))
+        parts.append(log_short(z, expected, terms))
     if "RAND" in flags:
         parts.append(np.broadcast_to(terms[5], z.shape))
     if len(parts) == 1:
@@ -72,7 +89,6 @@ def _linear(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: n
         exponent = hit_exponent(flags, z, expected, terms)
         p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
     if "SHORT" in flags:
-        decay = np.exp(-terms[4] * z) / np.maximum(expected, SMALLEST_RANGE)
-        density = terms[3] * short_factor(terms[4] * expected) * decay
+        density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
         p += np.where((z <= expected) & (expected > 0), density, 0)
     return np.log(p + terms[5])

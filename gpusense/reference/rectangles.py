@@ -12,6 +12,8 @@ only cells whose rectangles can hold one of these are. Occupied cells are known 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from gpusense.reference.bits import cells_left, cells_right, unpacked
@@ -91,6 +93,19 @@ def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
     return np.stack([reach + longer, np.where(longer, lower, np.where(reach > 0, least, 0))])
 
 
+def _quadrants(
+    rectangles: np.ndarray, rows: int, cols: int, sectors: int, top: int, left: int, bottom: int, right: int
+) -> Iterator[tuple[int, tuple[int, int], tuple[slice, slice], np.ndarray]]:
+    """For each quadrant its ways along x and y, the rows and columns that a change reaches, and their planes."""
+    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
+    for quadrant in range(4):
+        dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
+        row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
+        col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
+        part = planes[quadrant, :, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
+        yield quadrant, (dx, dy), (row, col), part
+
+
 def rectangles_rows(
     flags: frozenset[str],
     runs: np.ndarray,
@@ -107,20 +122,15 @@ def rectangles_rows(
     right: int,
 ) -> None:
     """From free cells in columns: along the rows the widest rectangles of enough height."""
-    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
     free = runs[: 2 * band * cols].reshape(2, band, cols)
-    for quadrant in range(4):
-        dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
-        row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
-        col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
+    for quadrant, (dx, _), (row, col), planes in _quadrants(rectangles, rows, cols, sectors, top, left, bottom, right):
         seen = reached(dx, col, cols)
         run = free[quadrant >> 1, row.start - first : row.stop - first, seen][:, ::dx]
+        part = slice(col.start - seen.start, col.stop - seen.start)
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             wide, high = longest(run, width, height)[:, :, ::dx]
-            part = slice(col.start - seen.start, col.stop - seen.start)
-            out = planes[quadrant, sector, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
-            out[...] = (wide + 256 * high)[:, part]
+            planes[sector] = (wide + 256 * high)[:, part]
 
 
 def free_rows(
@@ -147,17 +157,12 @@ def rectangles_scan(
     right: int,
 ) -> None:
     """From free cells in rows: along the columns the highest rectangles of enough width."""
-    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
     free = runs[: 2 * band * cols].reshape(2, band, cols)
-    for quadrant in range(4):
-        dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
-        row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
-        col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
+    for quadrant, (_, dy), (row, col), planes in _quadrants(rectangles, rows, cols, sectors, top, left, bottom, right):
         seen = reached(dy, row, rows)
         run = free[quadrant & 1, seen.start - first : seen.stop - first, col][::dy].T
+        part = slice(row.start - seen.start, row.stop - seen.start)
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             high, wide = (side.T[::dy] for side in longest(run, height, width))
-            part = slice(row.start - seen.start, row.stop - seen.start)
-            out = planes[quadrant, sector, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
-            out[...] = (wide + 256 * high)[part]
+            planes[sector] = (wide + 256 * high)[part]

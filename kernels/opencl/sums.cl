@@ -2,7 +2,8 @@
 // requires: error_free
 
 // One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block of
-// them is added plainly, then its sum to a compensated total.
+// them, 1 or BLOCK_TERMS, is added plainly, then its sum to a compensated total. BLOCK_TERMS numbers are read before any
+// is added, so that a work-item waits once for all of them; what lies beyond the last counts as 0, which changes no sum.
 kernel void sum_parts(global const real *parts, global const int *order, global real *log_p, const int particles,
                       const int count, const int block, const int across, const int along, const real fixed,
                       const real temperature) {
@@ -15,11 +16,18 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
 #endif
     global const real *part = parts + (long)place * across;
     real2 total = (real2)(fixed, 0);
-    for (int first = 0; first < count; first += block) {
-        const int last = min(first + block, count);
-        real sum = 0;
-        for (int k = first; k < last; ++k) sum += part[(long)k * along];
-        total = add_term(total, sum);
+    for (int first = 0; first < count; first += BLOCK_TERMS) {
+        real term[BLOCK_TERMS], sum = 0;
+#pragma unroll
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < count ? part[(long)(first + i) * along] : 0;
+#pragma unroll
+        for (int i = 0; i < BLOCK_TERMS; ++i) {
+            if (block == 1)
+                total = add_term(total, term[i]);
+            else
+                sum += term[i];
+        }
+        if (block != 1) total = add_term(total, sum);
     }
 #if CUBES
     log_p[n] = temperature * log(total.x + total.y);

@@ -9,112 +9,32 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import end_point as end_points
 from . import error_free
+from .end_point import field_cell
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
 
-FIELD_RING = wp.constant(2)
 # Particles of a work-group of field_blocks.
 GROUP = wp.constant(64)
 
 
-# Index of a cell of the padded table; far cells become ring cells.
-@wp.func
-def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
-    c = wp.clamp(col, -FIELD_RING, cols + FIELD_RING - 1)
-    r = wp.clamp(row, -FIELD_RING, rows + FIELD_RING - 1)
-    return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
-
-
 @functools.cache
 def functions(flags):
-    """careful_offset, whole_cells, end_point, bilinear and log_field specialised by the flags."""
+    """between, bilinear, log_field and reading_value specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
-    two_sum, two_product = exact.two_sum, exact.two_product
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
+    ends = end_points.functions(flags)
+    EndPoint, end_point = ends.EndPoint, ends.end_point
+    ALL_READINGS = "ALL_READINGS" in flags
     BILINEAR = "BILINEAR" in flags
-    CAREFUL = "CAREFUL" in flags
     HIT = "HIT" in flags
+    LOG_TABLE = "LOG_TABLE" in flags
     SHARP = "SHARP" in flags
-    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
-    MINUS_ONE = real(-1.0)
-    EDGE = real(2.0**-33)
-
-    @wp.struct
-    class EndPoint:
-        cell: wp.vec2i
-        rest_x: vec2
-        rest_y: vec2
-        to_next_x: vec2
-        to_next_y: vec2
-
-    # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
-    # the working precision.
-    @wp.func
-    def careful_offset(frac: vec2, a: vec2, b: vec2, c: vec2, d: vec2, sign: real):
-        ab = two_product(a.x, b.x)
-        cd = two_product(c.x, d.x)
-        products = two_sum(ab.x, sign * cd.x)
-        total = two_sum(products.x, frac.x)
-        low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
-        return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
-
-    # Whole cells below an offset of two parts. What is left of it in [0, 1) comes second, and what is missing to 1
-    # third: both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or
-    # less short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
-    @wp.func
-    def whole_cells(offset: vec2):
-        nearest = wp.floor(offset.x + HALF)
-        past = vec2((offset.x - nearest) + offset.y, ZERO)
-        if SHARP:
-            past = two_sum(offset.x - nearest, offset.y)
-        size = past
-        if past.x < ZERO:
-            size = -past
-        other = vec2(ONE - size.x, ZERO)
-        if SHARP:
-            other = pair_sum(vec2(ONE, ZERO), -size)
-        rest = past
-        to_next = other
-        if past.x + EDGE < ZERO:
-            nearest -= ONE
-            rest = other
-            to_next = -past
-        return int(nearest), rest, to_next
-
-    # Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
-    # point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
-    # nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
-    @wp.func
-    def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
-        end = EndPoint()
-        x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
-        y = vec2((pose.y - shift) + (pose.w * point.x + pose.z * point.y), ZERO)
-        if CAREFUL:
-            if BILINEAR:
-                pass
-            else:
-                near = vec2(wp.floor(x.x), wp.floor(y.x))
-                left = vec2(x.x - near.x, y.x - near.y)
-                if left.x >= guard and left.y >= guard and left.x <= ONE - guard and left.y <= ONE - guard:
-                    end.cell = wp.vec2i(int(near.x), int(near.y))
-                    return end
-            c = vec2(pose.z, pose_low.z)
-            s = vec2(pose.w, pose_low.w)
-            p = vec2(point.x, point_low.x)
-            q = vec2(point.y, point_low.y)
-            x = careful_offset(two_sum(pose.x, -shift) + vec2(ZERO, pose_low.x), c, p, s, q, MINUS_ONE)
-            y = careful_offset(two_sum(pose.y, -shift) + vec2(ZERO, pose_low.y), s, p, c, q, ONE)
-        col, rest_x, to_next_x = whole_cells(x)
-        row, rest_y, to_next_y = whole_cells(y)
-        end.cell = wp.vec2i(col, row)
-        end.rest_x = rest_x
-        end.rest_y = rest_y
-        end.to_next_x = to_next_x
-        end.to_next_y = to_next_y
-        return end
+    ZERO, ONE = real(0.0), real(1.0)
+    SHIFT = real(0.5 if BILINEAR else 0.0)
 
     # a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their
     # digits.
@@ -161,47 +81,7 @@ def functions(flags):
         largest = wp.max(hit, terms[2])
         return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
 
-    return SimpleNamespace(
-        field_cell=field_cell,
-        careful_offset=careful_offset,
-        whole_cells=whole_cells,
-        end_point=end_point,
-        bilinear=bilinear,
-        log_field=log_field_linear if "LINEAR" in flags else log_field_log,
-    )
-
-
-@functools.cache
-def make(name, flags):
-    """A kernel of this file specialised by the flags."""
-    types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    parts_of = functions(flags)
-    end_point, bilinear, log_field = parts_of.end_point, parts_of.bilinear, parts_of.log_field
-    add_term = error_free.functions(flags).add_term
-    BILINEAR = "BILINEAR" in flags
-    CAREFUL = "CAREFUL" in flags
-    LOG_TABLE = "LOG_TABLE" in flags
-    CUBES = "CUBES" in flags
-    ALL_READINGS = "ALL_READINGS" in flags
-    PER_BEAM = "PER_BEAM" in flags
-    ZERO = real(0.0)
-    SHIFT = real(0.5 if BILINEAR else 0.0)
-    QUICK = "QUICK" in flags
-    INSIDE = "INSIDE" in flags
-    HALF = real(0.5)
-    # Adding and taking off 1.5 * 2^23 rounds to nearest.
-    ROUNDING = real(12582912.0)
-    # A constant for loops that Warp shall unroll.
-    WHOLE_BLOCK = 16
-
-    # The same as field_cell where no end point of the cloud leaves the table.
-    @wp.func
-    def table_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
-        if INSIDE:
-            return (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
-        else:
-            return field_cell(col, row, rows, cols)
+    log_field = log_field_linear if "LINEAR" in flags else log_field_log
 
     # What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
     # capped distances in metres where it is interpolated.
@@ -234,15 +114,25 @@ def make(name, flags):
             else:
                 return log_field(vec2(value, ZERO), terms)
 
-    # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. How far the place is off
-    # a cell's centre comes second.
-    @wp.func
-    def rounded_cell(lowered: vec4, point: vec2):
-        x = lowered.x + (lowered.z * point.x - lowered.w * point.y)
-        y = lowered.y + (lowered.w * point.x + lowered.z * point.y)
-        whole_x = (x + ROUNDING) - ROUNDING
-        whole_y = (y + ROUNDING) - ROUNDING
-        return wp.vec2i(int(whole_x), int(whole_y)), wp.max(wp.abs(x - whole_x), wp.abs(y - whole_y))
+    return SimpleNamespace(between=between, bilinear=bilinear, log_field=log_field, reading_value=reading_value)
+
+
+@functools.cache
+def make(name, flags):
+    """A kernel of this file specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    reading_value = functions(flags).reading_value
+    ends = end_points.functions(flags)
+    table_cell, end_point, rounded_cell = ends.table_cell, ends.end_point, ends.rounded_cell
+    add_term = error_free.functions(flags).add_term
+    CAREFUL = "CAREFUL" in flags
+    CUBES = "CUBES" in flags
+    PER_BEAM = "PER_BEAM" in flags
+    QUICK = "QUICK" in flags
+    ZERO, HALF = real(0.0), real(0.5)
+    # A constant for loops that Warp shall unroll.
+    WHOLE_BLOCK = 16
 
     # Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
     # squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is

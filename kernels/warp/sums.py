@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from . import error_free
+from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
 
 
@@ -14,12 +15,15 @@ def make(name, flags):
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     add_term = error_free.functions(flags).add_term
+    block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=real)
     ORDERED = "ORDERED" in flags
     CUBES = "CUBES" in flags
     ZERO = real(0.0)
 
     # One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block
-    # of them is added plainly, then its sum to a compensated total.
+    # of them, 1 or BLOCK_TERMS, is added plainly, then its sum to a compensated total. BLOCK_TERMS numbers are read
+    # before any is added, so that a work-item waits once for all of them; what lies beyond the last counts as 0, which
+    # changes no sum.
     @kernel
     def sum_parts(
         parts: wp.array(dtype=real),
@@ -43,14 +47,19 @@ def make(name, flags):
         total = vec2(fixed, ZERO)
         first = int(0)
         while first < count:
-            last = wp.min(first + block, count)
-            summed = real(0.0)
-            k = first
-            while k < last:
-                summed += parts[part + k * along]
-                k += 1
-            total = add_term(total, summed)
-            first += block
+            term = block_terms()
+            for i in range(BLOCK_TERMS):
+                if first + i < count:
+                    term[i] = parts[part + (first + i) * along]
+            if block == 1:
+                for i in range(BLOCK_TERMS):
+                    total = add_term(total, term[i])
+            else:
+                summed = real(0.0)
+                for i in range(BLOCK_TERMS):
+                    summed += term[i]
+                total = add_term(total, summed)
+            first += BLOCK_TERMS
         if CUBES:
             log_p[n] = temperature * wp.log(total.x + total.y)
         elif wp.isinf(total.x):

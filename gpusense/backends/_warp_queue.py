@@ -1,0 +1,208 @@
+"""What a call starts on a CUDA device is gathered and done in one go, as a CUDA graph where it is what was done before.
+
+A call of few particles is short: three launches of some 3 us each. To start a launch takes Warp 5 us, to start a copy
+10 us, and a copy from or to memory that is not page-locked waits besides. So copies of small arrays go by way of
+page-locked memory, and a call whose launches and copies are those of an earlier one, to the last pointer and number, is
+replayed from a graph: one start for all. Pointers and numbers are what a graph keeps, so equal keys are all it takes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Hashable, Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+# Page-locked bytes of a call, and the largest array that takes this way.
+_MEMORY = 16 << 20
+_LARGEST = 256 << 10
+# Bytes between the beginnings of arrays there.
+_ALIGNMENT = 256
+# Views of that memory, graphs, and keys of calls that might become graphs, which are kept.
+_MOST_VIEWS, _MOST_GRAPHS, _MOST_SEEN = 1024, 256, 512
+# A graph makes room for another when so many calls have not used it, in multiples of the graphs that there may be: to
+# make one takes longer than what it stands for.
+_STALE = 16
+# Beyond this a call is long enough for its starts not to count.
+_MOST_STEPS = 64
+
+
+class Step(Protocol):
+    """A launch or a copy."""
+
+    @property
+    def key(self) -> Hashable:
+        """What it does, and to which memory: steps of equal keys are the same."""
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """Start it on a stream, or on the device's current one."""
+
+
+class Copy:
+    """A copy of the first numbers of an array into another."""
+
+    def __init__(self, target: wp.array, source: wp.array, count: int) -> None:
+        self._arguments = (target, source, count)
+        self.key: Hashable = (target.ptr, source.ptr, count)
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """See Step.start."""
+        target, source, count = self._arguments
+        wp.copy(target, source, count=count, stream=stream)
+
+
+class Group:
+    """Steps that belong together: one for whoever compares them."""
+
+    _numbers = itertools.count()
+
+    def __init__(self, steps: list[Step]) -> None:
+        self._steps = steps
+        self.key: Hashable = next(self._numbers)
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """See Step.start."""
+        _start_each(self._steps, stream)
+
+
+class Queue:
+    """What one call has gathered."""
+
+    def __init__(self, device: wp.Device, types: Mapping[Any, Any]) -> None:
+        self.steps: list[Step] = []
+        # How often steps were started.
+        self.started = 0
+        # False while the device may still read or write the page-locked memory.
+        self.settled = True
+        self._types = types
+        self._memory = wp.empty(_MEMORY, dtype=wp.uint8, device="cpu", pinned=device.is_cuda)
+        self._bytes = self._memory.numpy()
+        self._used = 0
+        self._views: dict[tuple[int, int, np.dtype], tuple[np.ndarray, wp.array]] = {}
+        # What came back, and where it is to go.
+        self._back: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def begin(self) -> None:
+        """Gather a new call's; the device has done everything."""
+        self.settled, self._used = True, 0
+        self._back.clear()
+
+    def upload(self, array: np.ndarray, out: wp.array) -> bool:
+        """Gather a copy to the device, where there is room; the array may change at once."""
+        room = self._room(array)
+        if room is None:
+            return False
+        room[0][...] = array.reshape(-1)
+        self.steps.append(Copy(out, room[1], array.size))
+        return True
+
+    def download(self, buffer: wp.array, out: np.ndarray) -> bool:
+        """Gather a copy from the device, where there is room; the array is filled by ``deliver``."""
+        room = self._room(out)
+        if room is None:
+            return False
+        self.steps.append(Copy(room[1], buffer, out.size))
+        self._back.append((out.reshape(-1), room[0]))
+        return True
+
+    def deliver(self) -> None:
+        """Fill the arrays of downloads; the device has done everything."""
+        self.settled, self._used = True, 0
+        for out, found in self._back:
+            out[...] = found
+        self._back.clear()
+
+    def _room(self, array: np.ndarray) -> tuple[np.ndarray, wp.array] | None:
+        """Page-locked memory for an array, as NumPy and as Warp see it."""
+        size, begin = array.nbytes, self._used
+        if size > _LARGEST or begin + size > _MEMORY:
+            return None
+        self._used, self.settled = begin + -(-size // _ALIGNMENT) * _ALIGNMENT, False
+        key = (begin, array.size, array.dtype)
+        found = self._views.get(key)
+        if found is None:
+            if len(self._views) >= _MOST_VIEWS:
+                self._views.clear()
+            view = wp.array(
+                ptr=self._memory.ptr + begin, dtype=self._types[array.dtype], shape=(array.size,), device="cpu"
+            )
+            found = self._views[key] = (self._bytes[begin : begin + size].view(array.dtype), view)
+        return found
+
+
+class Graphs:
+    """Graphs of what was done more than once."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self._device = device
+        # The least recently used first, each with the number of the call that used it last.
+        self._graphs: dict[Hashable, tuple[Any, int]] = {}
+        self._calls = 0
+        self._seen: dict[Hashable, None] = {}
+        self._lock = threading.Lock()
+        self._stream: wp.Stream | None = None
+        self.failed = False
+
+    def start(self, steps: list[Step]) -> None:
+        """Start steps in their order."""
+        if not 1 < len(steps) <= _MOST_STEPS or self.failed:
+            _start_each(steps, None)
+            return
+        key = tuple([step.key for step in steps])
+        # A graph must not be started by two threads at once.
+        with self._lock:
+            self._calls += 1
+            graph, _ = self._graphs.pop(key, (None, 0))
+            if graph is None and self._seen.pop(key, key) is None and self._room():
+                graph = self._record(steps)
+            if graph is None:
+                _remember(self._seen, key, None, _MOST_SEEN)
+            else:
+                _remember(self._graphs, key, (graph, self._calls), _MOST_GRAPHS)
+                wp.capture_launch(graph)
+                return
+        _start_each(steps, None)
+
+    def _room(self) -> bool:
+        """Whether another graph may be kept."""
+        if len(self._graphs) < _MOST_GRAPHS:
+            return True
+        _, used = next(iter(self._graphs.values()))
+        return self._calls - used > _STALE * _MOST_GRAPHS
+
+    def _record(self, steps: list[Step]) -> Any:
+        """A graph of steps, none of which is started; None where there can be none now.
+
+        While one thread records, Warp refuses to let others wait for the device: only a thread alone does.
+        """
+        if threading.active_count() > 1:
+            return None
+        try:
+            if self._device.is_cuda and self._stream is None:
+                self._stream = wp.Stream(self._device)
+            where = {"stream": self._stream} if self._device.is_cuda else {"device": self._device}
+            wp.capture_begin(**where, force_module_load=False)
+            try:
+                _start_each(steps, self._stream)
+            finally:
+                graph = wp.capture_end(**where)
+        except RuntimeError:
+            # A driver that cannot: every step is started on its own from now on.
+            self.failed = True
+            return None
+        return graph
+
+
+def _start_each(steps: list[Step], stream: wp.Stream | None) -> None:
+    for step in steps:
+        step.start(stream)
+
+
+def _remember(kept: dict[Hashable, Any], key: Hashable, value: Any, most: int) -> None:
+    """Keep a value as the newest of at most so many."""
+    kept[key] = value
+    if len(kept) > most:
+        del kept[next(iter(kept))]

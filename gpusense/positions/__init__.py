@@ -1,0 +1,1 @@
+"""Positions from beacons without a filter: closed forms, least squares, and the covariance of what they find."""

@@ -1,0 +1,121 @@
+"""A pose from beacons of which range and bearing are measured."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense.positions.closed_forms import two_circles, wrap
+from gpusense.positions.fix import PositionFix
+from gpusense.positions.problem import Floats, Problem, make_problem, subsets
+from gpusense.positions.solver import minima, pick
+
+# The deviation of a bearing that says nothing [rad].
+NO_BEARING = 1e100
+
+
+def locate(
+    xy: ArrayLike,
+    ranges: ArrayLike,
+    bearings: ArrayLike,
+    heading: float | None = None,
+    *,
+    sigma_range: ArrayLike,
+    sigma_bearing: ArrayLike,
+    weights: ArrayLike | None = None,
+    loss: str = "linear",
+    loss_scale: float = 1.0,
+) -> PositionFix:
+    """The pose that sees beacons at the ranges and bearings measured.
+
+    Two beacons are enough, or one where the heading is known. The minimum of ``sum of rho(weight (residual /
+    sigma)^2)`` over ranges and bearings is found by Gauss-Newton steps from the rigid motion that takes the seen points
+    onto the beacons, from those of pairs, and from where pairs of circles cross. All minima that the noise cannot tell
+    from the best are returned.
+
+    One measurement set a call; coordinates may be as large as UTM's.
+
+    Args:
+        xy: (M, 2) the beacons' x and y [m].
+        ranges: (M,) measured distances [m], >= 0.
+        bearings: (M,) directions in the robot's frame, counter-clockwise from straight ahead [rad], any real. The
+            bearing to a beacon at range 0 says nothing and is not used.
+        heading: The robot's heading in the world [rad], or None: it is looked for.
+        sigma_range: Standard deviation of the ranges [m], one or (M,), > 0.
+        sigma_bearing: Standard deviation of the bearings [rad], one or (M,), > 0.
+        weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
+        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``; of each range
+            and of each bearing.
+        loss_scale: Residual at which a robust loss bends [sigma], > 0.
+
+    Returns:
+        Poses (S, 3), or positions (S, 2) for a known heading; residuals (S, M, 2), range and bearing. Statuses:
+        "unique", "ambiguous", "coincident" (no solution), "at a beacon", "singular".
+
+    Raises:
+        TypeError: an argument is not of the kind described.
+        ValueError: a shape or value breaks its rule, or too few beacons are left.
+
+    Source: lectures, "Distance and Bearing"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
+    """
+    for name, sigma in (("sigma_range", sigma_range), ("sigma_bearing", sigma_bearing)):
+        if sigma is None:
+            raise TypeError(f"{name}: must hold real numbers, got None")
+    least, reason = (2, ", or a circle of solutions remains") if heading is None else (1, "")
+    problem = make_problem(
+        xy, ranges=ranges, bearings=bearings, heading=heading, sigma_range=sigma_range, sigma_bearing=sigma_bearing,
+        names=("sigma_range", "sigma_bearing"), weights=weights, loss=loss, loss_scale=loss_scale, least=least,
+        reason=reason,
+    )  # fmt: skip
+    if heading is None and np.hypot(*(problem.xy - problem.xy[0]).T).max() <= problem.noise:
+        return problem.fix([], "coincident")
+    assert problem.ranges is not None
+    # A beacon at no distance has no bearing: a deviation that is large enough for it to count for nothing.
+    problem = replace(
+        problem, sigma_bearing=np.where(problem.ranges <= problem.touch, NO_BEARING, problem.sigma_bearing)
+    )
+    states, status = pick(*minima(problem, _starts(problem)), told=True)
+    if problem.at_beacon(states[0]):
+        status = "at a beacon"
+    return problem.fix(states, status)
+
+
+def _starts(problem: Problem) -> Floats:
+    """(N, d) states: rigid motions of all beacons and of pairs, and crossings of circles with the heading that fits."""
+    assert problem.ranges is not None and problem.bearings is not None
+    world, count = problem.points, len(problem.xy)
+    if problem.heading is not None:
+        # With a known heading each beacon has its own answer.
+        own = world - problem.ranges * np.exp(1j * (problem.bearings + problem.heading))
+        points, headings = np.append(own, own.mean()), np.full(count + 1, problem.heading)
+    else:
+        sets = [np.arange(count)[None], subsets(count, 2)]
+        parts = [_rigid(problem, chosen) for chosen in sets]
+        points, headings = (np.concatenate(part) for part in zip(*parts, strict=True))
+    if count > 1:
+        i, j = subsets(count, 2).T
+        crossing = two_circles(world[i], world[j], problem.ranges[i], problem.ranges[j], noise=problem.noise)[0].ravel()
+        seen = np.angle(world - crossing[:, None]) - problem.bearings
+        facing = np.angle(np.exp(1j * seen).sum(axis=1))
+        points, headings = np.append(points, crossing), np.append(headings, facing)
+    return np.column_stack([points.real, points.imag, wrap(headings)])[:, : problem.dimension]
+
+
+def _rigid(problem: Problem, chosen: NDArray[np.intp]) -> tuple[NDArray[np.complex128], Floats]:
+    """Positions and headings (N,) that move the points seen of (N, K) beacons onto these, in least squares.
+
+    The heading is the angle of sum conj(z_i - z) (m_i - m), with means z and m (Horn 1987, in the plane).
+    """
+    assert problem.ranges is not None and problem.bearings is not None
+    seen = (problem.ranges * np.exp(1j * problem.bearings))[chosen]
+    world = problem.points[chosen]
+    # A point's own error: along the ray, and across it.
+    variance = problem.sigma_range**2 + (problem.ranges * problem.sigma_bearing) ** 2
+    share = (problem.weights / variance)[chosen]
+    share = share / share.sum(axis=1, keepdims=True)
+    middle, centre = (share * seen).sum(axis=1), (share * world).sum(axis=1)
+    heading = np.angle((share * np.conj(seen - middle[:, None]) * (world - centre[:, None])).sum(axis=1))
+    return centre - middle * np.exp(1j * heading), np.remainder(heading + math.pi, 2 * math.pi) - math.pi

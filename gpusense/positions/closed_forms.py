@@ -1,0 +1,145 @@
+"""Where circles and lines of sight meet, in closed form; every function takes many problems at once.
+
+A beacon m is seen from the position p with heading theta at the range d = |m - p| and the bearing
+b = arg(m - p) - theta. Points of the plane are complex numbers here: turning is a product, and formulas are half as
+long. All lengths are relative to an origin near the beacons, which the callers subtract.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+Words = NDArray[np.str_]
+
+EPS = float(np.finfo(np.float64).eps)
+# Of the lengths or sines that are compared: what is equal within so many roundings is taken as equal.
+ROUNDINGS = 16
+
+
+def wrap(angle: Floats) -> Floats:
+    """Angles reduced to [-pi, pi]."""
+    return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def two_circles(
+    first: Complexes, second: Complexes, d1: Floats, d2: Floats, share: Floats | float = 0.5, noise: float = 0.0
+) -> tuple[Complexes, Words]:
+    """Where two circles meet ("Distances Only, No Uncertainty").
+
+    With the beacons at 0 and a on the x axis, x = (a^2 + d1^2 - d2^2) / 2a and y = +-sqrt(d1^2 - x^2). As they stand
+    these formulas lose digits where the triangle of the two beacons and the robot is flat. Here x is taken from the
+    beacon with the smaller range, as ((a - d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a,
+    with Kahan's area ("Miscalculating Area and Angles of a Needle-like Triangle", 2014), where nothing cancels but
+    the sides themselves.
+
+    Args:
+        first: (N,) centres.
+        second: (N,) centres.
+        d1: (N,) radii of the first circles, >= 0.
+        d2: (N,) radii of the second circles, >= 0.
+        share: Which part of a gap between the circles belongs to the first one, 0 to 1.
+        noise: Rounding of the inputs' coordinates, a length.
+
+    Returns:
+        (N, 2) points, first the one on the left of the way from ``first`` to ``second``; and (N,) how the circles lie:
+        "two" (they cross), "tangent", "disjoint", "contained" (one inside the other) or "coincident" (one centre).
+        Where they do not cross, both points are the nearest one on the line of centres (least squares); NaN for one
+        centre.
+    """
+    base = second - first
+    a = np.abs(base)
+    swap = d1 > d2
+    small, large = np.where(swap, d2, d1), np.where(swap, d1, d2)
+    high, middle, low = np.sort(np.stack([a, d1, d2]), axis=0)[::-1]
+    slack = low - (high - middle)  # > 0: the three lengths make a triangle
+    tolerance = ROUNDINGS * EPS * high + noise
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = ((a - large) * (a + large) + small * small) / (2 * a)
+        area = (high + (middle + low)) * np.maximum(slack, 0.0) * (low + (high - middle)) * (high + (middle - low))
+        y = np.sqrt(area) / (2 * a)
+        x = np.where(swap, a - x, x)
+        gap = a - d1 - d2
+        apart = d1 + gap * share
+        # Contained: the nearest points lie beyond the centre of the smaller circle, seen from that of the larger one.
+        inside = np.where(swap, d1 - (d1 - d2 - a) * share, -(d1 + (d2 - d1 - a) * share))
+        status = np.where(gap > tolerance, "disjoint", np.where(slack < -tolerance, "contained", "two"))
+        status = np.where((status == "two") & (slack <= tolerance), "tangent", status)
+        status = np.where(a <= noise, "coincident", status)
+        crossing = status == "two"
+        # A tangent point is that of the nearest points, too: gap and slack are rounding.
+        x = np.where(crossing, x, np.where(high == a, apart, inside))
+        y = np.where(crossing, y, 0.0)
+        along = np.where(a > noise, base / a, np.nan)
+    return first[:, None] + along[:, None] * (x[:, None] + 1j * np.stack([y, -y], axis=1)), status
+
+
+def two_rays(first: Complexes, second: Complexes, angle1: Floats, angle2: Floats) -> tuple[Complexes, Floats, Floats]:
+    """Where two lines of sight of known direction meet.
+
+    With m_i - p = rho_i u_i, rho_1 = ((m1 - m2) x u2) / (u1 x u2) and rho_2 = ((m1 - m2) x u1) / (u1 x u2).
+
+    Args:
+        first: (N,) beacons.
+        second: (N,) beacons.
+        angle1: (N,) directions from the robot to the first beacons in the world [rad].
+        angle2: (N,) directions to the second ones.
+
+    Returns:
+        (N,) points; (N, 2) distances of the beacons along the lines of sight, negative where one lies behind the robot;
+        and (N,) sines of the angles between the lines. Parallel lines have no point: inf or NaN.
+    """
+    u1, u2 = np.exp(1j * angle1), np.exp(1j * angle2)
+    sine = np.sin(angle2 - angle1)
+    base = first - second
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rho = np.stack([(np.conj(base) * u2).imag, (np.conj(base) * u1).imag], axis=1) / sine[:, None]
+        nearer_first = np.abs(rho[:, 0]) <= np.abs(rho[:, 1])
+        point = np.where(nearer_first, first - rho[:, 0] * u1, second - rho[:, 1] * u2)
+    return point, rho, sine
+
+
+def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
+    """Position and heading from three bearings ("Bearings Only").
+
+    (m_i - p) exp(-i (b_i + theta)) is real and positive. With beacon 2 as origin its imaginary parts are three linear
+    equations in exp(-i theta) and p exp(-i theta); without p they leave
+
+        w = sum of m_i exp(-i b_i) sin(b_j - b_k) over the cyclic (i, j, k),   exp(i theta) = +-w / |w|,
+
+    and the position follows from the two lines of sight that cross best. Unlike laws of cosines or cotangents (Pierlot
+    and Van Droogenbroeck, "A New Three Object Triangulation Algorithm for Mobile Robot Positioning", 2014) it has no
+    special cases for beacons in line, or for a robot in line with two of them. w = 0 on the circle through the beacons.
+
+    Args:
+        beacons: (N, 3) positions.
+        bearings: (N, 3) [rad].
+
+    Returns:
+        (N,) positions; (N,) headings; (N, 3) distances along the lines of sight, all > 0 for a pose that sees the
+        beacons where they are; and (N,) |w| relative to the sum of its terms' magnitudes, 0 where the bearings
+        leave more than one pose.
+    """
+    terms = np.empty(beacons.shape, np.complex128)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        # The sum does not change with the origin, so that it is taken at the middle of the beacons.
+        terms[:, i] = (beacons[:, i] - beacons.mean(axis=1)) * np.exp(-1j * bearings[:, i])
+        terms[:, i] *= np.sin(bearings[:, j] - bearings[:, k])
+    w, size = terms.sum(axis=1), np.abs(terms).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        clarity = np.where(size > 0, np.abs(w) / size, 0.0)
+    heading = np.angle(w)
+    angle = bearings + heading[:, None]
+    pairs = np.array([(0, 1), (1, 2), (2, 0)])
+    sines = np.abs(np.sin(bearings[:, pairs[:, 0]] - bearings[:, pairs[:, 1]]))
+    row = np.arange(len(beacons))
+    i, j = pairs[np.argmax(sines, axis=1)].T
+    point, _, _ = two_rays(beacons[row, i], beacons[row, j], angle[row, i], angle[row, j])
+    with np.errstate(invalid="ignore"):
+        rho = ((beacons - point[:, None]) * np.exp(-1j * angle)).real
+    # Turning round by pi changes the sign of all distances and leaves the position.
+    turned = np.nansum(np.sign(rho), axis=1) < 0
+    heading = np.where(turned, heading + np.pi, heading)
+    return point, wrap(heading), np.where(turned[:, None], -rho, rho), clarity

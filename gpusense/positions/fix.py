@@ -1,0 +1,88 @@
+"""What is known of a position: the solutions, how certain they are, and what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+STATUSES = {
+    "unique": "one solution",
+    "two": "two circles cross: both points fit equally well",
+    "mirror": "the beacons stand in line: the mirror image on the other side of the line fits equally well",
+    "ambiguous": "several minima fit within 3 sigma of the best one (their costs differ by less than 9)",
+    "tangent": "two circles touch: one point, and no information across the line of their centres",
+    "disjoint": "two circles are too far apart to meet: the nearest point between them",
+    "contained": "one circle lies inside the other: the nearest point between them",
+    "in line": "robot and beacons stand in one line: nothing fixes the position across it (ranges) or along it "
+    "(bearings)",
+    "coincident": "too few of the beacons stand at different places: a circle, an arc or a ray of solutions remains",
+    "parallel": "the lines of sight are parallel: they meet nowhere",
+    "behind": "the lines of sight meet where a beacon would lie behind its bearing",
+    "circle": "robot and beacons stand on one circle: every point of an arc of it has the same bearings",
+    "at a beacon": "the robot stands at a beacon: the bearing to it, and the direction of its range, have no meaning",
+    "singular": "the measurements do not fix the position: the information matrix is singular",
+}
+"""What each status means."""
+
+
+@dataclass(frozen=True, eq=False)
+class PositionFix:
+    """Positions or poses that fit measurements of beacons, the best first.
+
+    Attributes:
+        solutions: (S, 2) x and y [m], or (S, 3) with theta [rad] in [-pi, pi]; S is 0 where none exists or
+            infinitely many do.
+        covariance: (S, 2, 2) or (S, 3, 3) [m^2, m rad, rad^2] to first order in the noise; NaN where the
+            information matrix is singular. Where sigma was not given it is that of sigma = 1: multiply it with
+            the variance.
+        residuals: (S, M) measured less expected ranges [m] or bearings [rad, within +-pi]; (S, M, 2) for both.
+        cost: (S,) sum of the weighted squared residuals in sigmas, under the loss; chi-squared for the linear loss.
+        condition: (S,) condition number of the Jacobian in sigmas, heading in units that balance the position's; 1 is
+            best, inf is singular.
+        status: One of :data:`gpusense.positions.fix.STATUSES`.
+        degenerate: Whether the geometry, not the noise, keeps the best solution from being fixed: there is none, or
+            its information matrix is singular.
+    """
+
+    solutions: Floats
+    covariance: Floats
+    residuals: Floats
+    cost: Floats
+    condition: Floats
+    status: str
+    degenerate: bool
+
+    def __post_init__(self) -> None:
+        """Nobody changes a result by accident."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.solutions)
+
+    @property
+    def best(self) -> Floats:
+        """(2,) or (3,) the solution of the lowest cost.
+
+        Raises:
+            ValueError: there is no solution; the message says why.
+        """
+        if not len(self):
+            raise ValueError(f"solutions: must hold one, got none: {self.explain()}")
+        best: Floats = self.solutions[0]
+        return best
+
+    @property
+    def deviation(self) -> Floats:
+        """(S,) root of the trace of the position's covariance [m]: the dilution of precision where sigma is 1."""
+        return np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
+
+    def explain(self) -> str:
+        """What the status means, in words."""
+        return f"{self.status}: {STATUSES[self.status]}"

@@ -1,0 +1,107 @@
+// The cell of the likelihood field's table that a beam's end point falls into, and its place within that cell.
+// Cells must be the same on every device and in every precision: an end point that is nearer to an edge than guard, the
+// bound of its rounding errors, is found again with twice the digits.
+// requires: error_free
+
+#define FIELD_RING 2
+
+// i held to [0, last]; some drivers call clamp as a function.
+int within(const int i, const int last) { return i < 0 ? 0 : i > last ? last : i; }
+
+// Index of a cell of the padded table; far cells become ring cells.
+int field_cell(const int col, const int row, const int rows, const int cols) {
+    const int c = within(col + FIELD_RING, cols + 2 * FIELD_RING - 1);
+    const int r = within(row + FIELD_RING, rows + 2 * FIELD_RING - 1);
+    return r * (cols + 2 * FIELD_RING) + c;
+}
+
+// The same where no end point of the cloud leaves the table.
+int table_cell(const int col, const int row, const int rows, const int cols) {
+#if INSIDE
+    return (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING;
+#else
+    return field_cell(col, row, rows, cols);
+#endif
+}
+
+#if CAREFUL
+// frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
+// the working precision.
+real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2 c, const real2 d, const real sign) {
+    const real2 ab = two_product(a.x, b.x), cd = two_product(c.x, d.x);
+    const real2 products = two_sum(ab.x, sign * cd.x);
+    const real2 sum = two_sum(products.x, frac.x);
+    const real low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x);
+    return (real2)(sum.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + sum.y));
+}
+#endif
+
+// Largest integer not above a.
+int floor_int(const real a) {
+    const int whole = (int)a;
+    return whole - ((real)whole > a);
+}
+
+// Whole cells below an offset of two parts. What is left of it in [0, 1) is rest, and what is missing to 1 is to_next:
+// both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or less short
+// of an edge lies on it, so that end points on edges fall into the same cell in every precision.
+#define EDGE ((real)1.1641532182693481e-10)
+
+int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
+    const int nearest = floor_int(offset.x + (real)0.5);
+#if SHARP
+    const real2 past = two_sum(offset.x - (real)nearest, offset.y);
+    const real2 other = pair_sum((real2)(1, 0), past.x < 0 ? past : -past);
+#else
+    const real2 past = (real2)((offset.x - (real)nearest) + offset.y, 0);
+    const real2 other = (real2)(past.x < 0 ? 1 + past.x : 1 - past.x, 0);
+#endif
+    const int below = past.x + EDGE < 0;
+    *rest = below ? other : past;
+    *to_next = below ? -past : other;
+    return nearest - below;
+}
+
+// Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
+typedef struct {
+    int2 cell;
+    real2 rest_x, rest_y, to_next_x, to_next_y;
+} EndPoint;
+
+// point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
+// nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
+EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
+                   const real guard) {
+    EndPoint end;
+    real2 x = (real2)((pose.x - shift) + (pose.z * point.x - pose.w * point.y), 0);
+    real2 y = (real2)((pose.y - shift) + (pose.w * point.x + pose.z * point.y), 0);
+#if CAREFUL
+#if !BILINEAR
+    const int2 near = (int2)(floor_int(x.x), floor_int(y.x));
+    const real2 left = (real2)(x.x - (real)near.x, y.x - (real)near.y);
+    if (left.x >= guard && left.y >= guard && left.x <= 1 - guard && left.y <= 1 - guard) {
+        end.cell = near;
+        return end;
+    }
+#endif
+    const real2 c = (real2)(pose.z, pose_low.z), s = (real2)(pose.w, pose_low.w);
+    const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
+    x = careful_offset(two_sum(pose.x, -shift) + (real2)(0, pose_low.x), c, p, s, q, (real)-1);
+    y = careful_offset(two_sum(pose.y, -shift) + (real2)(0, pose_low.y), s, p, c, q, (real)1);
+#endif
+    end.cell.x = whole_cells(x, &end.rest_x, &end.to_next_x);
+    end.cell.y = whole_cells(y, &end.rest_y, &end.to_next_y);
+    return end;
+}
+
+#if QUICK
+// Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. off is how far the place is
+// off the cell's centre, along the axis where it is farther.
+int2 rounded_cell(const real4 lowered, const real2 point, real *off) {
+    const real x = lowered.x + (lowered.z * point.x - lowered.w * point.y);
+    const real y = lowered.y + (lowered.w * point.x + lowered.z * point.y);
+    const real to_x = x + ROUNDING, to_y = y + ROUNDING;
+    *off = fmax(fabs(x - (to_x - ROUNDING)), fabs(y - (to_y - ROUNDING)));
+    return (int2)(as_int(to_x), as_int(to_y)) - 0x4b400000;
+}
+#endif

@@ -1,0 +1,142 @@
+"""The cell of the likelihood field's table that a beam's end point falls into, and its place within that cell.
+
+Cells must be the same on every device and in every precision: an end point that is nearer to an edge than guard, the
+bound of its rounding errors, is found again with twice the digits.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import error_free
+from .prelude import precision
+
+FIELD_RING = wp.constant(2)
+
+
+# Index of a cell of the padded table; far cells become ring cells.
+@wp.func
+def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+    c = wp.clamp(col, -FIELD_RING, cols + FIELD_RING - 1)
+    r = wp.clamp(row, -FIELD_RING, rows + FIELD_RING - 1)
+    return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
+
+
+@functools.cache
+def functions(flags):
+    """table_cell, careful_offset, whole_cells, end_point and rounded_cell specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    exact = error_free.functions(flags)
+    two_sum, two_product, pair_sum = exact.two_sum, exact.two_product, exact.pair_sum
+    BILINEAR = "BILINEAR" in flags
+    CAREFUL = "CAREFUL" in flags
+    INSIDE = "INSIDE" in flags
+    SHARP = "SHARP" in flags
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+    MINUS_ONE = real(-1.0)
+    EDGE = real(2.0**-33)
+    # Adding and taking off 1.5 * 2^23 rounds to nearest.
+    ROUNDING = real(12582912.0)
+
+    # The same as field_cell where no end point of the cloud leaves the table.
+    @wp.func
+    def table_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+        if INSIDE:
+            return (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
+        else:
+            return field_cell(col, row, rows, cols)
+
+    # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
+    # the working precision.
+    @wp.func
+    def careful_offset(frac: vec2, a: vec2, b: vec2, c: vec2, d: vec2, sign: real):
+        ab = two_product(a.x, b.x)
+        cd = two_product(c.x, d.x)
+        products = two_sum(ab.x, sign * cd.x)
+        total = two_sum(products.x, frac.x)
+        low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
+        return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
+
+    # Whole cells below an offset of two parts. What is left of it in [0, 1) comes second, and what is missing to 1
+    # third: both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or
+    # less short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
+    @wp.func
+    def whole_cells(offset: vec2):
+        nearest = wp.floor(offset.x + HALF)
+        past = vec2((offset.x - nearest) + offset.y, ZERO)
+        if SHARP:
+            past = two_sum(offset.x - nearest, offset.y)
+        size = past
+        if past.x < ZERO:
+            size = -past
+        other = vec2(ONE - size.x, ZERO)
+        if SHARP:
+            other = pair_sum(vec2(ONE, ZERO), -size)
+        rest = past
+        to_next = other
+        if past.x + EDGE < ZERO:
+            nearest -= ONE
+            rest = other
+            to_next = -past
+        return int(nearest), rest, to_next
+
+    # Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
+    @wp.struct
+    class EndPoint:
+        cell: wp.vec2i
+        rest_x: vec2
+        rest_y: vec2
+        to_next_x: vec2
+        to_next_y: vec2
+
+    # point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
+    # nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
+    @wp.func
+    def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
+        end = EndPoint()
+        x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
+        y = vec2((pose.y - shift) + (pose.w * point.x + pose.z * point.y), ZERO)
+        if CAREFUL:
+            if BILINEAR:
+                pass
+            else:
+                near = vec2(wp.floor(x.x), wp.floor(y.x))
+                left = vec2(x.x - near.x, y.x - near.y)
+                if left.x >= guard and left.y >= guard and left.x <= ONE - guard and left.y <= ONE - guard:
+                    end.cell = wp.vec2i(int(near.x), int(near.y))
+                    return end
+            c = vec2(pose.z, pose_low.z)
+            s = vec2(pose.w, pose_low.w)
+            p = vec2(point.x, point_low.x)
+            q = vec2(point.y, point_low.y)
+            x = careful_offset(two_sum(pose.x, -shift) + vec2(ZERO, pose_low.x), c, p, s, q, MINUS_ONE)
+            y = careful_offset(two_sum(pose.y, -shift) + vec2(ZERO, pose_low.y), s, p, c, q, ONE)
+        col, rest_x, to_next_x = whole_cells(x)
+        row, rest_y, to_next_y = whole_cells(y)
+        end.cell = wp.vec2i(col, row)
+        end.rest_x = rest_x
+        end.rest_y = rest_y
+        end.to_next_x = to_next_x
+        end.to_next_y = to_next_y
+        return end
+
+    # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. How far the place is off
+    # a cell's centre comes second.
+    @wp.func
+    def rounded_cell(lowered: vec4, point: vec2):
+        x = lowered.x + (lowered.z * point.x - lowered.w * point.y)
+        y = lowered.y + (lowered.w * point.x + lowered.z * point.y)
+        whole_x = (x + ROUNDING) - ROUNDING
+        whole_y = (y + ROUNDING) - ROUNDING
+        return wp.vec2i(int(whole_x), int(whole_y)), wp.max(wp.abs(x - whole_x), wp.abs(y - whole_y))
+
+    return SimpleNamespace(
+        table_cell=table_cell,
+        careful_offset=careful_offset,
+        whole_cells=whole_cells,
+        EndPoint=EndPoint,
+        end_point=end_point,
+        rounded_cell=rounded_cell,
+    )

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gpusense.backends import Device, devices
     from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
+    from gpusense.landmarks import LandmarkMap
     from gpusense.learning.fit import fit_beam_parameters
     from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
     from gpusense.learning.result import BeamFit
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     from gpusense.models.beam import BeamModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
+    from gpusense.models.landmark import LandmarkModel
     from gpusense.normals import surface_normals
-    from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+    from gpusense.parameters import BeamParameters, IncidenceParameters, LandmarkParameters, LikelihoodFieldParameters
     from gpusense.positions.bearings import triangulate, triangulate_triangle
     from gpusense.positions.both import locate
     from gpusense.positions.fix import PositionFix
@@ -45,6 +47,9 @@ _HOME = {
     "DiscreteFit": "gpusense.discrete",
     "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
+    "LandmarkMap": "gpusense.landmarks",
+    "LandmarkModel": "gpusense.models.landmark",
+    "LandmarkParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
@@ -83,6 +88,9 @@ __all__ = [
     "DiscreteFit",
     "IncidenceFit",
     "IncidenceParameters",
+    "LandmarkMap",
+    "LandmarkModel",
+    "LandmarkParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
     "OccupancyGrid",

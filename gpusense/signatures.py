@@ -47,6 +47,12 @@ FLAGS = {
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
     "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "RANGE": "some feature has a range",
+    "BEARING": "some feature has a bearing",
+    "SIGNATURE": "some feature has a signature",
+    "FIELD": "the field of view is less than a full circle",
+    "KNOWN": "it is known which landmark each feature is",
+    "MARGINAL": "each feature's densities at all landmarks are summed",
     "INFORMATION": "the sums of the log-likelihood's second derivatives are wanted",
     "CAREFUL": "end points need more than the working precision to fall into the right cell",
 }
@@ -151,6 +157,13 @@ _CHANGED = (
 # Readings and expected ranges to learn from, in blocks of one length.
 _PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
 _RANGE = ("real limit", "real resolution", "real range_max")
+_LANDMARKS = ("real4 landmark [landmarks]", "real4 signature [landmarks]")
+_PLACED = (*_POSES, "real4 pose_low [particles]")
+_FEATURES = ("real feature [28 * features]",)
+_MIXTURE = ("real terms [4]", "real2 arcs [11]")
+_FEATURE_RESULT = (
+    "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",
+)  # fmt: skip
 # Rays of a cone and the least cosine of an angle of incidence that returns; kinds of terms, one for each bin of angles.
 _CONE = ("int cone_rays", "real critical")
 _ECHO = ("int kinds", *_CONE)
@@ -265,5 +278,21 @@ KERNELS: dict[str, Kernel] = {
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_RESULT, *_MAP, "int particles",
         "int readings", "real guard", "real fixed", "real temperature", wide=True,
+    ),
+    "score_features": _kernel(
+        "landmark_score", "particle", *_LANDMARKS, "int start [rows * cols + 1]", *_PLACED, *_FEATURES,
+        "int partner [features]", *_MIXTURE, *_FEATURE_RESULT, *_MAP, "int landmarks", "int particles", "int features",
+        "real size", "real share", "real fixed", "real temperature", wide=True,
+    ),
+    "joint_features": _kernel(
+        "landmark_joint", "particle", *_LANDMARKS, *_PLACED, *_FEATURES, *_MIXTURE,
+        "out real best [particles * sets]", "out int choice [particles * sets * features]",
+        "out real value [particles * sets * features]", *_FEATURE_RESULT, "int landmarks", "int particles",
+        "int features", "int sets", "real size", "real fixed", "real temperature",
+    ),
+    "count_unseen": _kernel(
+        "landmark_unseen", "particle", "real4 landmark [landmarks]", "int start [rows * cols + 1]", *_PLACED,
+        "int which [particles * features]", "out real log_p [particles]", *_MAP, "int particles", "int features",
+        "real size", "real range_max", "real axis_cosine", "real axis_sine", "real least", "real log_missed",
     ),
 }  # fmt: skip

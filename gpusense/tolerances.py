@@ -109,6 +109,10 @@ _ALL = (
         "nearer than 1e-13 cells per cell of range twice the digits cannot tell, and either cell is right",
     ),
     Tolerance(
+        "landmark", 16, "eps (1 + |log p_k|) of the precision",
+        "exponents and angles in two numbers; what is left are exp, log, log1p and erf within a few eps",
+    ),
+    Tolerance(
         "normals of straight walls, mean", 2, "degrees",
         "the error of the principal direction of a strip of 9 cells of a wall: half a cell of steps at its ends",
     ),

@@ -126,6 +126,17 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert all(row["error"] < 1e-2 for row in report["rows"] if row["error"] is not None)
 
 
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_landmarks_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--repeats", "1", "--seconds", "0.01"]
+    report = run_script("landmarks.py", "--backend", needs(selection), *arguments, output=tmp_path / "landmarks")
+    rows = report["rows"]
+    assert {(row["what"], row["cloud"]) for row in rows} == {
+        ("known", "tracking"), ("known", "global"), ("nearest", "tracking"), ("nearest", "global"),
+    }  # fmt: skip
+    assert all(row["rate"] > 0 and row["error"] < 16 for row in rows)
+
+
 def test_sonar_field_runs(tmp_path: Path) -> None:
     """Every way is tuned and scored, and the drawings are made; the recorded run is left out where there is none."""
     report = run_script(

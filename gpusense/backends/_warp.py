@@ -362,7 +362,9 @@ class _Pieces:
         self._name = _shared_axis(row) or ""
         self._axis = row.launch.index(self._name)
         self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
-        self._work = [i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings")]
+        self._work = [
+            i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
+        ]
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         particles = size[self._axis]

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from gpusense.grid import OccupancyGrid
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
+    from gpusense.models.absolute import HeadingModel, PositionModel
+    from gpusense.models.beacons import BeaconModel
     from gpusense.models.beam import BeamModel
+    from gpusense.models.bumper import BumperModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
@@ -27,19 +30,28 @@ if TYPE_CHECKING:
     from gpusense.positions.ranges import trilaterate
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
+    from gpusense.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeaconModel": "gpusense.models.beacons",
+    "BeaconParameters": "gpusense.sensor_parameters",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
+    "BumperModel": "gpusense.models.bumper",
+    "BumperParameters": "gpusense.sensor_parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "HeadingModel": "gpusense.models.absolute",
+    "HeadingParameters": "gpusense.sensor_parameters",
     "IncidenceParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
     "Odometry": "gpusense.logs",
     "PositionFix": "gpusense.positions.fix",
+    "PositionModel": "gpusense.models.absolute",
+    "PositionParameters": "gpusense.sensor_parameters",
     "RayCaster": "gpusense.models.caster",
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
@@ -60,16 +72,24 @@ _HOME = {
 }
 
 __all__ = [
+    "BeaconModel",
+    "BeaconParameters",
     "BeamModel",
     "BeamParameters",
+    "BumperModel",
+    "BumperParameters",
     "CasterMethod",
     "Device",
+    "HeadingModel",
+    "HeadingParameters",
     "IncidenceParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
     "OccupancyGrid",
     "Odometry",
     "PositionFix",
+    "PositionModel",
+    "PositionParameters",
     "RayCaster",
     "Reading",
     "Scan",

@@ -48,7 +48,9 @@ class BeaconModel(PointModel):
         self.parameters = BeaconParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BeaconParameters):
             raise TypeError(f"parameters: must be BeaconParameters, got {_checks.show(parameters)}")
-        self.xy = _checks.array("xy", xy, ("M", 2)).copy()
+        given = _checks.as_array("xy", xy)
+        # An empty list has no columns.
+        self.xy = _checks.array("xy", given.reshape(0, 2) if given.shape == (0,) else given, ("M", 2)).copy()
         self.xy.flags.writeable = False
         super().__init__(backend, precision)
         # Poses and beacons are placed relative to the middle of the beacons.
@@ -97,7 +99,10 @@ class BeaconModel(PointModel):
         if ids is None:
             z, index = _checks.array("ranges", given, (known,), finite=False), np.arange(known)
         else:
-            index = _checks.array("ids", ids, ("F",), dtype=np.int64)
+            chosen = _checks.as_array("ids", ids)
+            index = _checks.array(
+                "ids", chosen.astype(np.int64) if chosen.size == 0 else chosen, ("F",), dtype=np.int64
+            )
             z = _checks.array("ranges", given, (len(index),), finite=False)
             outside = (index < 0) | (index >= known)
             if outside.any():

@@ -35,6 +35,7 @@ class BumperModel(PointModel):
     is the distance from the outline to the nearest occupied cell's centre, less half a cell; distances are those of the
     cells that points lie in, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle
     in segments, are looked up at points half a cell apart at most. What stands wholly inside a polygon touches nothing.
+    A point farther off the map than the outline reaches, and 4 deviations (64 cells at most), counts as there.
 
     Args:
         grid: The map.
@@ -78,7 +79,8 @@ class BumperModel(PointModel):
         side = grid.resolution
         radius, self._points, self._start = sample_outline(outline, segments, side / 2)
         self.segments = len(self._start) - 1
-        margin = math.ceil(radius / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
+        extent = radius + float(np.hypot(*self._points.T).max())
+        margin = math.ceil(extent / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
         obstacles = np.pad(
             grid.obstacles("occupied" if unknown == "occupied" else "free"),
             margin + FIELD_RING,
@@ -90,7 +92,7 @@ class BumperModel(PointModel):
             raise ValueError(f"grid: {rule}, got {rows} x {cols}")
         self._table = squared_distances(self._backend, obstacles)
         self._region = Region(-margin, -margin, *(size - 2 * FIELD_RING for size in obstacles.shape))
-        self._guard = _GUARD * float(np.finfo(self._real).eps) * (float(np.abs(self._points).max()) * 2 / side + 2)
+        self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
         high, low = split(self._points / side, self._real)
         self._given = [self._backend.upload(each) for each in (high, low)]
         self._terms_there = self._backend.upload(self._terms(radius))

@@ -21,7 +21,7 @@ def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
 
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:
     """``theta - target`` in [-pi, pi]; the target is in there already."""
-    huge: np.ndarray = ~np.asarray(np.abs(theta) <= LIMIT)
+    huge = np.abs(theta) > LIMIT
     quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
     if huge.any():
         quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
@@ -48,7 +48,7 @@ def place_relative(
     ``verdict``, which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
     """
     given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
-    finite = np.isfinite(given).all(axis=1)
+    finite: np.ndarray = np.asarray(np.isfinite(given).all(axis=1))
     if not finite.all():
         verdict[0] = 1
     x_y = two_sum(given[:, :2], -np.array([origin_x, origin_y]))
@@ -58,7 +58,7 @@ def place_relative(
         moved = two_sum(x_y[0], arm)
         near = (np.abs(x_y[0]) <= FARTHEST).all(axis=1, keepdims=True)
         x_y = where_pair(near, two_sum(moved[0], moved[1] + x_y[1]), x_y)
-    near = finite[:, None] & (np.abs(x_y[0]) <= FARTHEST)
+    near = finite[:, np.newaxis] & (np.abs(x_y[0]) <= FARTHEST)
     high = np.where(finite[:, None], np.fmin(np.fmax(x_y[0], -FARTHEST), FARTHEST), 0.0)
     low = np.where(near, x_y[1], 0.0)
     place[:particles, 0::2] = high
@@ -76,7 +76,7 @@ def wrap_headings(
 ) -> None:
     """Headings minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict as for places."""
     given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
-    finite = np.isfinite(given).all(axis=1)
+    finite: np.ndarray = np.asarray(np.isfinite(given).all(axis=1))
     if not finite.all():
         verdict[0] = 1
     high, low = wrapped_difference(np.where(finite, given[:, 2], 0.0), (target, target_low))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import runpy
+from pathlib import Path
 
 import absolute_oracle as oracle
 import numpy as np
@@ -232,6 +234,13 @@ def test_sensors_of_a_wide_deviation_say_nothing(backend: str) -> None:
     np.testing.assert_allclose(flat, -np.log(2 * np.pi), rtol=1e-6)
     wide = gs.HeadingModel(gs.HeadingParameters(kind="von_mises", kappa=0.0), backend=backend)
     np.testing.assert_allclose(wide.log_likelihood(poses, 1.0), -np.log(2 * np.pi), rtol=1e-6)
+
+
+def test_the_example_sharpens_the_estimate(capsys) -> None:
+    runpy.run_path(str(Path(__file__).parents[1] / "examples" / "several_sensors.py"))
+    lines = capsys.readouterr().out.splitlines()
+    together = [float(line.split()[4]) for line in lines if line.startswith("... and")]
+    assert len(together) == 4 and together[3] < 1 < together[2] < together[0]
 
 
 def test_parameters_are_values() -> None:

@@ -1,4 +1,4 @@
-"""Where is the robot? A laser, a compass, a position fix and a bumper, each of them vague, and what they say together."""
+"""Where is the robot? A laser, a compass, a position fix and a bumper, each of them vague, and all together."""
 
 import numpy as np
 

@@ -88,7 +88,10 @@ HEADINGS = {
     "only noise": gs.HeadingParameters(z_hit=0.0, z_rand=1.0),
     "turned far": gs.HeadingParameters(sigma=0.5, offset=1e5),
     **{f"sigma {s:g}": gs.HeadingParameters(sigma=s) for s in (1e-8, 1e-4, 0.7, 1.4999, 1.5001, 2.5, 6.0, 1e3, 1e6)},
-    **{f"kappa {k:g}": gs.HeadingParameters(kind="von_mises", kappa=k) for k in (0, 1e-9, 0.5, 30, 1e4, 1e9, 1e16)},
+    **{
+        f"kappa {k:g}": gs.HeadingParameters(kind="von_mises", kappa=k)
+        for k in (0, 1e-300, 1e-9, 0.5, 30, 1e4, 1e9, 1e16)
+    },
     "von mises": gs.HeadingParameters(kind="von_mises", kappa=20.0, z_hit=0.5, z_rand=0.5, offset=3.0),
 }
 

@@ -189,8 +189,8 @@ class HeadingModel(PointModel):
             if p.kind == "von_mises":
                 from scipy.special import i0e
 
-                if p.kappa > 0:
-                    self._check_scale("kappa", 1 / math.sqrt(p.kappa), "1 / sqrt(kappa) ")
+                # Small ones may vanish: they are as 0.
+                self._check_scale("kappa", 1 / math.sqrt(max(p.kappa, 1.0)), "1 / sqrt(kappa) ")
                 kind, scale = VON_MISES, (2 * exact(p.kappa)).sqrt()
                 peak = total(log_hit, -(2 * PI * exact(float(i0e(p.kappa)))).ln())
             elif p.sigma <= _WIDEST_SUM:
@@ -203,6 +203,3 @@ class HeadingModel(PointModel):
                 kind, scale, peak = SERIES, Decimal(0), total(log_hit, -(2 * PI).ln())
                 waves = [2 * math.exp(-0.5 * min(n * p.sigma, 1e3) ** 2) for n in range(1, WAVES + 1)]
         return kind, np.array([*two_parts((scale, peak), real), random, decay, *waves], real)
-
-
-__all__ = ["HeadingModel", "PositionModel"]

@@ -16,6 +16,7 @@ from gpusense.models.point_model import Part, PointModel
 from gpusense.models.scan_model import log_weight
 from gpusense.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.reference.beacons import BEACON, NORMAL, STUDENT_T, TERMS, TWO_NORMALS
+from gpusense.reference.relative import FARTHEST
 from gpusense.sensor_parameters import BeaconParameters
 
 
@@ -56,6 +57,9 @@ class BeaconModel(PointModel):
         # Poses and beacons are placed relative to the middle of the beacons.
         middle = (self.xy.min(axis=0) / 2 + self.xy.max(axis=0) / 2) if len(self.xy) else np.zeros(2)
         self._origin = float(middle[0]), float(middle[1])
+        far = np.abs(self.xy - middle).max(initial=0.0)
+        if not far <= FARTHEST:
+            raise ValueError(f"xy: must be within {FARTHEST:.2g} m of the middle, got {far:.2g} m")
         self._kind, terms, series = self._mixture()
         self._count = len(series)
         self._terms_there, self._series_there = self._backend.upload(terms), self._backend.upload(series)
@@ -126,6 +130,7 @@ class BeaconModel(PointModel):
         p, real = self.parameters, self._real
         self._check_scale("sigma_range", p.sigma_range)
         self._check_scale("range_max", p.range_max)
+        self._check_scale("bias", max(abs(p.bias), 1.0), "its size ")
         random = log_weight(p.z_rand) - math.log(p.range_max)
         rest: list[Any] = [0.0] * 6
         series = np.zeros(1)

@@ -81,17 +81,17 @@ class BumperModel(PointModel):
         self.segments = len(self._start) - 1
         extent = radius + float(np.hypot(*self._points.T).max())
         margin = math.ceil(extent / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
+        rows, cols = (size + 2 * margin for size in grid.shape)
+        if max(rows, cols) + 2 * FIELD_RING > LONGEST_SIDE:
+            rule = f"must have at most {LONGEST_SIDE - 2 * FIELD_RING} rows and columns with room for the outline"
+            raise ValueError(f"grid: {rule}, got {rows} x {cols}")
         obstacles = np.pad(
             grid.obstacles("occupied" if unknown == "occupied" else "free"),
             margin + FIELD_RING,
             constant_values=outside == "occupied",
         )
-        if max(obstacles.shape) > LONGEST_SIDE:
-            rows, cols = obstacles.shape
-            rule = f"must have at most {LONGEST_SIDE} rows and columns with room for the outline"
-            raise ValueError(f"grid: {rule}, got {rows} x {cols}")
         self._table = squared_distances(self._backend, obstacles)
-        self._region = Region(-margin, -margin, *(size - 2 * FIELD_RING for size in obstacles.shape))
+        self._region = Region(-margin, -margin, rows, cols)
         self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
         high, low = split(self._points / side, self._real)
         self._given = [self._backend.upload(each) for each in (high, low)]

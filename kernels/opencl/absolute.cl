@@ -20,6 +20,8 @@
 #define RANDOM 4
 #define DECAY 5
 #define WAVE 6
+// exp of minus this is below half an eps.
+#define NEGLIGIBLE 40
 #define HALF_TURN ((real)3.141592653589793)
 #define HALF_TURN_LOW ((real)(FLOAT64 ? 0.0 : -8.742277657347586e-08))
 // sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
@@ -42,6 +44,8 @@ real2 half_sine(const real2 residual) {
 real log_other_turns(const real2 residual, const real decay) {
     const real size = fabs(residual.x), low = residual.x < 0 ? -residual.y : residual.y;
     const real rest = fmax((HALF_TURN - size) + (HALF_TURN_LOW - low), (real)0);
+    // Mostly nothing is to be added.
+    if (decay * rest > NEGLIGIBLE) return 0;
     real others = 0;
     for (int k = 1; k <= WRAPS; ++k) {
         others += exp(-decay * k * ((k - 1) * HALF_TURN + rest));

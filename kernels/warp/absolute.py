@@ -39,6 +39,8 @@ def make(name, flags):
     ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
     HALF_TURN = real(3.141592653589793)
     HALF_TURN_LOW = real(0.0 if "FLOAT64" in flags else -8.742277657347586e-08)
+    # exp of minus this is below half an eps.
+    NEGLIGIBLE = real(40.0)
     S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
 
     # sin(r / 2) of an angle in [-pi, pi].
@@ -60,6 +62,9 @@ def make(name, flags):
         rest = wp.max((HALF_TURN - size) + (HALF_TURN_LOW - low), ZERO)
         others = real(0.0)
         k = int(1)
+        # Mostly nothing is to be added.
+        if decay * rest > NEGLIGIBLE:
+            k = WRAPS + 1
         while k <= WRAPS:
             turns = real(k)
             others += wp.exp(-decay * turns * ((turns - ONE) * HALF_TURN + rest))

@@ -104,6 +104,19 @@ def test_bumpers_by_brute_force(backend: str, precision: str, scene: str) -> Non
             assert_close(found[told], truth[told].sum(axis=1), precision, truth[told])
 
 
+@each_precision
+def test_a_bumper_of_ten_nanometres(backend: str, precision: str) -> None:
+    cells = np.zeros((5, 9), int)
+    cells[2, 7] = 100
+    p, poses = gs.BumperParameters(sigma=1e-8, p_contact=0.9, p_false=0.0), [[0.45, 0.25, 0.0]]
+    for steps in (-2.0, 0.3, 5.0):
+        radius = 0.3 - 0.05 + 1e-8 * steps
+        model = gs.BumperModel(gs.OccupancyGrid(cells, 0.1), radius, p, backend=backend, precision=precision)
+        for pressed in (True, False):
+            found = model.log_likelihood(poses, pressed)
+            assert_close(found, [oracle.bump(9, 0.1, radius, pressed, p)], precision)
+
+
 def test_a_bumper_that_is_pressed_or_not(backend: str) -> None:
     model = gs.BumperModel(GRID, 0.2, backend=backend, precision="float64")
     poses = poses_around(GRID)
@@ -205,6 +218,8 @@ def test_extreme_poses_are_never_nan(backend: str, precision: str) -> None:
     for name, (model, measured) in given.items():
         found = model.log_likelihood(poses, *measured)
         assert not np.isnan(found).any() and not np.isposinf(found).any(), name
+        # Exponents are held where they would overflow.
+        assert np.isfinite(found).all(), name
 
 
 @each_precision

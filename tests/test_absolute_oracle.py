@@ -101,7 +101,7 @@ def test_headings(backend: str, precision: str) -> None:
     for name, p in HEADINGS.items():
         width = p.sigma if p.kind == "wrapped_normal" else 1 / np.sqrt(p.kappa) if p.kappa else 1.0
         width = min(width, 0.1)
-        for reading in (0.0, 3.1, -1e6 + 0.1):
+        for reading in (0.0, 3.1, 4.7, -1e6 + 0.1):
             at = np.remainder(reading - p.offset, 2 * np.pi)
             around = np.array([at + step * width for step in STEPS] + [at + np.pi - 1e-7, at - np.pi + 1e-7])
             theta = np.concatenate(
@@ -171,9 +171,9 @@ def test_beacons(backend: str, precision: str) -> None:
 
 
 @each_precision
-@pytest.mark.parametrize("kind", ["normal", "student_t", "mixture"])
-def test_beacons_of_ten_nanometres(backend: str, precision: str, kind: str) -> None:
-    p = gs.BeaconParameters(sigma_range=1e-8, kind=kind, nu=3, sigma_heavy=1e-6, z_hit=1.0, z_rand=0.0, range_max=20.0)
+@pytest.mark.parametrize(("kind", "nu"), [("normal", 1), ("student_t", 3), ("student_t", 99), ("mixture", 1)])
+def test_beacons_of_ten_nanometres(backend: str, precision: str, kind: str, nu: int) -> None:
+    p = gs.BeaconParameters(sigma_range=1e-8, kind=kind, nu=nu, sigma_heavy=1e-6, z_hit=1.0, z_rand=0.0, range_max=20.0)
     poses = np.zeros((len(STEPS), 3))
     poses[:, 0] = 1e-8 * STEPS
     xy = [[3.0, 4.0]]

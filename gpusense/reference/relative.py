@@ -25,6 +25,7 @@ def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) ->
     quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
     if huge.any():
         quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
+    # Three quarters would be rounded.
     quarters = np.where(quadrant == 3, -1, quadrant).astype(np.float64)
     angle = pair_sum((quarters * QUARTER, quarters * QUARTER_LOW), rest)
     angle = pair_sum(angle, (-np.asarray(target[0]), -np.asarray(target[1])))

@@ -23,6 +23,7 @@ double2 wrapped_difference(const double theta, const double2 target) {
 #else
     const Turn turn = reduce_ordinary(theta);
 #endif
+    // Three quarters would be rounded.
     const double quarters = turn.quadrant == 3 ? -1.0 : (double)turn.quadrant;
     double2 angle = pair_sum_float64((double2)(quarters * QUARTER, quarters * QUARTER_LOW), turn.rest);
     angle = pair_sum_float64(angle, -target);

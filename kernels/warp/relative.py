@@ -43,6 +43,7 @@ def make(name, flags):
                 quadrant, rest = reduce_huge(theta)
         else:
             quadrant, rest = reduce_ordinary(theta)
+        # Three quarters would be rounded.
         quarters = wp.float64(quadrant)
         if quadrant == 3:
             quarters = MINUS_ONE

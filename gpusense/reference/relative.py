@@ -25,8 +25,8 @@ def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) ->
     quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
     if huge.any():
         quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
-    # Three quarters would be rounded.
-    quarters = np.where(quadrant == 3, -1, quadrant).astype(np.float64)
+    # Up to three quarters are exact: the last bits of one are 0.
+    quarters = quadrant.astype(np.float64)
     angle = pair_sum((quarters * QUARTER, quarters * QUARTER_LOW), rest)
     angle = pair_sum(angle, (-np.asarray(target[0]), -np.asarray(target[1])))
     turns = np.where(angle[0] > 2 * QUARTER, -4.0, np.where(angle[0] < -2 * QUARTER, 4.0, 0.0))

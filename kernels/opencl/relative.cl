@@ -23,8 +23,8 @@ double2 wrapped_difference(const double theta, const double2 target) {
 #else
     const Turn turn = reduce_ordinary(theta);
 #endif
-    // Three quarters would be rounded.
-    const double quarters = turn.quadrant == 3 ? -1.0 : (double)turn.quadrant;
+    // Up to three quarters are exact: the last bits of one are 0.
+    const double quarters = (double)turn.quadrant;
     double2 angle = pair_sum_float64((double2)(quarters * QUARTER, quarters * QUARTER_LOW), turn.rest);
     angle = pair_sum_float64(angle, -target);
     const double turns = angle.x > 2.0 * QUARTER ? -4.0 : angle.x < -2.0 * QUARTER ? 4.0 : 0.0;

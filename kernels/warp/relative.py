@@ -15,7 +15,7 @@ FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(2.0**60)), wp.constant(wp.floa
 QUARTER, QUARTER_LOW = wp.constant(wp.float64(1.5707963267948966)), wp.constant(wp.float64(6.123233995736766e-17))
 HALF_TURN, MINUS_HALF_TURN = wp.constant(wp.float64(3.141592653589793)), wp.constant(wp.float64(-3.141592653589793))
 ZERO, FOUR = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(4.0))
-MINUS_ONE, MINUS_FOUR = wp.constant(wp.float64(-1.0)), wp.constant(wp.float64(-4.0))
+MINUS_FOUR = wp.constant(wp.float64(-4.0))
 LIMIT = wp.constant(wp.float64(1048576.0))
 
 
@@ -43,10 +43,8 @@ def make(name, flags):
                 quadrant, rest = reduce_huge(theta)
         else:
             quadrant, rest = reduce_ordinary(theta)
-        # Three quarters would be rounded.
+        # Up to three quarters are exact: the last bits of one are 0.
         quarters = wp.float64(quadrant)
-        if quadrant == 3:
-            quarters = MINUS_ONE
         angle = pair_sum(wp.vec2d(quarters * QUARTER, quarters * QUARTER_LOW), rest)
         angle = pair_sum(angle, -target)
         turns = wp.where(angle.x > HALF_TURN, MINUS_FOUR, wp.where(angle.x < MINUS_HALF_TURN, FOUR, ZERO))

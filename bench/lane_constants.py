@@ -2,8 +2,8 @@
 
 Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
 |r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);
-erf(x) = 1 - exp(-x W(x)) for x up to 4. log 2 is cut into a part that has products with counts without rounding and the
-rest.
+erf(x) = 1 - exp(-x W(x)) for x up to 4; arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that
+has products with counts without rounding and the rest.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ mp.mp.dps = 50
 HALF = mp.log(2) / 2 * (1 + mp.mpf(2) ** -10)
 LOW, HIGH = mp.sqrt(0.5) - 1, mp.sqrt(2) - 1
 ERF_ONE = mp.mpf(4)
+# tan(pi/8) with room for rounding.
+ARC_END = (mp.sqrt(2) - 1) * (1 + mp.mpf(2) ** -10)
 # Bits of the first part of log 2; counts have at most 8.
 PART_BITS = 16
 POINTS = 1001
@@ -79,6 +81,11 @@ def error_function() -> tuple[list[float], float]:
     return remez(lambda x: -mp.log(mp.erfc(x)) / x, lambda x: x * mp.erfc(x) / mp.erf(x), zero, ERF_ONE, 9)
 
 
+def arc() -> tuple[list[float], float]:
+    """A, and its error."""
+    return remez(lambda z: (mp.atan(mp.sqrt(z)) / mp.sqrt(z) - 1) / z, lambda z: z, mp.mpf(0), ARC_END**2, 5)
+
+
 def log_parts() -> list[float]:
     """log 2 in a part of 16 bits and the rest, and its reciprocal."""
     scale = mp.mpf(2) ** PART_BITS
@@ -88,7 +95,7 @@ def log_parts() -> list[float]:
 
 def main() -> None:
     """Print everything."""
-    for name, (powers, error) in (("E", exponential()), ("L", logarithm()), ("W", error_function())):
+    for name, (powers, error) in (("E", exponential()), ("L", logarithm()), ("W", error_function()), ("A", arc())):
         print(name, ", ".join(f"{c:.9g}f" for c in powers), f"relative error 2^{error:.1f}")
     print("log 2 in parts, and 1 / log 2", *(f"{part:.9g}f" for part in log_parts()))
 

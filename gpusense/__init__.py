@@ -14,7 +14,12 @@ from gpusense._version import __version__
 
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
+    from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
+    from gpusense.landmarks import LandmarkMap
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.result import BeamFit
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.absolute import HeadingModel, PositionModel
@@ -23,7 +28,9 @@ if TYPE_CHECKING:
     from gpusense.models.bumper import BumperModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
-    from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+    from gpusense.models.landmark import LandmarkModel
+    from gpusense.normals import surface_normals
+    from gpusense.parameters import BeamParameters, IncidenceParameters, LandmarkParameters, LikelihoodFieldParameters
     from gpusense.positions.bearings import triangulate, triangulate_triangle
     from gpusense.positions.both import locate
     from gpusense.positions.fix import PositionFix
@@ -36,15 +43,23 @@ if TYPE_CHECKING:
 _HOME = {
     "BeaconModel": "gpusense.models.beacons",
     "BeaconParameters": "gpusense.sensor_parameters",
+    "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
     "BumperModel": "gpusense.models.bumper",
     "BumperParameters": "gpusense.sensor_parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
+    "DiscreteBeamModel": "gpusense.discrete",
+    "DiscreteCauses": "gpusense.discrete",
+    "DiscreteFit": "gpusense.discrete",
     "HeadingModel": "gpusense.models.absolute",
     "HeadingParameters": "gpusense.sensor_parameters",
+    "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
+    "LandmarkMap": "gpusense.landmarks",
+    "LandmarkModel": "gpusense.models.landmark",
+    "LandmarkParameters": "gpusense.parameters",
     "LikelihoodFieldModel": "gpusense.models.field",
     "LikelihoodFieldParameters": "gpusense.parameters",
     "OccupancyGrid": "gpusense.grid",
@@ -60,11 +75,14 @@ _HOME = {
     "classify": "gpusense.scanner",
     "devices": "gpusense.backends",
     "distance_transform": "gpusense.prepare",
+    "fit_beam_parameters": "gpusense.learning.fit",
+    "fit_incidence_parameters": "gpusense.learning.incidence",
     "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
+    "surface_normals": "gpusense.normals",
     "triangulate": "gpusense.positions.bearings",
     "triangulate_triangle": "gpusense.positions.bearings",
     "trilaterate": "gpusense.positions.ranges",
@@ -74,15 +92,23 @@ _HOME = {
 __all__ = [
     "BeaconModel",
     "BeaconParameters",
+    "BeamFit",
     "BeamModel",
     "BeamParameters",
     "BumperModel",
     "BumperParameters",
     "CasterMethod",
     "Device",
+    "DiscreteBeamModel",
+    "DiscreteCauses",
+    "DiscreteFit",
     "HeadingModel",
     "HeadingParameters",
+    "IncidenceFit",
     "IncidenceParameters",
+    "LandmarkMap",
+    "LandmarkModel",
+    "LandmarkParameters",
     "LikelihoodFieldModel",
     "LikelihoodFieldParameters",
     "OccupancyGrid",
@@ -99,11 +125,14 @@ __all__ = [
     "classify",
     "devices",
     "distance_transform",
+    "fit_beam_parameters",
+    "fit_incidence_parameters",
     "locate",
     "normalize_weights",
     "read_log",
     "read_map",
     "resample",
+    "surface_normals",
     "triangulate",
     "triangulate_triangle",
     "trilaterate",

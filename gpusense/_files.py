@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and settings that are read from them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import os
 import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+from gpusense import _checks
+
+# Bytes: a file of settings is small.
+_LARGEST_YAML = 1 << 20
 
 
 def check_writable(path: Path) -> None:
@@ -54,3 +59,27 @@ def _fresh(path: Path) -> Iterator[BinaryIO]:
         raise FileNotFoundError(error.errno, error.strerror, str(path.parent)) from None
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def read_mapping(file: Path) -> dict[Any, Any]:
+    """The mapping in a YAML file of plain values.
+
+    Raises:
+        ValueError: it is too large, no plain YAML, or no mapping.
+    """
+    import yaml
+
+    with file.open("rb") as stream:
+        text = stream.read(_LARGEST_YAML + 1)
+    if len(text) > _LARGEST_YAML:
+        raise ValueError(f"{file}: must be a YAML file of at most {_LARGEST_YAML} bytes, got a larger file")
+    try:
+        data = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        problem = getattr(error, "problem", None) or type(error).__name__
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{file}: must be plain YAML, got an error{where}: {problem}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{file}: must hold a YAML mapping, got {_checks.show(data)}")
+    return data

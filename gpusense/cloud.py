@@ -12,7 +12,7 @@ import numpy as np
 
 from gpusense import _checks, arrays
 from gpusense.backends.base import Backend, Buffer
-from gpusense.frames import Mount, frame_scalars, place_poses
+from gpusense.frames import Cells, Mount, frame_scalars, place_poses
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
 from gpusense.reference.heading import LIMIT
@@ -114,7 +114,7 @@ class Cloud:
         space: Workspace,
         given: Buffer,
         part: tuple[int, int],
-        frame: tuple[Region, OccupancyGrid, Mount],
+        frame: tuple[Region, Cells, Mount],
         real: np.dtype,
         *,
         careful: bool,
@@ -138,7 +138,7 @@ class Cloud:
         self,
         space: Workspace,
         part: tuple[int, int],
-        frame: tuple[Region, OccupancyGrid, Mount],
+        frame: tuple[Region, Cells, Mount],
         real: np.dtype,
         careful: bool,
     ) -> Placed:

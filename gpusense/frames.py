@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -18,6 +19,23 @@ from gpusense.reference.heading import cos_sin
 
 Mount = tuple[float, float, float]
 Frame = tuple[float, float, float, float, float, float, float]
+
+
+class Cells(Protocol):
+    """What poses are placed in: an occupancy grid, or buckets of landmarks."""
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """(x, y, yaw) of the first cell's corner in the world."""
+
+    @property
+    def resolution(self) -> float:
+        """Side of a cell [m]."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+
 
 _CAREFUL = frozenset({"CAREFUL"})
 
@@ -58,18 +76,18 @@ def _cos_sin(angle: float) -> tuple[float, float]:
     return float(cos[0]), float(sin[0])
 
 
-def frame_scalars(grid: OccupancyGrid, mount: Mount) -> Frame:
+def frame_scalars(grid: Cells, mount: Mount) -> Frame:
     """The grid's frame and the mount as the kernel ``place_poses`` takes them, from ``origin_x`` to ``yaw_sin``."""
     x, y, yaw = grid.origin
     return x, y, grid.resolution, mount[0], mount[1], *_cos_sin(yaw)
 
 
-def place_poses(poses: np.ndarray, grid: OccupancyGrid, mount: Mount, real: np.dtype) -> PlacedPoses:
+def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) -> PlacedPoses:
     """Place sensors in a grid: the pose times the scanner's mount, without the mount's yaw.
 
     Args:
         poses: (N, 3) float64 robot poses in the world, metres and radians.
-        grid: The map that gives the frame.
+        grid: The cells that give the frame.
         mount: The sensor's pose on the robot; its yaw belongs to the bearings.
         real: Precision of the result.
     """

@@ -5,17 +5,20 @@ from __future__ import annotations
 from gpusense.backends.base import BackendInfo
 from gpusense.signatures import CASTER_FLAGS
 
-# A kernel has no such variant with these flags, or without all of some set of those.
-_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
+# A kernel has no such variant with these flags, some of them of its own, or without all of some set of those.
+_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
+_NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"}}
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "score_beams": ({"LINEAR"},),
+    "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),
 }
 
 
 def widened(info: BackendInfo, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
     """The flags of a launch on a device, with WIDE where it asks for lanes and the scene has such a kernel."""
-    if info.lanes == 1 or flags & _NEVER or not any(needed <= flags for needed in _NEEDED[kernel]):
+    never = _NEVER | _NEVER_OF.get(kernel, set())
+    if info.lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED[kernel]):
         return frozenset(flags)
     return frozenset(flags) | {"WIDE"}

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense import _checks
+from gpusense._files import read_mapping
 from gpusense._images import open_raster
 from gpusense.grid import OccupancyGrid
-
-_MAX_YAML_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -170,21 +169,7 @@ def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
 
 
 def _read_yaml(file: Path) -> _MapYaml:
-    import yaml
-
-    with file.open("rb") as stream:
-        text = stream.read(_MAX_YAML_BYTES + 1)
-    if len(text) > _MAX_YAML_BYTES:
-        raise ValueError(f"{file}: must be a YAML file of at most {_MAX_YAML_BYTES} bytes, got a larger file")
-    try:
-        data = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        problem = getattr(error, "problem", None) or type(error).__name__
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        raise ValueError(f"{file}: must be plain YAML, got an error{where}: {problem}") from error
-    if not isinstance(data, dict):
-        raise ValueError(f"{file}: must hold a YAML mapping, got {_checks.show(data)}")
+    data = read_mapping(file)
     for key in ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"):
         if key not in data:
             raise ValueError(f"{file}: must have the key {key!r}, got {_checks.show(list(data))}")

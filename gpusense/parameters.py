@@ -166,3 +166,53 @@ class LikelihoodFieldParameters(_Parameters):
         self._check("sigma_hit", above=0)
         self._check("max_distance", above=0)
         _checks.choice("interpolation", self.interpolation, ("nearest", "bilinear"))
+
+
+@dataclass(frozen=True)
+class LandmarkParameters(_Parameters):
+    """The landmark model's parameters, *Probabilistic Robotics* section 6.6.
+
+    A deviation of None leaves that part of every feature out.
+
+    Raises:
+        TypeError: a value is not of its field's kind.
+        ValueError: a value breaks its field's rule, the two weights do not sum to 1 within 1e-6, or all deviations are
+            None.
+    """
+
+    sigma_range: float | None = 0.2
+    """The standard deviation of a range, > 0 [m] (equation 6.40)."""
+    sigma_bearing: float | None = 0.05
+    """The standard deviation of a bearing, > 0 [rad] (equation 6.40)."""
+    sigma_signature: float | None = None
+    """The standard deviation of a signature, > 0, in its own unit (equation 6.40)."""
+    z_detect: float = 0.95
+    """The weight of a feature that is a landmark, >= 0 [1]."""
+    z_false: float = 0.05
+    """The weight of a feature that is none, a false positive, >= 0 [1]."""
+    range_max: float = 20.0
+    """The largest range of a feature, > 0 [m]."""
+    field_of_view: float = 2 * math.pi
+    """The angle in which features are seen, half to each side of the sensor's axis, in (0, 2 pi] [rad]."""
+    signature_span: tuple[float, float] | None = None
+    """The smallest and largest signature of a feature; None for 4 deviations more than the map's own span."""
+    p_detect: float = 0.9
+    """The probability that a landmark in view is seen, in [0, 1] [1]; used for negative information only."""
+
+    def __post_init__(self) -> None:
+        names = ("sigma_range", "sigma_bearing", "sigma_signature")
+        for name in names:
+            if getattr(self, name) is not None:
+                self._check(name, above=0)
+        if all(getattr(self, name) is None for name in names):
+            raise ValueError(f"{' + '.join(names)}: must not all be None, got None")
+        self._check_weights("z_detect", "z_false")
+        self._check("range_max", above=0)
+        self._check("field_of_view", above=0, high=2 * math.pi)
+        self._check("p_detect", low=0, high=1)
+        if self.signature_span is not None:
+            low, high = (float(end) for end in _checks.array("signature_span", self.signature_span, (2,)))
+            if not low < high:
+                rule = "must be two rising numbers"
+                raise ValueError(f"signature_span: {rule}, got {_checks.show(self.signature_span)}")
+            object.__setattr__(self, "signature_span", (low, high))

@@ -107,6 +107,7 @@ def prepare_scan(
     specialize: bool,
     *,
     max_is_range: bool = False,
+    max_depends: bool = False,
     distinct: bool = False,
 ) -> PreparedScan:
     """Class, choose and group the readings of one scan.
@@ -119,9 +120,10 @@ def prepare_scan(
         beams: Which beams are used.
         specialize: False keeps readings without information, and casts equal bearings one by one.
         max_is_range: Evaluate finite max readings like ranges, at range_max.
+        max_depends: The probability of a max reading depends on the pose, so such readings are evaluated too.
         distinct: No two bearings are known to be the same.
     """
-    if specialize and distinct and beams is None and not max_is_range:
+    if specialize and distinct and beams is None and not (max_is_range or max_depends):
         return _plain_scan(ranges, scanner, vectors, z_max)
     kinds = classify(ranges, scanner)
     if max_is_range:
@@ -131,14 +133,13 @@ def prepare_scan(
     is_max = used & (kinds == Reading.MAX)
     hit = used & (kinds == Reading.HIT)
     informative = int(np.count_nonzero((kinds == Reading.HIT) | ((kinds == Reading.MAX) & (z_max > 0))))
-    values = np.where(hit, ranges, 0).astype(np.float64)
-    if specialize:
+    values = np.where(hit, ranges, np.nan).astype(np.float64)
+    values[is_max] = np.inf
+    if specialize and not max_depends:
         columns = np.flatnonzero(hit)
         constant = float(np.count_nonzero(is_max) * np.log(z_max)) if is_max.any() else 0.0
     else:
-        columns = np.arange(len(kinds))
-        values[~hit] = np.nan
-        values[is_max] = np.inf
+        columns = np.flatnonzero(hit | is_max) if specialize else np.arange(len(kinds))
         constant = 0.0
         is_max = np.zeros_like(is_max)
     rays, first, order = _group(vectors[columns], specialize and not distinct)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gpusense import _checks
 from gpusense.backends import BackendInfo
+from gpusense.discrete import DiscreteBeamModel
 from gpusense.grid import OccupancyGrid
 from gpusense.logs import Pose, Scan, read_log
 from gpusense.models.beam import BeamModel
@@ -271,7 +272,7 @@ def score_log(
         step(f"scan {index}")
         assert scan.pose is not None
         poses = cloud.draw(index, scan.pose, models[0].grid)
-        beams = evaluated_beams(models[0], scan)
+        beams = evaluated_beams(models[0], scan.ranges)
         scored = []
         for model, own in zip(models, found, strict=True):
             begin = time.perf_counter()
@@ -284,7 +285,8 @@ def score_log(
     return scores, [comparison.result() for comparison in comparisons]
 
 
-def evaluated_beams(model: Model, scan: Scan) -> int:
+def evaluated_beams(model: Model, ranges: Array) -> int:
     """How many readings of a scan a model evaluates at every particle: its hits, as far as ``beams=`` takes them."""
-    kinds = classify(scan.ranges, model.scanner)
-    return int(np.count_nonzero(choose_beams(kinds, model.beams, model.parameters.z_max > 0) & (kinds == Reading.HIT)))
+    kinds = classify(ranges, model.scanner)
+    informative = isinstance(model.parameters, DiscreteBeamModel) or model.parameters.z_max > 0
+    return int(np.count_nonzero(choose_beams(kinds, model.beams, informative) & (kinds == Reading.HIT)))

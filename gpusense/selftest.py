@@ -99,6 +99,7 @@ class Recorder:
             "parts": {"PER_BEAM"} & flags,
             "pose_low": {"CAREFUL"} & flags,
             "sensor": {"SENSOR_TABLE"} & flags,
+            "normals": {"INCIDENCE"} & flags,
             "map_table": {},
         }
         for argument, value in given.items():
@@ -165,7 +166,8 @@ def _replay_beams(launch: Launch, values: dict[str, Any]) -> np.ndarray:
     else:
         parts = log_density(launch.flags, z, expected, values["terms"])
     if "ALL_READINGS" in launch.flags:
-        parts = np.where(np.isnan(z), 0.0, np.where(np.isinf(z), values["terms"][7], parts))
+        atom = parts if "SENSOR_TABLE" in launch.flags else np.where(np.isinf(z), values["terms"][7], parts)
+        parts = np.where(np.isnan(z), 0.0, atom)
     return parts
 
 

@@ -31,6 +31,8 @@ FLAGS = {
     "BRESENHAM": "rays are cast along Bresenham's lines",
     "CDDT": "rays are cast through a compressed directional distance transform",
     "LOOKUP": "ranges come from a look-up table",
+    "ECHO": "a sensor hears the nearest of several rays, or its angle of incidence matters",
+    "INCIDENCE": "the angle of incidence chooses the mixture's terms, or says whether anything returns",
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
@@ -45,6 +47,13 @@ FLAGS = {
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
     "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "RANGE": "some feature has a range",
+    "BEARING": "some feature has a bearing",
+    "SIGNATURE": "some feature has a signature",
+    "FIELD": "the field of view is less than a full circle",
+    "KNOWN": "it is known which landmark each feature is",
+    "MARGINAL": "each feature's densities at all landmarks are summed",
+    "INFORMATION": "the sums of the log-likelihood's second derivatives are wanted",
     "CAREFUL": "end points need more than the working precision to fall into the right cell",
 }
 
@@ -135,6 +144,9 @@ def _kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = Fa
 
 _MAP = ("int rows", "int cols")
 _POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
+# Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
+_NORMALS = ("real2 normals [(rows + 2) * (cols + 2)]",)
+_CONES = "real2 ray [rays * cone_rays]"
 # A map as a caster has it: what an entry is, and how many there are, is the caster's.
 _CAST = ("entry map_table [map]",)
 _CASTER = ("int bins", "real slack", "real tolerance")
@@ -142,7 +154,20 @@ _PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
 _CHANGED = (
     *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right",
 )  # fmt: skip
+# Readings and expected ranges to learn from, in blocks of one length.
+_PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
 _RANGE = ("real limit", "real resolution", "real range_max")
+_LANDMARKS = ("real4 landmark [landmarks]", "real4 signature [landmarks]")
+_PLACED = (*_POSES, "real4 pose_low [particles]")
+_FEATURES = ("real feature [28 * features]",)
+_MIXTURE = ("real terms [4]", "real2 arcs [11]")
+_FEATURE_RESULT = (
+    "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",
+)  # fmt: skip
+# Rays of a cone and the least cosine of an angle of incidence that returns; kinds of terms, one for each bin of angles.
+_CONE = ("int cone_rays", "real critical")
+_ECHO = ("int kinds", *_CONE)
+_TERMS = ("real terms [10 * kinds]", "real edges [kinds]")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 
 KERNELS: dict[str, Kernel] = {
@@ -191,9 +216,9 @@ KERNELS: dict[str, Kernel] = {
         "int particles", "int rays", *_CASTER, *_RANGE, wide=True,
     ),
     "score_beams": _kernel(
-        "beam", "particle", *_CAST, *_POSES, "real2 ray [rays]", "int first [rays + 1]", "real reading [readings]",
-        "real terms [10]", "real sensor [cells * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
-        "int readings", *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
+        "beam", "particle", *_CAST, *_NORMALS, *_POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
+        *_TERMS, "real sensor [(cells + 1) * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
+        "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
         wide_group=16,
     ),
     "cast_tiles": _kernel(
@@ -201,10 +226,14 @@ KERNELS: dict[str, Kernel] = {
         "out real ranges [particles * rays]", *_MAP, "int particles", "int rays", *_CASTER, *_RANGE, "int spread",
     ),
     "beam_tiles": _kernel(
-        "beam", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]", "int first [rays + 1]",
-        "real reading [readings]", "real terms [10]", "real sensor [cells * (cells + 1)]",
-        "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_CASTER,
+        "beam", "item", *_CAST, *_NORMALS, *_POSES, "int order [particles]", _CONES, "int first [rays + 1]",
+        "real reading [readings]", *_TERMS, "real sensor [(cells + 1) * (cells + 1)]",
+        "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_ECHO, *_CASTER,
         "int cells", "real per_metre", *_RANGE, "int across", "int along", "int spread",
+    ),
+    "cast_echoes": _kernel(
+        "echo", "ray particle", *_CAST, *_NORMALS, *_POSES, _CONES, "out real ranges [particles * rays]",
+        "out real incidence [particles * rays]", *_MAP, "int particles", "int rays", *_CONE, *_CASTER, *_RANGE,
     ),
     "sum_parts": _kernel(
         "sums", "particle", "real parts [particles * count]", "int order [particles]", "out real log_p [particles]",
@@ -237,10 +266,34 @@ KERNELS: dict[str, Kernel] = {
         "out real parts [particles * readings]", *_MAP, "int particles", "int readings", "int across", "int along",
         "int spread",
     ),
+    "e_step": _kernel(
+        "learning", "block", *_PAIRS, "real terms [12]", "out real sums [blocks * width]", "int blocks", "int readings",
+        "int across", "int along", "int width",
+    ),
+    "pair_causes": _kernel(
+        "learning", "block", *_PAIRS, "real terms [12]", "out real4 causes [blocks * readings]", "int blocks",
+        "int readings", "int across", "int along",
+    ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_RESULT, *_MAP, "int particles",
         "int readings", "real guard", "real fixed", "real temperature", wide=True,
+    ),
+    "score_features": _kernel(
+        "landmark_score", "particle", *_LANDMARKS, "int start [rows * cols + 1]", *_PLACED, *_FEATURES,
+        "int partner [features]", *_MIXTURE, *_FEATURE_RESULT, *_MAP, "int landmarks", "int particles", "int features",
+        "real size", "real share", "real fixed", "real temperature", wide=True,
+    ),
+    "joint_features": _kernel(
+        "landmark_joint", "particle", *_LANDMARKS, *_PLACED, *_FEATURES, *_MIXTURE,
+        "out real best [particles * sets]", "out int choice [particles * sets * features]",
+        "out real value [particles * sets * features]", *_FEATURE_RESULT, "int landmarks", "int particles",
+        "int features", "int sets", "real size", "real fixed", "real temperature",
+    ),
+    "count_unseen": _kernel(
+        "landmark_unseen", "particle", "real4 landmark [landmarks]", "int start [rows * cols + 1]", *_PLACED,
+        "int which [particles * features]", "out real log_p [particles]", *_MAP, "int particles", "int features",
+        "real size", "real range_max", "real axis_cosine", "real axis_sine", "real least", "real log_missed",
     ),
     "place_relative": _kernel(
         "relative", "particle", "coordinate poses [particles * 3]", "out real4 place [particles]",

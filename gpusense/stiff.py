@@ -104,7 +104,7 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())
     world, limits = (*obstacles.shape, count, 1), (RANGE_MAX, 1.0, RANGE_MAX)
-    exact, none = (0, 0.0, 0.0), device.empty(1, real)
+    exact, none, laser = (0, 0.0, 0.0), device.empty(2, real), (1, 1, 0.0)
     device.compile("cast_ranges", wide)((1, count), rectangles, cells, pose, ray, ranges, *world, *exact, *limits)
     expected = device.download(ranges, np.empty(count, real))
 
@@ -124,9 +124,9 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
             z = np.clip(np.concatenate([expected, bends]), 0, RANGE_MAX - ulp).astype(real)
             parts, first = device.empty(count * len(z), real), np.array([0, len(z)], np.int32)
             device.compile("score_beams", flags | model._components)(
-                (count,), rectangles, cells, pose, ray, device.upload(first), device.upload(z),
-                device.upload(model._terms), none, device.empty(count, real), parts, *world, len(z), *exact, 0, 0.0,
-                *limits, 0.0, 1.0,
+                (count,), rectangles, none, cells, pose, ray, device.upload(first), device.upload(z),
+                device.upload(model._terms), none, none, device.empty(count, real), parts, *world, len(z), *laser,
+                *exact, 0, 0.0, *limits, 0.0, 1.0,
             )  # fmt: skip
             found = device.download(parts, np.empty(count * len(z), real))
             own = np.repeat(np.array([list(p.to_dict().values())], real).T, found.size, axis=1)

@@ -108,8 +108,37 @@ _ALL = (
         "end points near a cell's edge are found again with twice the digits, so float32 hits the cells of float64; "
         "nearer than 1e-13 cells per cell of range twice the digits cannot tell, and either cell is right",
     ),
+    Tolerance(
+        "landmark", 16, "eps (1 + |log p_k|) of the precision",
+        "exponents and angles in two numbers; what is left are exp, log, log1p and erf within a few eps",
+    ),
+    Tolerance(
+        "normals of straight walls, mean", 2, "degrees",
+        "the error of the principal direction of a strip of 9 cells of a wall: half a cell of steps at its ends",
+    ),
+    Tolerance("normals of straight walls, largest", 12, "degrees", "a step of a wall that is almost along an axis"),
+    Tolerance(
+        "float32 angles of incidence", 8, "eps",
+        "directions and normals have the same bits everywhere; arc tangents of OpenCL are within 6 ulps",
+    ),
+    Tolerance("float64 angles of incidence", 1e-14, "rad", "arc tangents of OpenCL are within 6 ulps"),
     Tolerance("specialize=False, float32", 32, "eps (1 + |log p_k|)", "both keep the bound of one beam"),
     Tolerance("specialize=False, float64", 2e-11, "1 + |log p_k|", "both keep the bound of one beam"),
+    Tolerance(
+        "float64 sums to learn from", 1e-12, "relative",
+        "a few eps a pair, added in blocks with compensation; relative to the largest sum of squares",
+    ),
+    Tolerance(
+        "float32 sums to learn from", 2e-5, "relative",
+        "a pair's terms carry the rounding of z, z* and sigma to float32, which u^2 multiplies by its size",
+    ),
+    Tolerance(
+        "learned parameters", 1e-6, "relative",
+        "float64 on every backend: EM ends within 1e-8 nats of the optimum, and goes the same way to it everywhere",
+    ),
+    Tolerance(
+        "exact EM falls", 1e-9, "|log-likelihood|", "rounding of sums; every step is held to what it gains before",
+    ),
     Tolerance("batching, order, repetition", 0, "values with other bits", "one work-item scores a particle by itself"),
 )  # fmt: skip
 

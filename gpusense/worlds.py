@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense import _checks
 from gpusense.backends import get_backend
 from gpusense.grid import OccupancyGrid
-from gpusense.models.caster import RayCaster
+from gpusense.models.beam import BeamModel
 from gpusense.parameters import BeamParameters
 from gpusense.scanner import Scanner
 
@@ -243,13 +243,10 @@ def simulate_scan(
     Raises:
         TypeError, ValueError: as :func:`sample_readings`.
     """
-    (x, y, theta), (ahead, aside, turn) = _checks.array("pose", pose, (3,)).tolist(), scanner.mount
-    c, s = math.cos(theta), math.sin(theta)
-    sensor = [(x + c * ahead - s * aside, y + s * ahead + c * aside, theta + turn)]
     device = get_backend(backend)
     real = "float64" if device.info.float64 else "float32"
-    caster = RayCaster(grid, scanner.range_max, backend=device, precision=real)
-    expected = np.minimum(caster.cast(sensor, scanner.bearings)[0].astype(np.float64), scanner.range_max)
+    model = BeamModel(grid, scanner, parameters, backend=device, precision=real)
+    expected = np.minimum(model.expected_ranges([_checks.array("pose", pose, (3,))])[0], scanner.range_max)
     return sample_readings(expected, scanner.range_max, parameters, rng)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import bad_input_landmarks
 import numpy as np
 
 import gpusense as gs
@@ -96,7 +97,7 @@ MODEL_CASES = [
         "beam-parameters-dict",
         beam(parameters={"z_hit": 1}),
         TypeError,
-        "parameters: must be BeamParameters, got {'z_hit': 1}",
+        "parameters: must be BeamParameters or a DiscreteBeamModel, got {'z_hit': 1}",
     ),
     (
         "field-parameters-of-the-beam-model",
@@ -350,4 +351,5 @@ CASES: list[tuple[str, Action, type[Exception], Message]] = [
     *CALL_CASES,
     *CASTER_CASES,
     *BACKEND_CASES,
+    *bad_input_landmarks.CASES,
 ]

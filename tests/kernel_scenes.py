@@ -97,6 +97,12 @@ def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tup
 
 # The exact caster's bins, slack and tolerance.
 EXACT = (0, 0.0, 0.0)
+# Kinds of terms, rays of a cone and the least cosine of an incidence, where no incidence matters; and what is not read.
+LASER = (1, 1, 0.0)
+
+
+def nothing(real: type, numbers: int = 1) -> np.ndarray:
+    return np.zeros((1, numbers) if numbers > 1 else 1, real)
 
 
 def scene_flags(real: type, *names: str) -> frozenset[str]:

@@ -127,6 +127,35 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
 
 
 @pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_landmarks_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--repeats", "1", "--seconds", "0.01"]
+    report = run_script("landmarks.py", "--backend", needs(selection), *arguments, output=tmp_path / "landmarks")
+    rows = report["rows"]
+    assert {(row["what"], row["cloud"]) for row in rows} == {
+        ("known", "tracking"), ("known", "global"), ("nearest", "tracking"), ("nearest", "global"),
+    }  # fmt: skip
+    assert all(row["rate"] > 0 and row["error"] < 16 for row in rows)
+
+
+def test_sonar_field_runs(tmp_path: Path) -> None:
+    """Every way is tuned and scored, and the drawings are made; the recorded run is left out where there is none."""
+    report = run_script(
+        "sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4", "--particles", "30",
+        "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
+    )  # fmt: skip
+    rows = report["rows"]
+    assert len({row["model"] for row in rows}) == 4 and {row["window"] for row in rows} == {1, 8}
+    for row in rows:
+        assert len(row["rank"]) == (4 if row["window"] == 1 else 2)
+        assert all(0 <= rank <= 1 for rank in row["rank"] + row["global rank"])
+        assert all(-50 < value <= math.log(31) + 1e-9 for value in row["information"])
+        assert all(0 <= error < 5 for error in row["error"])
+        # Tuned ways know more than nothing about a pose, one frame at a time.
+        assert row["window"] == 8 or sum(row["information"]) > 0
+    assert sorted(file.name for file in (tmp_path / "drawn").glob("*.png")) == ["sonar-scene.png", "sonar-scores.png"]
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
 def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--particles", "50", "--particles", "90", "--beams", "12", "--scans", "3", "--calls", "4"]
     output = tmp_path / "small_calls"
@@ -135,3 +164,47 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
     assert {"field, 50 x 12, NumPy in and out", "beam model, 3 scans of 50 x 12 in 3 calls"} <= set(names)
     assert len(names) == 12 and all(row["differing_bits"] == 0 for row in report["rows"])
     assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])
+
+
+def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    words = (
+        "--pairs 4000 --numpy-pairs 2000 --scenes 2 --count 400 --starts 1 --repeats 2 --seconds 1 --precision float64"
+    )
+    arguments = ["--backend", "numpy", "--backend", needs("opencl"), *words.split()]
+    report = run_script("learning.py", *arguments, output=tmp_path / "small")
+    assert [row["backend"].split(":")[0] for row in report["rows"]] == ["numpy", "opencl"]
+    for row in report["rows"]:
+        assert row["error"] < 1e-6 and row["converged"] and 0 < row["iteration_s"] < math.inf
+    assert len(report["scenes"]) == 2 and report["fall"] <= 1e-9
+    assert 0 < report["within"] <= report["identified"] <= 12
+
+
+def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--scans", "20", "--block", "2"]
+    sets = ["sonar1", "sonar2", "lidar_wall", "intel", "s3000"]
+    chosen = [word for name in sets for word in ("--set", name)]
+    report = run_script("fit_real.py", *arguments, *chosen, "--discrete", "0.3", output=tmp_path / "fits")
+    assert [row["set"] for row in report["sets"]] == sets and str(data_dir) not in json.dumps(report)
+    for row in report["sets"]:
+        assert row["fit"]["converged"] and row["discrete"]["converged"] and row["held_out"][0]["name"] == "fitted"
+    # Both sonars sit a little off the reference; the laser's is a set-up error of millimetres.
+    bias = {row["set"]: row["fit"]["range_bias"] for row in report["sets"]}
+    assert abs(bias["sonar1"] + 0.027) < 0.01 and abs(bias["sonar2"]) < 0.01 and 0 < bias["lidar_wall"] < 0.01
+
+
+def test_localisation_with_fitted_parameters_runs(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--log", "intel", "--scans", "2"]
+    report = run_script("fit_localisation.py", *arguments, "--particles", "500", output=tmp_path / "fits")
+    (log,) = report["logs"]
+    assert [row["parameters_of"] for row in log["rows"]][:2] == ["fitted", "nav2_amcl's defaults"] and len(
+        log["rows"]
+    ) == 5
+    assert log["scored_scans"] == 2 and all(1 <= row["rank"]["median"] < 20 for row in log["rows"])
+
+
+def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
+    command = [sys.executable, str(BENCH / "discrete_convergence.py"), "--output", str(tmp_path), "--most", "64"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert {path.name for path in tmp_path.iterdir()} == {"discrete_convergence.png", "discrete_rows.png"}
+    first, second = ([float(cell) for cell in line.split("|")[2:-1]] for line in done.stdout.splitlines()[2:])
+    assert all(1.3 < wide / narrow < 3 for wide, narrow in zip(first, second, strict=True))

@@ -9,11 +9,13 @@ import pytest
 from kernel_scenes import (
     EXACT,
     GRIDS,
+    LASER,
     LIMIT,
     RESOLUTION,
     adversarial_poses,
     assert_near,
     directions,
+    nothing,
     on_both,
     planes_of,
     ranges_on_both,
@@ -102,9 +104,9 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     count, readings, fixed, temperature = len(pose), len(reading), -3.25, 0.5
     parts = np.full((count, readings), np.nan, real)
     found = run(
-        device, "score_beams", flags, (count,), planes_of(occupied), cell, pose, ray, first, reading, terms,
-        np.zeros(1, real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings, *EXACT, 0, 0.0,
-        LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
+        device, "score_beams", flags, (count,), planes_of(occupied), nothing(real, 2), cell, pose, ray, first, reading,
+        terms, nothing(real), nothing(real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings,
+        *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
     )  # fmt: skip
 
     # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
@@ -124,9 +126,9 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     cell, pose = adversarial_poses(occupied, real, outside=False)
     count, none = len(pose), np.zeros(0, real)
     found = run(
-        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), cell, pose, np.zeros((0, 2), real),
-        np.zeros(1, np.int32), none, terms, none, np.empty(count, real), none, *occupied.shape, count, 0, 0, *EXACT,
-        0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
+        device, "score_beams", frozenset(flags), (count,), planes_of(occupied), nothing(real, 2), cell, pose,
+        np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, np.empty(count, real), none,
+        *occupied.shape, count, 0, 0, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
     )  # fmt: skip
     assert (found["log_p"] == -1.5).all()
 

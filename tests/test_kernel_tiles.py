@@ -10,6 +10,7 @@ import pytest
 from kernel_scenes import (
     EXACT,
     GRIDS,
+    LASER,
     LIMIT,
     PRECISIONS,
     RESOLUTION,
@@ -17,6 +18,7 @@ from kernel_scenes import (
     adversarial_poses,
     assert_near,
     directions,
+    nothing,
     on_both,
     planes_of,
     run,
@@ -147,9 +149,9 @@ def beam_tiles(
     reading = scan(np.linspace(0, RANGE, first[-1]), real, all_readings="ALL_READINGS" in names)
     readings, order = len(reading), an_order(count)
     expected, found = on_both(
-        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), cell, pose, order, ray, first, reading,
-        terms, np.zeros(1, real), room_for(count, readings, way, real), *OCCUPIED.shape, count, rays, readings, *EXACT,
-        0, 0.0, LIMIT, RESOLUTION, RANGE, *strides(count, readings, way), spread,
+        device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
+        ray, first, reading, terms, nothing(real), nothing(real), room_for(count, readings, way, real), *OCCUPIED.shape,
+        count, rays, readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE, *strides(count, readings, way), spread,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched

@@ -79,6 +79,15 @@ def test_errors_in_ulps(function, evaluate):
     assert off[worst] <= TOLERANCES[row].value
 
 
+def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
+    """What is added to t for arctan t, in ulps of arctan t."""
+    t = spread(1e-30, 0.41421356)
+    exact = np.arctan(t.astype(np.float64))
+    off = np.abs(evaluate("arc_rest", t) - (exact - t)) / np.spacing(exact.astype(np.float32))
+    print(f"arc_rest: {off.max():.3f} ulp at {t[int(np.argmax(off))]!r}")
+    assert off.max() <= 0.2
+
+
 def test_ends(evaluate):
     """Exact values, far arguments, and none that depends on a neighbour."""
 
@@ -111,8 +120,8 @@ def derived() -> ModuleType:
 def test_constants_are_those_that_were_derived():
     made, expected = derived(), {}
     with mp.workdps(50):
-        polynomials = (made.exponential(), made.logarithm(), made.error_function())
-        for name, (powers, error) in zip("ELW", polynomials, strict=True):
+        polynomials = (made.exponential(), made.logarithm(), made.error_function(), made.arc())
+        for name, (powers, error) in zip("ELWA", polynomials, strict=True):
             assert error < -24
             expected |= {f"{name}{i}": powers[i] for i in range(len(powers))}
         expected |= dict(zip(("LOG2_HIGH", "LOG2_LOW", "ONE_OVER_LOG2"), made.log_parts(), strict=True))

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+import yaml
 
 import gpusense as gs
 from gpusense import scoring
@@ -130,6 +131,33 @@ def test_command_ranks_the_logged_pose_first(capsys, recorded, model):
     assert document["agreement"] == []
 
 
+def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(yaml.safe_dump({"beam_model": gs.BeamParameters(sigma_hit=0.07).to_dict(), "amcl": {}}))
+    options = ["--particles", "50", "--backend", "numpy", "--limit", "1", "--json", "--parameters", str(file)]
+    code, out, _ = run(capsys, recorded, *options)
+    assert (code, json.loads(out)["parameters"]) == (0, gs.BeamParameters(sigma_hit=0.07).to_dict())
+    code, out, _ = run(capsys, recorded, *options, "--sigma-hit", "0.2")
+    assert json.loads(out)["parameters"]["sigma_hit"] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "model", "message"),
+    [
+        ("beam_model: {z_hit: 2}", "beam", "parameters.yaml: beam_model: z_hit + z_short + z_max + z_rand: must be 1"),
+        ("beam_model: 3", "beam", "parameters.yaml: must hold a mapping beam_model, got 3"),
+        ("{}", "beam", "parameters.yaml: must hold a mapping beam_model, got None"),
+        ("[", "beam", "parameters.yaml: must be plain YAML, got an error"),
+        ("beam_model: {}", "field", "--parameters: must be left out with the field"),
+    ],
+)
+def test_bad_files_of_parameters(capsys, recorded, tmp_path, text, model, message):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text)
+    code, out, err = run(capsys, recorded, "--model", model, "--backend", "numpy", "--parameters", str(file))
+    assert (code, out) == (2, "") and message in err and err.count("\n") == 1
+
+
 def test_backends_are_compared(capsys, recorded):
     present = [d.selection for d in gs.devices() if d.available and d.kind != "simulator" and d.backend != "numpy"]
     if not present:
@@ -154,7 +182,7 @@ def test_another_ranking_is_noticed(capsys, recorded, monkeypatch):
 
     def wrong(flags, *arguments):
         score_beams(flags, *arguments)
-        log_p = arguments[8]
+        log_p = arguments[10]
         log_p[: len(log_p) // 2] += 1
 
     monkeypatch.setattr(beam, "score_beams", wrong)

@@ -45,6 +45,8 @@ _VECTORS = {
     (wp.float64, 2): wp.vec2d,
     (wp.float64, 4): wp.vec4d,
 }
+# The axes of a launch that threads may share, and the argument that counts each.
+_SHARED = {"particle": "particles", "block": "blocks"}
 _MOST_NUMBERS = (1 << 31) - 1
 # Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: threads
 # that others hold up take fewer.
@@ -324,15 +326,20 @@ class _LaunchStep:
         self._launch.start(*self._given, stream)
 
 
-def _per_particle(argument: Argument) -> bool:
-    """Whether an argument has one row a particle."""
-    return argument.shape is not None and argument.shape.split(" ")[0] == "particles"
+def _shared_axis(row: Kernel) -> str | None:
+    """The axis of a launch, particles or blocks of pairs, that threads may share."""
+    return next((axis for axis in _SHARED if axis in row.launch), None)
+
+
+def _has_rows(argument: Argument, axis: str) -> bool:
+    """Whether an argument has one row for each index of an axis."""
+    return argument.shape is not None and argument.shape.split(" ")[0] == _SHARED[axis]
 
 
 def _independent(row: Kernel) -> bool:
-    """Whether a kernel writes to nothing but the rows of its own particles."""
-    outputs = [argument for argument in row.arguments if argument.output]
-    return "particle" in row.launch and all(_per_particle(argument) for argument in outputs)
+    """Whether a kernel writes to nothing but the rows of its own particles or blocks."""
+    axis = _shared_axis(row)
+    return axis is not None and all(_has_rows(argument, axis) for argument in row.arguments if argument.output)
 
 
 @functools.cache
@@ -348,13 +355,16 @@ def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
 
 
 class _Pieces:
-    """A launch over particles, cut into pieces that several threads take one after the other."""
+    """A launch over particles or blocks of pairs, cut into pieces that several threads take one after the other."""
 
     def __init__(self, launch: _Launch, row: Kernel) -> None:
         self._launch, self._row = launch, row
-        self._axis = row.launch.index("particle")
-        self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == "particles")
-        self._work = [i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings")]
+        self._name = _shared_axis(row) or ""
+        self._axis = row.launch.index(self._name)
+        self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
+        self._work = [
+            i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
+        ]
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         particles = size[self._axis]
@@ -396,11 +406,11 @@ class _Pieces:
                 helper.result()
 
     def _rows(self, arguments: tuple[Any, ...]) -> list[tuple[int, int]]:
-        """The arrays that hold something of every particle, and how many numbers of each."""
+        """The arrays that hold something of every particle or block, and how many numbers of each."""
         named = {argument.name: value for argument, value in zip(self._row.arguments, arguments, strict=True)}
         found = []
         for i, argument in enumerate(self._row.arguments):
-            if argument.shape is not None and _per_particle(argument):
+            if argument.shape is not None and _has_rows(argument, self._name):
                 factors = argument.shape.split(" * ")[1:]
                 each = math.prod(int(factor) if factor.isdigit() else int(named[factor]) for factor in factors)
                 if arguments[i].size >= argument.width * each * arguments[self._count]:

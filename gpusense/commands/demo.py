@@ -19,8 +19,8 @@ from gpusense.grid import OccupancyGrid
 from gpusense.models.beam import BeamModel
 from gpusense.models.field import LikelihoodFieldModel
 from gpusense.parameters import BeamParameters
-from gpusense.scan import choose_beams
-from gpusense.scanner import Reading, Scanner, classify
+from gpusense.scanner import Scanner
+from gpusense.scoring import evaluated_beams
 
 NAME = "demo"
 HELP = "Localise a robot in a made-up building with every backend, compare them, and draw the result."
@@ -185,9 +185,7 @@ def score(scene: Scene, name: str, backend: Backend, reference: np.ndarray) -> S
         log_p = np.asarray(model.log_likelihood(scene.poses, scene.ranges))
         calls.append(time.perf_counter() - begin)
     # A reading without return has the same probability at every pose, and nothing is evaluated for it.
-    kinds = classify(scene.ranges, scene.scanner)
-    chosen = choose_beams(kinds, scene.beams, model.parameters.z_max > 0)
-    evaluated = int(np.count_nonzero(chosen & (kinds == Reading.HIT)))
+    evaluated = evaluated_beams(model, scene.ranges)
     errors = np.abs(log_p[scene.checked] - reference)
     return Score(name, model, log_p, first, min(calls, default=first), len(calls), evaluated, errors)
 

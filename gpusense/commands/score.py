@@ -26,6 +26,7 @@ from gpusense.commands._common import (
 
 if TYPE_CHECKING:
     from gpusense.grid import OccupancyGrid
+    from gpusense.parameters import BeamParameters
     from gpusense.scanner import Scanner
     from gpusense.scoring import Agreement, BackendScore, Model, ScanScore
 
@@ -46,6 +47,7 @@ Exit codes: 0 success, 1 two backends rank the particles differently by more tha
 
 example:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
+  gpusense score --map map.yaml --log run.log.gz --parameters fitted/parameters.yaml
   gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 --backend opencl --backend numpy --limit 3"""
 
 _SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit")
@@ -86,6 +88,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--temperature", type=positive_number, default=1.0, metavar="T",
         help="in (0, 1], multiplies log-likelihoods (default: %(default)s, the plain product over beams)")  # fmt: skip
     group = parser.add_argument_group("parameters of the model")
+    group.add_argument("--parameters", type=Path, metavar="YAML",
+        help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
     for name, meaning in _MEANING.items():
         group.add_argument(_option(name), type=_number, metavar="X", help=meaning)
     group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="how the field is read; field only")
@@ -132,6 +136,11 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner)
     for name in given:
         if name not in (*_SHARED, *_OWN[args.model]):
             raise ValueError(f"{_option(name)}: must be a parameter of the {args.model} model, got another model's")
+    beam = scoring.BEAM_PARAMETERS
+    if args.parameters is not None:
+        if args.model != "beam":
+            raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
+        beam = read_beam_parameters(args.parameters)
     made: dict[str, Model] = {}
     for backend in args.backend or ["auto"]:
         common = {
@@ -139,11 +148,31 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner)
         }  # fmt: skip
         model: Model
         if args.model == "beam":
-            model = BeamModel(grid, scanner, scoring.BEAM_PARAMETERS.replace(**given), **common)
+            model = BeamModel(grid, scanner, beam.replace(**given), **common)
         else:
             model = LikelihoodFieldModel(grid, scanner, scoring.FIELD_PARAMETERS.replace(**given), **common)
         made.setdefault(model.device.selection, model)
     return list(made.values())
+
+
+def read_beam_parameters(path: Path) -> BeamParameters:
+    """The parameters below ``beam_model`` in a YAML file.
+
+    Raises:
+        FileNotFoundError: it is missing.
+        ValueError: it holds no such parameters, or one of them breaks its rule.
+    """
+    from gpusense import _checks
+    from gpusense._files import read_mapping
+    from gpusense.parameters import BeamParameters
+
+    values = read_mapping(_checks.existing_file(path)).get("beam_model")
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: must hold a mapping beam_model, got {_checks.show(values)}")
+    try:
+        return BeamParameters.from_dict(values)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: beam_model: {error}") from None
 
 
 def summary(score: BackendScore) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,9 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster
 from gpusense.cloud import LEAST_ORDERED, Cloud, all_within, ordered, tiles_of
+from gpusense.cones import cones_of, require_exact
+from gpusense.discrete import DiscreteBeamModel
+from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
@@ -24,7 +28,7 @@ from gpusense.models.scan_model import (
     rounded_terms,
     sums_linearly,
 )
-from gpusense.parameters import BeamParameters
+from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.scan import Beams, PreparedScan
@@ -43,7 +47,12 @@ class BeamModel(ScanModel):
     Args:
         grid: The map.
         scanner: The scanner's geometry.
-        parameters: Weights and shapes of the mixture.
+        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, the table of a sensor of the
+            scanner's range_max, of which every beam is one look-up, max readings too.
+        incidence: Instead of ``parameters``, those for each range of angles of incidence: between a beam and the normal
+            of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has those of the first
+            range. Where ``z_max`` differs between them, max readings depend on the pose, and are impossible where it
+            is 0. Needs an exact caster.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
         caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
@@ -68,8 +77,9 @@ class BeamModel(ScanModel):
         self,
         grid: OccupancyGrid,
         scanner: Scanner,
-        parameters: BeamParameters | None = None,
+        parameters: BeamParameters | DiscreteBeamModel | None = None,
         *,
+        incidence: IncidenceParameters | None = None,
         backend: str | Backend = "auto",
         precision: str = "float32",
         caster: str | Caster | None = None,
@@ -83,10 +93,25 @@ class BeamModel(ScanModel):
     ) -> None:
         peer = compat_module.choose(compat)
         default = BeamParameters() if peer is None else peer.beam
-        self.parameters = default if parameters is None else parameters
-        if not isinstance(self.parameters, BeamParameters):
-            raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(parameters)}")
-        compat_module.check_weights(self.parameters, compat)
+        self._discrete = parameters if isinstance(parameters, DiscreteBeamModel) else None
+        if self._discrete is not None:
+            _check_discrete(self._discrete, scanner, compat, sensor_table)
+        # Of the mixture nothing is used where there is a discrete model.
+        own: object = default if parameters is None or self._discrete is not None else parameters
+        if not isinstance(own, BeamParameters):
+            rule = "must be BeamParameters or a DiscreteBeamModel"
+            raise TypeError(f"parameters: {rule}, got {_checks.show(parameters)}")
+        self.incidence_parameters = incidence
+        # The parameters of each bin of angles of incidence.
+        self._kinds: tuple[BeamParameters, ...] = (own,)
+        if incidence is not None:
+            if not isinstance(incidence, IncidenceParameters):
+                raise TypeError(f"incidence: must be IncidenceParameters, got {_checks.show(incidence)}")
+            for name, value in (("parameters", parameters), ("sensor_table", sensor_table), ("compat", compat)):
+                if value is not None:
+                    raise ValueError(f"{name}: must be None with incidence, got {_checks.show(value)}")
+            self._kinds = incidence.parameters
+        compat_module.check_weights(own, compat)
         if peer is not None:
             caster = "bresenham" if caster is None else caster
             unknown = "occupied" if unknown is None else unknown
@@ -96,9 +121,14 @@ class BeamModel(ScanModel):
         method = casters.choose("caster", "exact" if caster is None else caster)
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
-            temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
-            end_points=False,
+            temperature=temperature, beams=beams, compat=compat, specialize=specialize,
+            z_max=max(p.z_max for p in self._kinds) if self._discrete is None else 1.0, end_points=False,
         )  # fmt: skip
+        self._max_depends = self._discrete is not None or len({p.z_max for p in self._kinds}) > 1
+        self._cones = cones_of(scanner, method, incidence=incidence is not None)
+        self._rays_each = self._cones.rays
+        # The rays of each beam: one, or those of a cone.
+        self._cone_vectors = ray_vectors(scanner.ray_bearings, scanner.mount)
         self._caster = MapCaster(
             self._backend, self._real, grid, scanner.mount, scanner.range_max, method,
             unknown=self.unknown, outside=self.outside, crop=specialize,
@@ -107,10 +137,23 @@ class BeamModel(ScanModel):
         self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
         self._terms_there = self._backend.upload(self._terms)
+        edges = (0.0, math.pi / 2) if incidence is None else incidence.edges
+        self._edges = self._backend.upload(np.cos(edges[1:]).astype(self._real))
         self._none = self._backend.upload(np.zeros(1, np.int32))
         # Where the readings of each ray begin while no rays are shared.
         self._one_each = self._backend.upload(np.arange(scanner.count + 1, dtype=np.int32))
         self._sensor, self._cells = self._tabulate(sensor_table)
+
+    @property
+    def parameters(self) -> BeamParameters | DiscreteBeamModel:
+        """Weights and shapes of the mixture, or the table of a sensor.
+
+        Raises:
+            AttributeError: they depend on the angle of incidence; see ``incidence_parameters``.
+        """
+        if self.incidence_parameters is not None:
+            raise AttributeError("parameters: depend on the angle of incidence here, see incidence_parameters")
+        return self._kinds[0] if self._discrete is None else self._discrete
 
     @property
     def table_bytes(self) -> int:
@@ -143,30 +186,49 @@ class BeamModel(ScanModel):
             self.grid = self._caster.update(cells, region)
 
     def expected_ranges(self, poses: object, *, out: Any = None) -> Any:
-        """z* of every beam of the scanner at each pose.
+        """z* of every beam of the scanner at each pose; of a cone, the range of the nearest return.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad]; arrays of other libraries as in ``log_likelihood``.
             out: Where to write them, as in ``log_likelihood``.
 
         Returns:
-            (N, K) metres in the model's precision; exactly range_max where nothing is nearer.
+            (N, K) metres in the model's precision; exactly range_max where nothing is nearer, or returns.
 
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
         """
         with self._lock:
-            return self._caster.cast(poses, self._vectors, out)
+            return self._caster.cast(poses, self._cone_vectors, out, dataclasses.replace(self._cones, incidence=False))
+
+    def incidence(self, poses: object, *, out: Any = None) -> Any:
+        """The angle of incidence of every beam of the scanner at each pose; see ``RayCaster.incidence``.
+
+        Args:
+            poses: As for ``expected_ranges``.
+            out: Where to write them, as in ``log_likelihood``.
+
+        Returns:
+            (N, K) radians in [0, pi / 2] in the model's precision, 0 head-on; of a cone, that of the ray with the
+            nearest return. NaN where a beam has none.
+
+        Raises:
+            TypeError, ValueError: poses that are not (N, 3) finite numbers, or a caster that is not exact.
+        """
+        require_exact("caster", self._caster.method)
+        with self._lock:
+            return self._caster.cast(poses, self._cone_vectors, out, dataclasses.replace(self._cones, incidence=True))
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
-        p = self.parameters
-        components = [
-            ("z_hit", p.z_hit, "1 exp, 2 erf and 1 division per particle-beam"),
-            ("z_short", p.z_short, "1 exp, 1 tanh and 2 divisions per particle-beam"),
-            ("z_rand", p.z_rand, "1 addition per particle-beam"),
-            ("z_max", p.z_max, "max readings altogether"),
-        ]
+        costs = (
+            ("z_hit", "1 exp, 2 erf and 1 division per particle-beam"),
+            ("z_short", "1 exp, 1 tanh and 2 divisions per particle-beam"),
+            ("z_rand", "1 addition per particle-beam"),
+            ("z_max", "max readings altogether"),
+        )
+        components = [(name, max(getattr(p, name) for p in self._kinds), cost) for name, cost in costs]
+        components = components if self._discrete is None else []
         omissions = scene_omissions(
             components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
             precision=self.precision, ring=self._caster.method.ring,
@@ -183,12 +245,15 @@ class BeamModel(ScanModel):
             )
         if self._last_code and "ORIGINS_OUTSIDE" not in self._last_code:
             omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray"))
-        if self._last_code and "LINEAR" in self._last_code:
+        if self._last_code and "LINEAR" in self._last_code and self._discrete is None:
             omissions.append(
                 Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
             )
         if self._peer is not None:
             omissions.append(Omission("normalised density", f"compat='{self.compat}' sums cubes", "the likelihood"))
+        elif self._discrete is not None:
+            steps = f"{self._cells + 1} x {self._cells + 1} steps of readings and expected ranges, no return included"
+            omissions.append(Omission("mixture", f"the model is a table of {steps}", "all but 1 look-up a beam"))
         elif self.sensor_table is not None:
             why = f"log p is tabulated over {self._cells} x {self._cells + 1} bins of readings and expected ranges"
             omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
@@ -203,12 +268,17 @@ class BeamModel(ScanModel):
             omissions.append(far)
         caster = self._caster.method
         how = "" if caster.name == "exact" else f", ranges by {caster}"
-        title = f"beam model{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
+        how += self._cones.words(self.scanner.critical_incidence)
+        if self.incidence_parameters is not None:
+            how += f", parameters for {len(self._kinds)} ranges of the angle of incidence"
+            how += " (max readings depend on it)" if self._max_depends else ""
+        name = "beam model" if self._discrete is None else "discrete beam model"
+        title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
 
     def _peer_mixture(self) -> tuple[frozenset[str], np.ndarray]:
         """Flags and numbers of the kernel file ``compat``."""
-        p, range_max = self.parameters, self.scanner.range_max
+        p, range_max = self._kinds[0], self.scanner.range_max
         flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}
         hit = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
         if self.compat == "amcl":
@@ -222,28 +292,46 @@ class BeamModel(ScanModel):
         """Flags of the components, and the numbers of the kernel file ``mixture``."""
         if self._peer is not None:
             return self._peer_mixture()
-        p, range_max = self.parameters, self.scanner.range_max
-        weights = {"HIT": p.z_hit, "SHORT": p.z_short, "RAND": p.z_rand}
+        range_max, kinds = self.scanner.range_max, self._kinds
+        weights = {name: max(getattr(p, f"z_{name.lower()}") for p in kinds) for name in ("HIT", "SHORT", "RAND")}
         flags = {name for name, weight in weights.items() if weight > 0 or not self._specialize}
-        rand, scale = p.z_rand / range_max, p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        # Where no range is possible at any angle, something must say so of each.
+        flags |= {"RAND"} if self._max_depends and not flags else set()
+        peaks = [p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi)) for p in kinds]
         if self._specialize and len(flags) == 1:
             flags.add("SINGLE")
-        if (p.z_hit > 0 and scale > HIGH_PEAK) or not self._specialize:
+        if max(peaks) > HIGH_PEAK or not self._specialize:
             flags.add("SHARP")
-        if sums_linearly(rand, max(scale, p.z_short * p.lambda_short), self._real):
+        if all(
+            sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), self._real)
+            for p, peak in zip(kinds, peaks, strict=True)
+        ):
             flags.add("LINEAR")
-            head = (scale, p.z_short, rand)
+        terms = [self._terms_of(p, peak, "LINEAR" in flags) for p, peak in zip(kinds, peaks, strict=True)]
+        if self.sensor_table is not None:
+            flags = {"SENSOR_TABLE"} | (flags & {"LINEAR"})
+        if self._discrete is not None:
+            flags = {"SENSOR_TABLE"}
+        return frozenset(flags), np.concatenate(terms)
+
+    def _terms_of(self, p: BeamParameters, peak: float, linear: bool) -> np.ndarray:
+        range_max = self.scanner.range_max
+        if linear:
+            head = (peak, p.z_short, p.z_rand / range_max)
         else:
             log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
             head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
         shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
         terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-        if self.sensor_table is not None:
-            flags = {"SENSOR_TABLE"} | (flags & {"LINEAR"})
-        return frozenset(flags), rounded_terms(terms, self._real)
+        return rounded_terms(terms, self._real)
 
     def _tabulate(self, width: float | None) -> tuple[Buffer, int]:
         """The sensor's table on the device, and its number of bins; no table and 0 where the mixture is evaluated."""
+        if self._discrete is not None:
+            table = self._discrete.sensor_table(self._real)
+            # Sums need no watch over impossible readings where there are none.
+            self._components |= {"LINEAR"} if np.isfinite(table).all() else set()
+            return self._backend.upload(table), self._discrete.bins
         if width is None:
             return self._backend.upload(np.zeros(1, self._real)), 0
         from gpusense.reference.densities import log_mixture  # loads SciPy
@@ -253,21 +341,28 @@ class BeamModel(ScanModel):
         cells = max(round(range_max / width), 1)
         middle = (np.arange(cells) + 0.5) * (range_max / cells)
         expected = np.append(middle, range_max)
-        table = np.empty((cells, cells + 1), self._real)
+        table = np.full((cells + 1, cells + 1), log_weight(self._kinds[0].z_max), self._real)
         # In blocks of rows: the densities need some forty numbers for each of theirs.
         for first in range(0, cells, 64):
             rows = slice(first, first + 64)
-            own = self.parameters.to_dict()
-            table[rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
+            own = self._kinds[0].to_dict()
+            table[:-1][rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
         return self._backend.upload(table), cells
 
     def _impossible(self) -> bool:
-        p = self.parameters
-        return p.z_hit == 0 and p.z_short == 0 and p.z_rand == 0
+        # Where max readings depend on the pose, the kernel tells.
+        return not self._max_depends and all(p.z_hit == p.z_short == p.z_rand == 0 for p in self._kinds)
 
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         space, real, backend = self._workspace, self._real, self._backend
-        ray, reading = space.upload_all("scan", (scan.rays.astype(real), scan.readings.astype(real)))
+        # Readings that share a ray, the axis of their cones, share these.
+        vectors = scan.rays if self._cones.rays == 1 else self._cone_vectors[scan.columns[scan.first[:-1]]]
+        values = scan.readings.astype(real)
+        if self._cells:
+            # A range below range_max that is rounded to it is still a range, and no max reading to the table.
+            top = np.nextafter(real.type(self.scanner.range_max), real.type(0))
+            values = np.where(np.isfinite(scan.readings), np.minimum(values, top), values)
+        ray, reading = space.upload_all("scan", (vectors.astype(real), values))
         shared = scan.shared or not self._specialize
         first = space.upload("first", scan.first) if scan.shared else self._one_each
         rays, readings = len(scan.rays), len(scan.readings)
@@ -275,9 +370,13 @@ class BeamModel(ScanModel):
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
+            normals = self._caster.normals(region, self._cones.flags)
             mount, count = self.scanner.mount, part[1] - part[0]
             poses = cloud.given(backend, space, part)
-            flags = self._components | self._scene_flags() | self._caster.flags | cloud.headings()
+            flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
+            # A table has a row for max readings.
+            evaluated = self._max_depends and self._discrete is None
+            flags |= cloud.headings() | ({"ALL_READINGS"} if evaluated else set())
             flags |= {"SHARED_RAYS"} if shared else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
@@ -286,11 +385,12 @@ class BeamModel(ScanModel):
                 self._last_code = frozenset(flags)
                 sizes = (count, rays, readings, shared, inside)
                 if space.again(
-                    (poses, result, table, first), cloud.code(), self._caster.map.preparations, sizes, scalars
+                    (poses, result, table, first, normals), cloud.code(), self._caster.map.preparations, sizes, scalars
                 ):
                     return None
             placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=False)
-            world = (region.rows, region.cols, count, rays, readings, *self._caster.scalars, self._cells)
+            world: tuple[Any, ...] = (region.rows, region.cols, count, rays, readings, len(self._kinds))
+            world += (*self._cones.scalars, *self._caster.scalars, self._cells)
             world += (self._cells / self.scanner.range_max, self._caster.limit, self.grid.resolution)
             world += (self.scanner.range_max,)
             if gpu:
@@ -301,8 +401,8 @@ class BeamModel(ScanModel):
                 parts = space.empty("parts", count * readings, real)
                 tiles, spread = tiles_of(count, rays)
                 backend.compile("beam_tiles", self._last_code)(
-                    (tiles,), table, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
-                    self._sensor, parts, *world, 1, count, spread,
+                    (tiles,), table, normals, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
+                    self._edges, self._sensor, parts, *world, 1, count, spread,
                 )  # fmt: skip
                 backend.compile("sum_parts", self._last_code)(
                     (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
@@ -313,9 +413,23 @@ class BeamModel(ScanModel):
             flags = self._last_code = widened(backend.info, "score_beams", flags)
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             backend.compile("score_beams", flags)(
-                (count,), table, placed.cell, placed.pose, ray, first, reading, self._terms_there, self._sensor, result,
-                parts, *world, *scalars,
+                (count,), table, normals, placed.cell, placed.pose, ray, first, reading, self._terms_there, self._edges,
+                self._sensor, result, parts, *world, *scalars,
             )  # fmt: skip
             return parts
 
         return launch
+
+
+def _check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:
+    """See that nothing contradicts a discrete model.
+
+    Raises:
+        ValueError: the scanner has another range_max, or an option is given that is for the mixture.
+    """
+    for name, value in (("compat", compat), ("sensor_table", sensor_table)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {_checks.show(value)}")
+    if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
+        rule = f"must have the scanner's range_max = {scanner.range_max}"
+        raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

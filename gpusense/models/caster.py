@@ -14,12 +14,14 @@ from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster, Window
 from gpusense.cloud import Cloud, all_within, finish, ordered, tiles_of
+from gpusense.cones import LASER, Cones, require_exact
 from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.lookup_files import describe, write_lookup
-from gpusense.models.reachable import ReachableMap
+from gpusense.models.reachable import ReachableMap, TableMemoryError
 from gpusense.models.scan_model import check_scene, chunk_of, in_chunks, real_dtype
+from gpusense.normals import normal_table
 from gpusense.plan import Omission
 from gpusense.region import Region
 from gpusense.workspace import Workspace
@@ -167,6 +169,27 @@ class RayCaster:
         vectors = ray_vectors(_checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
         return self._caster.cast(poses, vectors, out)
 
+    def incidence(self, poses: object, bearings: object, *, out: Any = None) -> Any:
+        """Angles of incidence: between each ray and the normal of the surface that it hits.
+
+        Normals are those of ``surface_normals``, of the cell in which the exact ray ends; a cell without one counts as
+        met head-on.
+
+        Args:
+            poses: As for ``cast``.
+            bearings: As for ``cast``.
+            out: Where to write the angles, as for ``cast``.
+
+        Returns:
+            (N, K) radians in [0, pi / 2], 0 head-on; NaN where nothing is nearer than ``range_max``.
+
+        Raises:
+            TypeError, ValueError: arguments that are not finite numbers of these shapes, or a method that is not exact.
+        """
+        vectors = ray_vectors(_checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
+        require_exact("method", self.method)
+        return self._caster.cast(poses, vectors, out, Cones(incidence=True))
+
 
 class MapCaster:
     """The caster of one map, sensor mount and range on one device; models share its table of the map.
@@ -198,7 +221,10 @@ class MapCaster:
     ) -> None:
         self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
         self.limit = range_max / grid.resolution
-        self.method, self.outside, self.table_bytes = method, outside, 0
+        self.method, self.outside, self._table_bytes = method, outside, 0
+        # Normals of the map's walls, and the window they belong to.
+        self._normals: tuple[Region, Buffer, int] | None = None
+        self._no_normals = backend.upload(np.zeros(2, real))
         self.map = ReachableMap(
             backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._mend
         )
@@ -212,6 +238,28 @@ class MapCaster:
         self._lock = threading.Lock()
 
     @property
+    def table_bytes(self) -> int:
+        """Bytes of the map's tables on the device."""
+        return self._table_bytes + (0 if self._normals is None else self._normals[2])
+
+    def normals(self, region: Region, flags: frozenset[str]) -> Buffer:
+        """Normals of the walls in a window, where flags ask for them; made once for a window.
+
+        Raises:
+            TableMemoryError: the device cannot hold them.
+        """
+        if "INCIDENCE" not in flags:
+            return self._no_normals
+        if self._normals is None or self._normals[0] != region:
+            self._normals = None
+            try:
+                table = normal_table(self.map.obstacles, region, self.outside, self.real)
+                self._normals = (region, self.backend.upload(table), table.nbytes)
+            except MemoryError as error:
+                raise TableMemoryError(*error.args) from error
+        return self._normals[1]
+
+    @property
     def scalars(self) -> tuple[Any, ...]:
         """The kernels' arguments bins, slack and tolerance."""
         return self.method.scalars()
@@ -223,7 +271,7 @@ class MapCaster:
 
     def _prepare(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
         table = self.method.prepare(backend, Window(obstacles, self.limit, self.outside))
-        self.table_bytes = table.size
+        self._table_bytes = table.size
         self.flags = self._own_flags | table.flags
         return table.buffer
 
@@ -235,7 +283,7 @@ class MapCaster:
         if isinstance(self.method, casters.Lookup) and self.method.file is not None:
             raise ValueError(f"file: must be None where the map changes, got {_checks.show(self.method.file)}")
         with self._lock:
-            self.grid = self.map.update(cells, region)
+            self.grid, self._normals = self.map.update(cells, region), None
             return self.grid
 
     def prepare(self, cloud: Cloud) -> None:
@@ -252,8 +300,11 @@ class MapCaster:
             obstacles = region.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
-    def cast(self, poses: object, vectors: np.ndarray, out: object = None) -> Any:
-        """Expected ranges (N, K) of (N, 3) poses and (K, 2) ray vectors, in pieces that fit the device."""
+    def cast(self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER) -> Any:
+        """Expected ranges, or angles of incidence, (N, K) of (N, 3) poses and (K, 2) ray vectors, in pieces that fit.
+
+        Vectors of cones are (K, C, 2).
+        """
         cloud, rays = Cloud(poses, self.backend), len(vectors)
         given = arrays.check_out(out, (cloud.count, rays), self.real, poses, self.backend)
         ranges: Any
@@ -264,10 +315,10 @@ class MapCaster:
         if cloud.count * rays:
             with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
-                chunk = chunk_of(self.backend, rays, self.real.itemsize)
+                chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
                 in_chunks(
                     cloud.count, chunk, self._workspace,
-                    lambda begin, end: self._cast_chunk(cloud, (begin, end), ray, rays, ranges),
+                    lambda begin, end: self._cast_chunk(cloud, (begin, end), ray, rays, ranges, cones),
                 )  # fmt: skip
                 finish(self._workspace, cloud.on_device)
         if out is not None:
@@ -276,19 +327,27 @@ class MapCaster:
             return arrays.result_for(poses, ranges.reshape((cloud.count, rays)))
         return arrays.like(poses, ranges)
 
-    def _cast_chunk(self, cloud: Cloud, part: tuple[int, int], ray: Buffer, rays: int, ranges: Any) -> None:
+    def _cast_chunk(
+        self, cloud: Cloud, part: tuple[int, int], ray: Buffer, rays: int, ranges: Any, cones: Cones
+    ) -> None:
         space, backend, count = self._workspace, self.backend, part[1] - part[0]
         table, region, corners = cloud.ensure(self.map, *part)
+        normals = self.normals(region, cones.flags)
         given = cloud.given(backend, space, part)
         placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
         if cloud.on_device:
             result = backend.part(ranges, part[0] * rays, count * rays)
         else:
             result = space.empty("ranges", count * rays, self.real)
-        flags = self.flags | self._wide
+        flags = self.flags | self._wide | cones.flags
         flags |= set() if all_within(corners, self.grid, self.mount, region, 0) else {"ORIGINS_OUTSIDE"}
         sizes = (region.rows, region.cols, count, rays, *self.scalars, self.limit, self.grid.resolution, self.range_max)
-        if backend.info.kind == "gpu":
+        if "ECHO" in flags:
+            other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
+            both = (other, result) if cones.incidence else (result, other)
+            inputs = (table, normals, placed.cell, placed.pose, ray)
+            backend.compile("cast_echoes", flags)((rays, count), *inputs, *both, *sizes[:4], *cones.scalars, *sizes[4:])
+        elif backend.info.kind == "gpu":
             order = ordered(backend, space, placed, count, rays, self.real)
             flags |= {"ORDERED"} if order is not None else set()
             order = placed.cell if order is None else order

@@ -182,6 +182,8 @@ class ScanModel(ABC):
         self._peer = compat_module.choose(compat)
         # What the sum over beams begins with, and whether readings are end points.
         self._lead, self._end_points = 0.0, end_points
+        # Rays of each beam, and whether the probability of a max reading depends on the pose.
+        self._rays_each, self._max_depends = 1, False
         # Numbers that GPUs keep for each reading until they are summed.
         self._kept_parts = 1 / BLOCK_TERMS if end_points else 1.0
         self.compat = compat
@@ -295,7 +297,7 @@ class ScanModel(ABC):
             ranges = self._peer.readings(ranges, self.scanner, self._end_points)
         scan = prepare_scan(
             ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize,
-            max_is_range=self._peer is not None, distinct=self._distinct,
+            max_is_range=self._peer is not None, max_depends=self._max_depends, distinct=self._distinct,
         )  # fmt: skip
         self._last_scan = scan
         if per_beam and len(scan.max_columns):
@@ -316,7 +318,7 @@ class ScanModel(ABC):
         launch = self._prepare_launch(scan)
         space, backend = self._workspace, self._backend
         kept = 1.0 if per_beam else self._kept_parts if backend.info.kind == "gpu" else 0.0
-        chunk = chunk_of(backend, len(scan.readings), self._real.itemsize * kept)
+        chunk = chunk_of(backend, len(scan.readings) * self._rays_each, self._real.itemsize * kept)
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:

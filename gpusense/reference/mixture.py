@@ -38,11 +38,26 @@ def hit_exponent(
     return product[0], product[1] + (square[1] * terms[1] + square[0] * terms[9])
 
 
+def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Terms of the log domain: log of ``z_hit p_hit(z | z*)``."""
+    exponent = hit_exponent(flags, z, expected, terms)
+    log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
+    return log_p - np.log(hit_mass(expected, terms[2], terms[6]))
+
+
 def short_factor(x: np.ndarray) -> np.ndarray:
     """``x / (1 - exp(-x))`` for x >= 0 as h / tanh(h) + h with h = x / 2."""
     h = x.dtype.type(0.5) * x
     safe = np.where(h > TINY, h, 1)
     return np.where(h > TINY, safe / np.tanh(safe) + h, x.dtype.type(1))
+
+
+def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Terms of the log domain: log of ``z_short p_short(z | z*)``."""
+    inside = (z <= expected) & (expected > 0)
+    x = terms[4] * expected
+    log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
+    return np.where(inside, log_p, -np.inf)
 
 
 def short_peak(decay: np.floating, expected: np.ndarray) -> np.ndarray:
@@ -58,14 +73,9 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
         return _linear(flags, z, expected, terms)
     parts = []
     if "HIT" in flags:
-        exponent = hit_exponent(flags, z, expected, terms)
-        log_hit = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
-        parts.append(log_hit - np.log(hit_mass(expected, terms[2], terms[6])))
+        parts.append(log_hit(flags, z, expected, terms))
     if "SHORT" in flags:
-        inside = (z <= expected) & (expected > 0)
-        x = terms[4] * expected
-        log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
-        parts.append(np.where(inside, log_p, -np.inf))
+        parts.append(log_short(z, expected, terms))
     if "RAND" in flags:
         parts.append(np.broadcast_to(terms[5], z.shape))
     if len(parts) == 1:

@@ -1,6 +1,7 @@
 """The density of one reading from a table of log p over bins of readings and expected ranges, instead of a formula.
 
-Row i is a bin of readings; column j a bin of expected ranges, and the last column is for rays without an obstacle.
+Row i is a bin of readings, the last row for max readings (log probabilities); column j a bin of expected ranges, the
+last column for rays without an obstacle.
 """
 
 from __future__ import annotations
@@ -8,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 
-def range_bin(distance: np.ndarray, per_metre: np.floating, cells: int) -> np.ndarray:
-    """Bins of ranges; what is at the end or beyond belongs to the last one."""
-    finite = np.where(np.isfinite(distance), distance, 0)
-    return np.minimum((finite * per_metre).astype(np.int64), cells - 1)
+def range_bin(distance: np.ndarray, per_metre: np.floating, cells: int, range_max: np.floating) -> np.ndarray:
+    """Bins of ranges; the last one, after the cells, is for range_max and more."""
+    inside = np.where(distance < range_max, distance, 0)
+    bins = np.minimum((inside * per_metre).astype(np.int64), cells - 1)
+    return np.where(distance >= range_max, cells, bins)
 
 
 def tabulated_density(
@@ -23,5 +25,5 @@ def tabulated_density(
     range_max: np.floating,
 ) -> np.ndarray:
     """log p of readings by the table."""
-    column = np.where(expected >= range_max, cells, range_bin(expected, per_metre, cells))
-    return sensor[range_bin(z, per_metre, cells) * (cells + 1) + column]
+    column = range_bin(expected, per_metre, cells, range_max)
+    return sensor[range_bin(z, per_metre, cells, range_max) * (cells + 1) + column]

@@ -1,6 +1,6 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 // Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
-// requires: error_free caster tiles mixture sensor_table compat
+// requires: error_free caster echo tiles mixture sensor_table compat
 
 #if !WIDE
 // What one reading adds to the sum.
@@ -8,7 +8,9 @@ real reading_term(const real z, const real expected, global const real *terms, g
                   const int cells, const real per_metre, const real range_max) {
 #if ALL_READINGS
     if (isnan(z)) return 0;
+#if !SENSOR_TABLE
     if (isinf(z)) return terms[7];
+#endif
 #endif
 #if CUBES
     const real p = compat_density(z, expected, terms);
@@ -35,13 +37,14 @@ real scan_log(const real sum) {
 #if WIDE
 // One work-item a particle, LANES rays at a time, each with one reading. Lanes are added in their order, so that sums
 // are those of the scalar kernel.
-kernel void score_beams(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real2 *ray, global const int *first, global const real *reading,
-                        global const real *terms, global const real *sensor, global real *log_p, global real *parts,
-                        const int rows, const int cols, const int particles, const int rays, const int readings,
-                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
-                        const real limit, const real resolution, const real range_max, const real fixed,
-                        const real temperature) {
+kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
+                        global const real4 *pose, global const real2 *ray, global const int *first,
+                        global const real *reading, global const real *terms, global const real *edges,
+                        global const real *sensor, global real *log_p, global real *parts, const int rows,
+                        const int cols, const int particles, const int rays, const int readings, const int kinds,
+                        const int cone_rays, const real critical, const int bins, const real slack,
+                        const real tolerance, const int cells, const real per_metre, const real limit,
+                        const real resolution, const real range_max, const real fixed, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     real2 total = (real2)(fixed, 0);
@@ -76,13 +79,14 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
 }
 #else
 // One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared.
-kernel void score_beams(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real2 *ray, global const int *first, global const real *reading,
-                        global const real *terms, global const real *sensor, global real *log_p, global real *parts,
-                        const int rows, const int cols, const int particles, const int rays, const int readings,
-                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
-                        const real limit, const real resolution, const real range_max, const real fixed,
-                        const real temperature) {
+kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
+                        global const real4 *pose, global const real2 *ray, global const int *first,
+                        global const real *reading, global const real *terms, global const real *edges,
+                        global const real *sensor, global real *log_p, global real *parts, const int rows,
+                        const int cols, const int particles, const int rays, const int readings, const int kinds,
+                        const int cone_rays, const real critical, const int bins, const real slack,
+                        const real tolerance, const int cells, const real per_metre, const real limit,
+                        const real resolution, const real range_max, const real fixed, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     real2 total = (real2)(fixed, 0);
@@ -91,15 +95,26 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
     int impossible = 0;
 #endif
     for (int r = 0; r < rays; ++r) {
+#if ECHO
+        const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + r * cone_rays,
+                                       cone_rays, critical, limit, bins, slack, tolerance);
+        const real t = echo.t;
+#else
         const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
+#endif
         const real expected = expected_range(t, limit, resolution, range_max);
+#if INCIDENCE
+        global const real *own = incidence_terms(terms, edges, kinds, echo.cosine);
+#else
+        global const real *own = terms;
+#endif
 #if SHARED_RAYS
         for (int k = first[r]; k < first[r + 1]; ++k) {
 #else
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -126,13 +141,15 @@ kernel void score_beams(global const entry *map_table, global const int2 *pose_c
 }
 
 // For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
-kernel void beam_tiles(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                       global const int *order, global const real2 *ray, global const int *first,
-                       global const real *reading, global const real *terms, global const real *sensor,
-                       global real *parts, const int rows, const int cols, const int particles, const int rays,
-                       const int readings, const int bins, const real slack, const real tolerance, const int cells,
-                       const real per_metre, const real limit, const real resolution, const real range_max,
-                       const int across, const int along, const int spread) {
+kernel void beam_tiles(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
+                       global const real4 *pose, global const int *order, global const real2 *ray,
+                       global const int *first, global const real *reading, global const real *terms,
+                       global const real *edges, global const real *sensor, global real *parts, const int rows,
+                       const int cols, const int particles, const int rays, const int readings, const int kinds,
+                       const int cone_rays, const real critical, const int bins, const real slack,
+                       const real tolerance, const int cells, const real per_metre, const real limit,
+                       const real resolution, const real range_max, const int across, const int along,
+                       const int spread) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;
 #if ORDERED
@@ -141,15 +158,26 @@ kernel void beam_tiles(global const entry *map_table, global const int2 *pose_ce
     const int n = place;
 #endif
     for (int r = tile_ray(item, spread); r < rays; r += tile_step(spread)) {
+#if ECHO
+        const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + r * cone_rays,
+                                       cone_rays, critical, limit, bins, slack, tolerance);
+        const real t = echo.t;
+#else
         const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
+#endif
         const real expected = expected_range(t, limit, resolution, range_max);
+#if INCIDENCE
+        global const real *own = incidence_terms(terms, edges, kinds, echo.cosine);
+#else
+        global const real *own = terms;
+#endif
 #if SHARED_RAYS
         for (int k = first[r]; k < first[r + 1]; ++k) {
 #else
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
             parts[(long)place * across + (long)k * along] = term;
         }
     }

@@ -1,6 +1,6 @@
 // Exponentials, logarithms and the error function in lanes; PoCL's own are calls that pass vectors through memory.
 // e^a = 2^k e^r with |r| <= log(2)/2 and e^r = 1 + r + r^2 E(r); log(2^k (1 + f)) = k log 2 + f - f^2/2 + f^3 L(f) with
-// 1 + f from sqrt(1/2) to sqrt(2); erf(x) = 1 - exp(-x W(x)). bench/lane_constants.py derives the constants;
+// 1 + f from sqrt(1/2) to sqrt(2); erf(x) = 1 - exp(-x W(x)); arctan t = t + t^3 A(t^2). bench/lane_constants.py derives the constants;
 // tests/test_lane_math.py measures the worst errors that stand here, in ulps of float32.
 // requires: lanes
 
@@ -18,7 +18,7 @@
 #define ROOT_HALF 0x3f3504f3
 // The error function is 1 to the last bit from here on.
 #define LANE_ERF_ONE 4.0f
-// E, L and W, lowest power first; their relative errors are 2^-25.6, 2^-27.2 and 2^-24.2.
+// E, L, A and W, lowest power first; relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t) and 2^-24.2.
 #define E0 0.49999997f
 #define E1 0.166665465f
 #define E2 0.041667223f
@@ -32,6 +32,11 @@
 #define L5 -0.131601855f
 #define L6 0.127615467f
 #define L7 -0.0763445124f
+#define A0 -0.333333164f
+#define A1 0.199984789f
+#define A2 -0.14243634f
+#define A3 0.105943188f
+#define A4 -0.0607896857f
 #define W0 1.12837923f
 #define W1 0.636619389f
 #define W2 0.102777831f
@@ -71,6 +76,12 @@ lanes log_lanes(const lanes p) {
     const lanes low = (L0 + L1 * f) + square * (L2 + L3 * f), high = (L4 + L5 * f) + square * (L6 + L7 * f);
     const lanes cubic = (square * f) * (low + (square * square) * high);
     return (f + ((cubic + k * LOG2_LOW) - 0.5f * square)) + k * LOG2_HIGH;
+}
+
+// arctan t - t for |t| <= tan(pi/8).
+lanes arc_rest(const lanes t) {
+    const lanes z = t * t;
+    return t * z * ((A0 + A1 * z) + z * z * ((A2 + A3 * z) + z * z * A4));
 }
 
 // erf(x) for x >= 0, within 3.8 ulp, 1 from 4 on.

@@ -6,7 +6,8 @@
 
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
-// Keeps 1 / z* finite.
+// Keep 2 / x and 1 / z* finite.
+#define TINY_DECAY ((real)1e-30)
 #define SMALLEST_RANGE ((real)1e-37)
 // Up to this 1 - exp(-x) is x within a quarter of the last bit of float32.
 #define SMALL_DECAY 2.98023224e-08f
@@ -35,20 +36,33 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
     return (real2)(off * (off * terms[1]), 0);
 #endif
 }
+
+// Terms of the log domain: log of z_hit p_hit(z | z*).
+real log_hit(const real z, const real expected, global const real *terms) {
+    const real2 exponent = hit_exponent(z, expected, terms);
+    const real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
+    return mass == 1 ? log_p : log_p - log(mass);
+}
 #endif
 
 #if SHORT
 // x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
 real short_factor(const real x) {
     const real h = (real)0.5 * x;
-    return h > TINY ? h / tanh(h) + h : (real)1;
+    return h > TINY_DECAY ? h / tanh(h) + h : (real)1;
+}
+
+// Terms of the log domain: log of z_short p_short(z | z*).
+real log_short(const real z, const real expected, global const real *terms) {
+    if (!(z <= expected && expected > 0)) return -INFINITY;
+    return terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
 }
 
 // short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
 real short_peak(const real lambda, const real expected) {
     const real h = (real)0.5 * (lambda * expected), t = tanh(h);
     const real shortest = expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE;
-    return (h > TINY ? lambda * (1 + t) : (real)1) / (h > TINY ? 2 * t : shortest);
+    return (h > TINY_DECAY ? lambda * (1 + t) : (real)1) / (h > TINY_DECAY ? 2 * t : shortest);
 }
 #endif
 #endif
@@ -98,14 +112,11 @@ real log_density(const real z, const real expected, global const real *terms) {
 real log_density(const real z, const real expected, global const real *terms) {
     real largest = -INFINITY;
 #if HIT
-    const real2 exponent = hit_exponent(z, expected, terms);
-    const real hit = (terms[0] - exponent.x) + (terms[8] - exponent.y) - log(hit_mass(expected, terms[2], terms[6]));
+    const real hit = log_hit(z, expected, terms);
     largest = hit;
 #endif
 #if SHORT
-    real shorter = -INFINITY;
-    if (z <= expected && expected > 0)
-        shorter = terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
+    const real shorter = log_short(z, expected, terms);
     largest = fmax(largest, shorter);
 #endif
 #if RAND

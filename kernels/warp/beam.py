@@ -8,7 +8,7 @@ import math
 
 import warp as wp
 
-from . import compat, error_free, mixture, sensor_table
+from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision
@@ -36,6 +36,10 @@ def make(name, flags):
     PER_BEAM = "PER_BEAM" in flags
     LINEAR = "LINEAR" in flags
     ORDERED = "ORDERED" in flags
+    ECHO = "ECHO" in flags
+    INCIDENCE = "INCIDENCE" in flags
+    nearest_echo = echo.functions(flags).nearest_echo
+    incidence_terms = echo.functions(flags).incidence_terms
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
@@ -53,8 +57,9 @@ def make(name, flags):
         if ALL_READINGS:
             if wp.isnan(z):
                 return ZERO
-            if wp.isinf(z):
-                return terms[7]
+            if not SENSOR_TABLE:
+                if wp.isinf(z):
+                    return terms[7]
         if CUBES:
             p = compat_density(z, expected, terms)
             return p * p * p
@@ -76,12 +81,14 @@ def make(name, flags):
     @kernel
     def score_beams(
         map_table: wp.array(dtype=ENTRY),
+        normals: wp.array(dtype=vec2),
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
         ray: wp.array(dtype=vec2),
         first: wp.array(dtype=wp.int32),
         reading: wp.array(dtype=real),
         terms: wp.array(dtype=real),
+        edges: wp.array(dtype=real),
         sensor: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
@@ -90,6 +97,9 @@ def make(name, flags):
         particles: wp.int32,
         rays: wp.int32,
         readings: wp.int32,
+        kinds: wp.int32,
+        cone_rays: wp.int32,
+        critical: real,
         bins: wp.int32,
         slack: real,
         tolerance: real,
@@ -110,7 +120,17 @@ def make(name, flags):
         block = real(0.0)
         impossible = bool(False)
         for r in range(rays):
-            t = cast_ray(map_table, rows, cols, cell, from_pose, ray[r], limit, bins, slack, tolerance)
+            own = terms
+            if ECHO:
+                heard = nearest_echo(
+                    map_table, normals, rows, cols, cell, from_pose, ray, r * cone_rays, cone_rays, critical, limit,
+                    bins, slack, tolerance,
+                )  # fmt: skip
+                t = heard.t
+                if INCIDENCE:
+                    own = incidence_terms(terms, edges, kinds, heard.cosine)
+            else:
+                t = cast_ray(map_table, rows, cols, cell, from_pose, ray[r], limit, bins, slack, tolerance)
             expected = expected_range(t, limit, resolution, range_max)
             begin = r
             end = r + 1
@@ -118,7 +138,7 @@ def make(name, flags):
                 begin = first[r]
                 end = first[r + 1]
             for k in range(begin, end):
-                term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max)
+                term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -141,6 +161,7 @@ def make(name, flags):
     @kernel
     def beam_tiles(
         map_table: wp.array(dtype=ENTRY),
+        normals: wp.array(dtype=vec2),
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
         order: wp.array(dtype=wp.int32),
@@ -148,6 +169,7 @@ def make(name, flags):
         first: wp.array(dtype=wp.int32),
         reading: wp.array(dtype=real),
         terms: wp.array(dtype=real),
+        edges: wp.array(dtype=real),
         sensor: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         rows: wp.int32,
@@ -155,6 +177,9 @@ def make(name, flags):
         particles: wp.int32,
         rays: wp.int32,
         readings: wp.int32,
+        kinds: wp.int32,
+        cone_rays: wp.int32,
+        critical: real,
         bins: wp.int32,
         slack: real,
         tolerance: real,
@@ -175,10 +200,20 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         cell = pose_cell[n]
-        own = pose[n]
+        from_pose = pose[n]
         r = tile_ray(item, spread)
         while r < rays:
-            t = cast_ray(map_table, rows, cols, cell, own, ray[r], limit, bins, slack, tolerance)
+            own = terms
+            if ECHO:
+                heard = nearest_echo(
+                    map_table, normals, rows, cols, cell, from_pose, ray, r * cone_rays, cone_rays, critical, limit,
+                    bins, slack, tolerance,
+                )  # fmt: skip
+                t = heard.t
+                if INCIDENCE:
+                    own = incidence_terms(terms, edges, kinds, heard.cosine)
+            else:
+                t = cast_ray(map_table, rows, cols, cell, from_pose, ray[r], limit, bins, slack, tolerance)
             expected = expected_range(t, limit, resolution, range_max)
             k = r
             end = r + 1
@@ -186,7 +221,7 @@ def make(name, flags):
                 k = first[r]
                 end = first[r + 1]
             while k < end:
-                term = reading_term(reading[k], expected, terms, sensor, cells, per_metre, range_max)
+                term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max)
                 parts[place * across + k * along] = term
                 k += 1
             r += tile_step(spread)

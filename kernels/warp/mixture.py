@@ -17,7 +17,7 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """hit_mass, hit_exponent, short_factor, short_peak and log_density specialised by the flags."""
+    """hit_mass, short_factor, log_hit, log_short and log_density specialised by the flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     two_product = error_free.functions(flags).two_product
@@ -63,6 +63,16 @@ def functions(flags):
         else:
             return vec2(off * (off * terms[1]), ZERO)
 
+    # Terms of the log domain: log of z_hit p_hit(z | z*).
+    @wp.func
+    def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
+        exponent = hit_exponent(z, expected, terms)
+        log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y)
+        mass = hit_mass(expected, terms[2], terms[6])
+        if mass == ONE:
+            return log_p
+        return log_p - wp.log(mass)
+
     # x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
     @wp.func
     def short_factor(x: real):
@@ -70,6 +80,13 @@ def functions(flags):
         if h > TINY:
             return h / wp.tanh(h) + h
         return ONE
+
+    # Terms of the log domain: log of z_short p_short(z | z*).
+    @wp.func
+    def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
+        if z <= expected and expected > ZERO:
+            return terms[3] + wp.log(short_factor(terms[4] * expected)) - wp.log(expected) - terms[4] * z
+        return NEVER
 
     # short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
     @wp.func
@@ -107,12 +124,10 @@ def functions(flags):
         shorter = NEVER
         largest = NEVER
         if HIT:
-            exponent = hit_exponent(z, expected, terms)
-            hit = (terms[0] - exponent.x) + (terms[8] - exponent.y) - wp.log(hit_mass(expected, terms[2], terms[6]))
+            hit = log_hit(z, expected, terms)
             largest = hit
         if SHORT:
-            if z <= expected and expected > ZERO:
-                shorter = terms[3] + wp.log(short_factor(terms[4] * expected)) - wp.log(expected) - terms[4] * z
+            shorter = log_short(z, expected, terms)
             largest = wp.max(largest, shorter)
         if RAND:
             largest = wp.max(largest, terms[5])
@@ -131,4 +146,6 @@ def functions(flags):
             return largest + wp.log(p)
 
     log_density = log_density_linear if "LINEAR" in flags else log_density_log
-    return SimpleNamespace(hit_mass=hit_mass, short_factor=short_factor, log_density=log_density)
+    return SimpleNamespace(
+        hit_mass=hit_mass, short_factor=short_factor, log_hit=log_hit, log_short=log_short, log_density=log_density
+    )

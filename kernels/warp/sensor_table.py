@@ -1,7 +1,7 @@
 """The density of one reading from a table of log p over bins of readings and expected ranges, instead of a formula.
 
-Row i is a bin of readings; column j a bin of expected ranges, and the last column is for rays without an obstacle. The
-table has fewer than 2^31 entries.
+Row i is a bin of readings, the last row for max readings (log probabilities); column j a bin of expected ranges, the
+last column for rays without an obstacle. The table has fewer than 2^31 entries.
 """
 
 import functools
@@ -17,16 +17,18 @@ def functions(flags):
     """range_bin and tabulated_density in the precision of the flags."""
     real = precision(flags).real
 
-    # Bin of a range; what is at the end or beyond belongs to the last one.
+    # Bin of a range; the last one, after the cells, is for range_max and more.
     @wp.func
-    def range_bin(distance: real, per_metre: real, cells: wp.int32):
+    def range_bin(distance: real, per_metre: real, cells: wp.int32, range_max: real):
+        if distance >= range_max:
+            return cells
         return wp.min(int(distance * per_metre), cells - 1)
 
     @wp.func
     def tabulated_density(
         z: real, expected: real, sensor: wp.array(dtype=real), cells: wp.int32, per_metre: real, range_max: real
     ):
-        column = wp.where(expected >= range_max, cells, range_bin(expected, per_metre, cells))
-        return sensor[range_bin(z, per_metre, cells) * (cells + 1) + column]
+        column = range_bin(expected, per_metre, cells, range_max)
+        return sensor[range_bin(z, per_metre, cells, range_max) * (cells + 1) + column]
 
     return SimpleNamespace(range_bin=range_bin, tabulated_density=tabulated_density)

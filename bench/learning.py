@@ -1,0 +1,220 @@
+"""How fast the beam model's parameters are learned, and how well: rates, fifty scenes, ten starts, degenerate readings.
+
+    python bench/learning.py --backend numpy --backend opencl --backend warp:cpu --output bench/results/learning_cpu
+    python bench/learning.py --backend numpy --backend opencl --pairs 100000 --count 1000 --starts 2     # a quick look
+
+*Rates*: one EM iteration (pass over the pairs and M-step) on --pairs pairs of a typical scene, without the second
+derivatives and with them, the upload, and a whole fit from its own start, as the best and the median of several runs;
+beside them the NumPy reference on the same pairs (a part of them where it is slow, said so), whose sums each backend's
+must match: *error* is the largest difference of the fitted parameters, relative, in float64.
+
+*Scenes*: fifty scenes with known parameters, from mild to stiff. Parameters whose standard error is below 30 % of
+them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
+log-likelihood in an iteration of exact EM and of the book's; and from --starts starts, by how many nats "gradient" and
+"hill_climb" end from EM's optimum in scenes that are identified as a whole.
+
+Exit code 1 where exact EM falls by more than 1e-9 of the log-likelihood, fewer than 95 % are within 3 standard errors,
+or an end differs by more than 1e-4 nats.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from speed import best, command_line, machine
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.learning.device_sums import DeviceSums
+from gpusense.learning.em import em_step
+from gpusense.learning.options import make_bounds, open_device
+from gpusense.learning.pairs import make_pairs
+from gpusense.learning.point import first_guess, random_start
+from gpusense.learning.problem import NO_PRIOR, Problem
+from gpusense.learning.scenes import Scene, learning_scenes
+
+TYPICAL = Scene("typical", gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 0.5), 30.0, (0.02, 0.98))
+IDENTIFIED, FALLS, SHARE, NATS = 0.3, 1e-9, 0.95, 1e-4
+
+
+def values(parameters: gs.BeamParameters) -> np.ndarray:
+    """The six numbers."""
+    return np.array(list(parameters.to_dict().values()))
+
+
+def rates(
+    selection: str, precision: str, arguments: argparse.Namespace, truth: dict[int, np.ndarray]
+) -> dict[str, Any]:
+    """Seconds of one iteration and of a fit on one backend."""
+    backend, real = open_device(selection, precision)
+    count = min(arguments.pairs, arguments.numpy_pairs) if selection == "numpy" else arguments.pairs
+    z, expected = TYPICAL.draw(count, np.random.default_rng(arguments.seed))
+    pairs = make_pairs(z, expected, TYPICAL.range_max)
+    bounds = make_bounds(pairs)
+
+    def upload() -> DeviceSums:
+        device = DeviceSums(backend, real, pairs)
+        backend.synchronize()
+        return device
+
+    uploaded = best(upload, arguments.repeats, arguments.seconds)
+    problem = Problem(upload(), pairs, bounds, NO_PRIOR, False)
+    value = problem.value(first_guess(pairs, bounds))
+    problem.value(value.point, second=True)
+    plain = best(lambda: em_step(problem, value), arguments.repeats, arguments.seconds)
+    second = best(lambda: em_step(problem, value, second=True), arguments.repeats, arguments.seconds)
+    fits: list[gs.BeamFit] = []
+
+    def fit() -> None:
+        fits.append(gs.fit_beam_parameters(z, expected, TYPICAL.range_max, backend=backend, precision=precision))
+
+    whole = best(fit, 3, arguments.seconds)
+    found = values(fits[-1].parameters)
+    if count not in truth:
+        reference = gs.fit_beam_parameters(
+            z[: arguments.numpy_pairs], expected[: arguments.numpy_pairs], TYPICAL.range_max, backend="numpy"
+        )
+        # The reference on fewer pairs is no truth for more of them: compare the same pairs.
+        part = gs.fit_beam_parameters(
+            z[: arguments.numpy_pairs],
+            expected[: arguments.numpy_pairs],
+            TYPICAL.range_max,
+            backend=backend,
+            precision=precision,
+        )
+        error = float(np.max(np.abs(values(part.parameters) / values(reference.parameters) - 1)))
+    else:
+        error = float(np.max(np.abs(found / truth[count] - 1)))
+    if selection == "numpy" and precision == "float64":
+        truth[count] = found
+    return {
+        "backend": backend.info.selection, "device": backend.info.name, "precision": precision, "pairs": count,
+        "hits": pairs.hits, "upload_s": uploaded[0], "iteration_s": plain[0], "iteration_median_s": plain[1],
+        "second_s": second[0], "pairs_per_s": pairs.hits / plain[0], "fit_s": whole[0],
+        "iterations": fits[-1].iterations, "passes": fits[-1].passes, "error": error, "converged": fits[-1].converged,
+    }  # fmt: skip
+
+
+def fall(trace: np.ndarray) -> float:
+    """The largest fall in an iteration over the log-likelihood's size."""
+    return float(np.max(-np.diff(trace), initial=0.0) / abs(trace[-1]))
+
+
+def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
+    """What one scene shows."""
+    z, expected = scene.draw(arguments.count, np.random.default_rng(arguments.seed + number))
+    pairs = make_pairs(z, expected, scene.range_max)
+    bounds = make_bounds(pairs)
+    # One device buffer serves every fit of a scene only within the library: users call the function.
+    run = dict(backend=arguments.backend[-1], precision="float64")
+    fit = gs.fit_beam_parameters(z, expected, scene.range_max, **run)
+    book = gs.fit_beam_parameters(z, expected, scene.range_max, method="em-book", **run)
+    error = np.array(list(fit.standard_errors.values()))
+    off = (values(fit.parameters) - values(scene.parameters)) / error
+    identified = np.isfinite(error) & (error < IDENTIFIED * values(fit.parameters))
+    ends: dict[str, float] = {}
+    if identified.all():
+        rng = np.random.default_rng(arguments.seed + number)
+        guess = first_guess(pairs, bounds)
+        starts = [random_start(guess, bounds, rng).parameters() for _ in range(arguments.starts)]
+        for method in ("gradient", "hill_climb"):
+            each = [
+                gs.fit_beam_parameters(z, expected, scene.range_max, method=method, initial=s, **run) for s in starts
+            ]
+            ends[method] = max((abs(one.log_likelihood - fit.log_likelihood) for one in each), default=0.0)
+    return {
+        "scene": scene.name, "truth": scene.parameters.to_dict(), "found": fit.parameters.to_dict(),
+        "identified": int(identified.sum()), "within": int((np.abs(off[identified]) <= 3).sum()),
+        "worst": float(np.max(np.abs(off[identified]), initial=0.0)), "iterations": fit.iterations,
+        "passes": fit.passes, "converged": fit.converged, "fall": fall(fit.trace), "book_fall": fall(book.trace),
+        "book_falls": int((np.diff(book.trace) < -1e-9 * abs(book.trace[-1])).sum()),
+        "book_behind": fit.log_likelihood - book.log_likelihood, "ends": ends,
+    }  # fmt: skip
+
+
+def to_markdown(rows: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> str:
+    """Both tables."""
+    lines = [
+        "| backend | precision | pairs | upload ms | EM iteration ms | with 2nd derivatives ms | 10^6 pairs/s "
+        "| x NumPy | fit s | passes | error |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    numpy = {row["precision"]: row["pairs_per_s"] for row in rows if row["backend"] == "numpy"}
+    for r in rows:
+        base = numpy.get(r["precision"])
+        ratio = f"{r['pairs_per_s'] / base:.1f}" if base else "-"
+        lines.append(
+            f"| {r['backend']} ({r['device']}) | {r['precision']} | {r['pairs']} | {1e3 * r['upload_s']:.1f} "
+            f"| {1e3 * r['iteration_s']:.2f} | {1e3 * r['second_s']:.2f} | {r['pairs_per_s'] / 1e6:.1f} | {ratio} "
+            f"| {r['fit_s']:.3f} | {r['passes']} | {r['error']:.1e} |"
+        )
+    lines += [
+        "", "| scene | identified | within 3 s.e. | worst, s.e. | iterations | EM's worst fall | book: falls "
+        "| book: nats behind | gradient, nats off | hill climbing, nats off |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for s in scenes:
+        ends = " | ".join(f"{s['ends'][m]:.0e}" if m in s["ends"] else "-" for m in ("gradient", "hill_climb"))
+        lines.append(
+            f"| {s['scene']} | {s['identified']} | {s['within']} | {s['worst']:.1f} | {s['iterations']} "
+            f"| {s['fall']:.0e} | {s['book_falls']} | {s['book_behind']:.3g} | {ends} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--backend", action="append", required=True, help="selection string; the last one has the scenes"
+    )
+    parser.add_argument("--precision", action="append", help="float64 and float32 where not given")
+    parser.add_argument("--pairs", type=int, default=10_000_000)
+    parser.add_argument("--numpy-pairs", type=int, default=1_000_000, help="pairs of the NumPy reference at most")
+    parser.add_argument("--scenes", type=int, default=50)
+    parser.add_argument("--count", type=int, default=4000, help="readings of each scene")
+    parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=20.0, help="longest time of the repeats of one figure")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
+    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
+    arguments = parser.parse_args()
+    truth: dict[int, np.ndarray] = {}
+    # The reference first: others are held against it.
+    selections = sorted(arguments.backend, key=lambda name: name != "numpy")
+    rows = []
+    for selection in selections:
+        for precision in arguments.precision or ("float64", "float32"):
+            if precision == "float32" or get_backend(selection).info.float64:
+                rows.append(rates(selection, precision, arguments, truth))
+    scenes = [scene_row(i, scene, arguments) for i, scene in enumerate(learning_scenes(50)[: arguments.scenes])]
+    identified, within = (sum(scene[name] for scene in scenes) for name in ("identified", "within"))
+    fell = max((scene["fall"] for scene in scenes), default=0.0)
+    off = max((nats for scene in scenes for nats in scene["ends"].values()), default=0.0)
+    command, host = command_line("bench/learning.py"), machine(arguments.commit)
+    described = ", ".join(f"{name} {value}" for name, value in host.items())
+    text = (
+        f"{to_markdown(rows, scenes)}\n\n{within} of {identified} identified parameters within 3 standard errors; "
+        f"exact EM falls by at most {fell:.1e} of the log-likelihood; other ways end within {off:.1e} nats.\n\n"
+        f"Machine: {described}. Command: `{command}`.\n"
+    )
+    print(text)
+    if arguments.output:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        report = {
+            "command": command, "machine": host, "rows": rows, "scenes": scenes, "identified": identified,
+            "within": within, "fall": fell, "off": off,
+        }  # fmt: skip
+        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+        arguments.output.with_suffix(".md").write_text(text)
+    return 1 if fell > FALLS or within < SHARE * identified or off > NATS else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,297 @@
+"""``gpusense fit``: the beam model's parameters from a recorded log in a map, or from pairs of readings."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpusense.commands._common import (
+    add_backend,
+    add_json,
+    add_seed,
+    check_writable,
+    machine,
+    machine_line,
+    positive_number,
+    print_json,
+    print_table,
+    progress,
+    whole_number,
+    write_whole,
+)
+
+if TYPE_CHECKING:
+    from gpusense.fitting import RangeData
+    from gpusense.held_out import HeldOut
+    from gpusense.learning.incidence import IncidenceFit
+    from gpusense.learning.result import BeamFit
+
+NAME = "fit"
+HELP = "Learn the beam model's parameters from a recorded log in a map, or from pairs of readings."
+
+_DESCRIPTION = """\
+How good is a range finder? gpusense fit learns the six parameters of the beam model from data of your own sensor: how
+often it is right (z_hit) and how exactly (sigma_hit), how often something stands in the way (z_short, lambda_short),
+how often it returns nothing (z_max), and the rest (z_rand). It needs readings and the ranges that were to be expected:
+either a map and a log with good poses, for which expected ranges are cast, or a file of pairs."""
+
+_EPILOG = """\
+A file of pairs has a line for each reading: the reading z, a comma, the expected range z*, and if you like another
+comma and the angle of incidence in radians. A first line without numbers is a header; .gz is read too. inf is 'no
+return', nan a missing reading.
+
+With --holdout every other block (one scan of a log, 100 pairs of a file; see --block) takes no part in the fit, and the
+others say how much likelier than the default parameters of nav2_amcl and Beluga the fitted ones make them. The standard
+error is that of blocks, because readings of a scan err together.
+
+A map that was made of the same scans hides their errors: fit with scans that the map has not seen, as --every 2
+--offset 1 chooses them where it was made of the even ones.
+
+--out writes parameters.yaml (ours and, ready to paste, those of nav2's amcl) and pictures: readings.png, density.png,
+trace.png, surface.png, and incidence.png where angles of incidence are fitted.
+
+Exit codes: 0 success, 1 the fit did not converge, 2 bad input.
+
+example:
+  gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --out fitted
+  gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
+
+UNFINISHED = 1
+# Only written to by --out.
+_PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
+_PAIRS_BLOCK = 100
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.description, parser.epilog = _DESCRIPTION, _EPILOG
+    add = parser.add_argument
+    add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
+    add("--log", type=Path, metavar="FILE", help="a CARMEN log with corrected poses, plain or .gz; needs --map")
+    add("--pairs", type=Path, metavar="CSV", help="readings and expected ranges instead; needs --range-max")
+    add("--every", type=whole_number(low=1), default=1, metavar="E",
+        help="every E-th scan or pair, from --offset on; '--every 2 --offset 1' are the odd ones")  # fmt: skip
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="number of the first one (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help="at most so many scans or pairs")
+    add("--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: what the log gives for 'no return')")  # fmt: skip
+    add("--range-min", type=positive_number, metavar="M", help="readings below this are missing [m] (default: none)")
+    add("--method", choices=("em", "em-book", "gradient", "hill_climb", "genetic"), default="em",
+        help="how the likelihood is climbed; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
+    add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
+    add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
+        help="also fit parameters for so many bins of the angle between beam and wall")  # fmt: skip
+    add("--restarts", type=whole_number(low=0), default=0, metavar="N", help="further starts at random (default: 0)")
+    add("--holdout", action="store_true", help="hold out every other block, and compare with others' defaults there")
+    add("--block", type=whole_number(low=1), metavar="B",
+        help=f"neighbouring scans or pairs of a block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip
+    add_backend(parser)
+    add_seed(parser)
+    add_json(parser)
+    add("--out", type=_folder, metavar="DIR", help="folder for parameters.yaml and pictures; made if absent")
+
+
+@dataclass(frozen=True)
+class Result:
+    """All that was found.
+
+    Attributes:
+        data: The readings of the fit.
+        fit: The fit.
+        incidence: That by angles of incidence, or None.
+        held_out: The comparison on held-out readings; empty without ``--holdout``.
+        held_out_readings: How many these are.
+    """
+
+    data: RangeData
+    fit: BeamFit
+    incidence: IncidenceFit | None
+    held_out: list[HeldOut]
+    held_out_readings: int
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit and print what came out."""
+    _check_sources(args)
+    result = _fit(args, _read(args))
+    files = _write(args.out, result) if args.out is not None else []
+    if args.json:
+        print_json(_document(args, result, files))
+    else:
+        _print(result, files)
+    return 0 if result.fit.converged else UNFINISHED
+
+
+def _check_sources(args: argparse.Namespace) -> None:
+    if args.pairs is not None:
+        for name in ("map", "log"):
+            if getattr(args, name) is not None:
+                raise ValueError(f"--{name}: must be left out with --pairs, got {getattr(args, name)}")
+        if args.range_max is None:
+            raise ValueError("--range-max: must be given with --pairs, got none")
+    for name in ("map", "log"):
+        if args.pairs is None and getattr(args, name) is None:
+            raise ValueError(f"--{name}: must be given unless --pairs is, got none")
+    if args.range_min is not None and args.range_max is not None and args.range_min >= args.range_max:
+        raise ValueError(f"--range-min: must be < --range-max = {args.range_max}, got {args.range_min}")
+
+
+def _read(args: argparse.Namespace) -> RangeData:
+    from gpusense import fitting
+    from gpusense.map_io import read_map
+    from gpusense.scoring import logged_scans
+
+    chosen = {"every": args.every, "offset": args.offset, "limit": args.limit}
+    range_min = args.range_min or 0.0
+    if args.pairs is not None:
+        data = fitting.data_of_pairs(
+            args.pairs, args.range_max, range_min=range_min, block=args.block or _PAIRS_BLOCK, **chosen
+        )
+        if args.incidence and data.incidence is None:
+            raise ValueError(f"--incidence: must have pairs with a third column, the angle, got two in {args.pairs}")
+        return data
+    grid = read_map(args.map)
+    scans = logged_scans(args.log, range_max=args.range_max, **chosen)
+    top = scans[0][1].scanner.range_max
+    if range_min >= top:
+        raise ValueError(f"--range-min: must be < the log's range_max = {top}, got {range_min}")
+    with progress(-(-len(scans) // fitting.SCANS)) as step:
+        return fitting.data_of_log(
+            grid, scans, backend=args.backend, range_min=range_min, block=args.block or 1,
+            incidence=bool(args.incidence), step=step,
+        )  # fmt: skip
+
+
+def _fit(args: argparse.Namespace, data: RangeData) -> Result:
+    from gpusense.held_out import compare_held_out
+    from gpusense.learning.fit import fit_beam_parameters
+    from gpusense.learning.incidence import fit_incidence_parameters
+
+    data, rest = data.halves() if args.holdout else (data, None)
+    sensor = {"range_max": data.range_max, "range_min": data.range_min, "backend": args.backend}
+    fit = fit_beam_parameters(
+        data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
+        range_bias=args.range_bias, progress=True,
+    )  # fmt: skip
+    incidence = None
+    if data.incidence is not None and args.incidence:
+        incidence = fit_incidence_parameters(
+            data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias
+        )
+    bias = fit.range_bias if fit.bias_fitted else 0.0
+    compared = []
+    if rest is not None:
+        compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias)
+    return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges))
+
+
+def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> dict[str, Any]:
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
+    held_out = [{**asdict(row), "parameters": row.parameters.to_dict()} for row in result.held_out]
+    return {
+        "options": options,
+        "range_max": result.data.range_max,
+        "readings": len(result.data.ranges),
+        "blocks": len(set(result.data.block.tolist())),
+        "fit": result.fit.to_dict(),
+        "incidence": None if result.incidence is None else result.incidence.to_dict(),
+        "held_out_readings": result.held_out_readings,
+        "held_out": held_out,
+        "files": files,
+        "machine": machine(),
+    }
+
+
+def _print(result: Result, files: list[Path]) -> None:
+    print(f"{result.fit}\nrange_max {result.data.range_max} m, of {len(result.data.ranges)} readings")
+    if result.incidence is not None:
+        print(f"\n{result.incidence}")
+    if result.held_out:
+        print(f"\nheld out: {result.held_out_readings} readings, mean log-likelihood of one [nats]")
+        columns = ("parameters", "log-likelihood", "std. error", "fitted ones gain", "std. error of it")
+        rows = [
+            (row.name, f"{row.per_beam:.4f}", _error(row.error), f"{row.gain:.4f}", _error(row.gain_error))
+            for row in result.held_out
+        ]
+        print_table(columns, rows, right=columns[1:])
+        for row in result.held_out:
+            if row.impossible:
+                print(f"{row.name}: {row.impossible} held-out readings are impossible")
+                print("softened: as if each cause had been seen half a time more; others are compared with that")
+    if files:
+        print("\nwritten: " + ", ".join(map(str, files)))
+    print(f"\n{machine_line()}")
+
+
+def _error(value: float) -> str:
+    return f"{value:.4f}" if math.isfinite(value) else "-"
+
+
+def parameters_yaml(result: Result) -> str:
+    """The parameters for us and for nav2_amcl."""
+    import yaml
+
+    own = {name: float(value) for name, value in result.fit.parameters.to_dict().items()}
+    lines = [
+        f"# gpusense fit: {result.fit.hits} ranges and {result.fit.max_readings} readings without return; "
+        f"{result.fit.status}",
+        "# For gpusense: gs.BeamParameters.from_dict(...) takes what stands under beam_model.",
+        yaml.safe_dump({"beam_model": own}, sort_keys=False).rstrip(),
+    ]
+    if result.fit.bias_fitted:
+        lines.append(f"# Subtract this from every reading [m].\nrange_bias: {float(result.fit.range_bias)!r}")
+    if result.incidence is not None:
+        lines.append("# For gpusense: gs.IncidenceParameters.from_dict(...).")
+        lines.append(
+            yaml.safe_dump({"incidence_model": result.incidence.parameters.to_dict()}, sort_keys=False).rstrip()
+        )
+    nav2 = {"laser_model_type": "beam", **own, "laser_max_range": float(result.data.range_max)}
+    lines += [
+        "# For nav2_amcl: what to paste below amcl's ros__parameters. Its beam model sums cubes of densities that are",
+        "# not normalised: the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
+        "# to its likelihood field alone, of which this fit says nothing.",
+        yaml.safe_dump({"amcl": {"ros__parameters": nav2}}, sort_keys=False).rstrip(),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _write(folder: Path, result: Result) -> list[Path]:
+    """The files of a fit, each whole."""
+    from gpusense import fit_plots
+    from gpusense.plots import save
+
+    text = parameters_yaml(result).encode()
+    file = folder / "parameters.yaml"
+    write_whole(file, lambda stream: stream.write(text))
+    parameters, bias = result.fit.parameters, result.fit.range_bias if result.fit.bias_fitted else 0.0
+    distances = fit_plots.distances_of(result.data)
+    figures = [
+        fit_plots.readings_figure(result.data, distances),
+        fit_plots.density_figure(result.data, parameters, distances, bias),
+        fit_plots.trace_figure(result.fit.trace, result.fit.method),
+        fit_plots.surface_figure(result.data, parameters, bias),
+    ]
+    names = list(_PICTURES)
+    if result.incidence is not None:
+        figures.append(fit_plots.incidence_figure(result.incidence))
+        names.append("incidence.png")
+    written = [file]
+    for name, figure in zip(names, figures, strict=True):
+        save(figure, folder / name)
+        written.append(folder / name)
+    return written
+
+
+def _folder(text: str) -> Path:
+    """A type for ``add_argument``: a folder that can be written to, made if it is absent."""
+    folder = Path(text)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder / "parameters.yaml")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise argparse.ArgumentTypeError(f"must be a folder that can be written to, got {text!r}: {reason}") from None
+    return folder

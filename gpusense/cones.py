@@ -1,0 +1,71 @@
+"""How a sensor hears: along one ray or in a cone of them, from surfaces at any angle or only from those met head-on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gpusense import _checks
+from gpusense.casters import Caster
+from gpusense.scanner import Scanner
+
+
+@dataclass(frozen=True)
+class Cones:
+    """How a sensor hears.
+
+    Attributes:
+        rays: Rays of each cone; 1 for a laser.
+        critical: Least cosine of an angle of incidence at which a surface returns; 0 where all do.
+        incidence: Whether angles of incidence are wanted, not ranges.
+    """
+
+    rays: int = 1
+    critical: float = 0.0
+    incidence: bool = False
+
+    @property
+    def scalars(self) -> tuple[int, float]:
+        """The kernels' arguments cone_rays and critical."""
+        return self.rays, self.critical
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """The kernels' flags."""
+        if self.incidence or self.critical > 0:
+            return frozenset({"ECHO", "INCIDENCE"})
+        return frozenset({"ECHO"} if self.rays > 1 else ())
+
+    def words(self, critical: float | None) -> str:
+        """What a plan's title says of it; ``critical`` is the largest angle that returns [rad]."""
+        cone = f", cones of {self.rays} rays" if self.rays > 1 else ""
+        return cone + (f", no return beyond {critical:g} rad of incidence" if critical is not None else "")
+
+
+def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
+    """How a scanner hears; ``incidence`` says whether its model depends on angles of incidence.
+
+    Raises:
+        ValueError: angles of incidence matter, and the caster is not exact.
+    """
+    critical = scanner.critical_incidence
+    least = 0.0 if critical is None or critical >= math.pi / 2 else max(math.cos(critical), 0.0)
+    if critical is not None and not method.exact:
+        value = f"critical_incidence = {_checks.show(critical)}"
+        raise ValueError(f"caster: must be an exact one for a scanner with {value}, got {method.name!r}")
+    if incidence:
+        require_exact("caster", method)
+    return Cones(scanner.cone_rays, least, incidence)
+
+
+def require_exact(argument: str, method: Caster) -> None:
+    """Refuse casters that do not say in which cell a ray ends.
+
+    Raises:
+        ValueError: the caster is not exact.
+    """
+    if not method.exact:
+        raise ValueError(f"{argument}: must be an exact one where angles of incidence matter, got {method.name!r}")
+
+
+LASER = Cones()

@@ -1,0 +1,165 @@
+"""What a sensor hears: the nearest return among the rays of its cone, one ray for a laser, and the angle there.
+
+The angle of incidence lies between the ray and the normal of the surface that it hits. Normals of cells are made
+beforehand, in a ring of cells around the map: 0 for free cells, NaN for cells without a normal, which count as met
+head-on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.ranges import BLOCK, caster_of
+from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_grid
+
+
+def is_wall(normal: np.ndarray) -> np.ndarray:
+    """Whether (M, 2) normals are those of obstacles."""
+    return (normal != 0).any(axis=1)
+
+
+def normal_at(
+    flags: frozenset[str], normals: np.ndarray, rows: int, cols: int, col: np.ndarray, row: np.ndarray
+) -> np.ndarray:
+    """(M, 2) normals of cells."""
+    beyond = off_grid(np.stack([col + 1, row + 1]), rows + 2, cols + 2)
+    found = normals[np.where(beyond, 0, (row + 1) * (cols + 2) + col + 1)]
+    found[beyond] = np.nan if "OUTSIDE_OCCUPIED" in flags else 0
+    return found
+
+
+def hit_normal(
+    flags: frozenset[str], normals: np.ndarray, rows: int, cols: int, cell: np.ndarray, r: Ray, t: np.ndarray
+) -> np.ndarray:
+    """Normals of the cells in which M rays end at distances t, which tell where the exact walk was.
+
+    It was across all boundaries in x up to t and those in y before t, or, after a step in y, up to t as well. A corner
+    is passed in x first.
+    """
+    x, y = cell.T.astype(np.int64)
+    col = x + r.step[0] * crossed(t, r.speed[0], r.a[0], r.inv[0], True).astype(np.int64)
+    before, until = (
+        y + r.step[1] * crossed(t, r.speed[1], r.a[1], r.inv[1], upto).astype(np.int64) for upto in (False, True)
+    )
+    own, first, second = (normal_at(flags, normals, rows, cols, *at) for at in ((x, y), (col, before), (col, until)))
+    later = np.where(is_wall(first)[:, None], first, second)
+    return np.where(((t == 0) & is_wall(own))[:, None], own, later)
+
+
+def incidence_terms(terms: np.ndarray, edges: np.ndarray, kinds: int, cosine: np.ndarray) -> np.ndarray:
+    """(10, ...) terms of the mixture for the bins of angles of incidence, by the cosines of the bins' upper edges."""
+    bins = (cosine[..., None] <= edges[: kinds - 1]).sum(axis=-1)
+    return np.moveaxis(terms[: 10 * kinds].reshape(kinds, 10)[bins], -1, 0)
+
+
+def nearest_echo(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    normals: np.ndarray,
+    rows: int,
+    cols: int,
+    cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    critical: np.floating,
+    limit: np.floating,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nearest returns of M cones.
+
+    A ray whose angle of incidence has a cosine below critical has no return: the surface is a mirror to it.
+
+    Args:
+        flags: Flags of the signature table.
+        map_table: What the caster made of the map.
+        normals: Padded normals; see above.
+        rows: Rows of the grid.
+        cols: Columns of the grid.
+        cell: (M, 2) integer column and row of each origin.
+        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
+        ray: (M, C, 2) cosine and sine of each cone's rays.
+        critical: Least cosine.
+        limit: Longest distance in cells.
+        bins: The caster's, as ``slack`` and ``tolerance`` are.
+        slack: See ``bins``.
+        tolerance: See ``bins``.
+
+    Returns:
+        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence, 1 and 0
+        there.
+    """
+    real = pose.dtype.type
+    nearest = np.full(len(cell), limit, pose.dtype)
+    cosine, sine = np.ones_like(nearest), np.zeros_like(nearest)
+    for i in range(ray.shape[1]):
+        t = caster_of(flags).cast_ray(
+            flags, map_table, rows, cols, cell, pose, ray[:, i], limit, bins, slack, tolerance
+        )
+        heard = t < nearest
+        if "INCIDENCE" in flags:
+            r = make_ray(pose, ray[:, i])
+            normal = hit_normal(flags, normals, rows, cols, cell, r, t)
+            known, (dx, dy) = ~np.isnan(normal[:, 0]), r.direction
+            straight = np.where(known, np.abs(dx * normal[:, 0] + dy * normal[:, 1]), real(1))
+            aslant = np.where(known, np.abs(dx * normal[:, 1] - dy * normal[:, 0]), real(0))
+            heard &= straight >= critical
+            cosine[heard], sine[heard] = straight[heard], aslant[heard]
+        nearest[heard] = t[heard]
+    return nearest, cosine, sine
+
+
+def cast_echoes(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    normals: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    ranges: np.ndarray,
+    incidence: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    rays: int,
+    cone_rays: int,
+    critical: np.floating,
+    bins: int,
+    slack: np.floating,
+    tolerance: np.floating,
+    limit: np.floating,
+    resolution: np.floating,
+    range_max: np.floating,
+) -> None:
+    """Expected ranges of all particles' cones, and the angles of incidence there, NaN where nothing returns."""
+    block = max(BLOCK // max(rays, 1), 1)
+    for first in range(0, particles, block):
+        some = slice(first, min(first + block, particles))
+        own = slice(some.start * rays, some.stop * rays)
+        t, cosine, sine = echoes(
+            flags, map_table, normals, rows, cols, pose_cell[some], pose[some], ray, rays, cone_rays, critical, limit,
+            bins, slack, tolerance,
+        )  # fmt: skip
+        ranges[own] = expected_range(t, limit, resolution, range_max)
+        if "INCIDENCE" in flags:
+            incidence[own] = np.where(t < limit, np.arctan2(sine, cosine), np.nan)
+
+
+def echoes(
+    flags: frozenset[str],
+    map_table: np.ndarray,
+    normals: np.ndarray,
+    rows: int,
+    cols: int,
+    cell: np.ndarray,
+    pose: np.ndarray,
+    ray: np.ndarray,
+    rays: int,
+    cone_rays: int,
+    *rest: np.floating | int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``nearest_echo`` of all cones at all poses, (N * rays,) each."""
+    lanes = (np.repeat(cell, rays, axis=0), np.repeat(pose, rays, axis=0))
+    cones = np.tile(ray[: rays * cone_rays].reshape(rays, cone_rays, 2), (len(pose), 1, 1))
+    return nearest_echo(flags, map_table, normals, rows, cols, *lanes, cones, *rest)  # type: ignore[arg-type]

@@ -1,0 +1,92 @@
+"""The likeliest joint association of a few features, in which no two of them are the same landmark.
+
+Features without a landmark are false positives. Landmarks are taken one after the other; ``best[s]`` is the largest sum
+of log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may
+join one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.landmark_grid import near
+from gpusense.reference.landmarks import (
+    FALSE_POSITIVE,
+    FEATURE,
+    RADIUS,
+    direction,
+    either,
+    log_detection,
+    offset,
+    sensor_place,
+)
+
+
+def joint_features(
+    flags: frozenset[str],
+    landmark: np.ndarray,
+    signature: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    feature: np.ndarray,
+    terms: np.ndarray,
+    arcs: np.ndarray,
+    best: np.ndarray,
+    choice: np.ndarray,
+    value: np.ndarray,
+    log_p: np.ndarray,
+    parts: np.ndarray,
+    which: np.ndarray,
+    landmarks: int,
+    particles: int,
+    features: int,
+    sets: int,
+    size: np.floating,
+    fixed: np.floating,
+    temperature: np.floating,
+) -> None:
+    """``choice[s]`` has the landmark of each feature of a set, and its log p at ``value``; ``sets`` is 2^features."""
+    real = pose.dtype
+    numbers = feature.reshape(-1, FEATURE)
+    place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], size)
+    turned = [direction(pose[:particles], pose_low[:particles], one) for one in numbers[:features]]
+    sums = best[: particles * sets].reshape(particles, sets)
+    who = choice[: particles * sets * features].reshape(particles, sets, features)
+    each = value[: particles * sets * features].reshape(particles, sets, features)
+    sums[:], who[:], each[:] = -np.inf, -1, -np.inf
+    sums[:, 0] = 0
+    for j in range(landmarks):
+        off = offset(landmark[j : j + 1], place)
+        own = signature[np.full(particles, j)]
+        log_each = np.full((features, particles), -np.inf, real)
+        for k in range(features):
+            if numbers[k, RADIUS] >= 0:
+                found = log_detection(flags, off, turned[k], numbers[k], own, terms, arcs)
+                found = either(found, numbers[k, FALSE_POSITIVE])
+                log_each[k] = np.where(near(off, turned[k], numbers[k]), found, -np.inf)
+        # From the full set down: the smaller sets do not have this landmark yet.
+        for s in range(sets - 1, 0, -1):
+            for k in range(features):
+                if s >> k & 1:
+                    less = s ^ 1 << k
+                    joined = sums[:, less] + log_each[k]
+                    better = joined > sums[:, s]
+                    sums[better, s] = joined[better]
+                    who[better, s], each[better, s] = who[better, less], each[better, less]
+                    who[better, s, k], each[better, s, k] = j, log_each[k, better]
+    most, chosen = np.full(particles, -np.inf, real), np.zeros(particles, np.int64)
+    for s in range(sets):
+        total = sums[:, s].copy()
+        for k in range(features):
+            if not s >> k & 1:
+                total = total + numbers[k, FALSE_POSITIVE]
+        better = total > most
+        most[better], chosen[better] = total[better], s
+    log_p[:particles] = np.where(np.isneginf(most), most, temperature * (fixed + most))
+    if "PER_BEAM" in flags:
+        n = np.arange(particles)
+        found, values = who[n, chosen], each[n, chosen]
+        which[: particles * features] = found.ravel()
+        false = numbers[:features, FALSE_POSITIVE]
+        parts[: particles * features] = np.where(found >= 0, values, false).ravel()

@@ -1,0 +1,80 @@
+"""Likelihood of a set of features for each particle, log p(f | x, m): the sum over features (tables 6.4 and 6.5)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.error_free import BLOCK_TERMS, add_term
+from gpusense.reference.landmark_grid import search
+from gpusense.reference.landmarks import (
+    FALSE_POSITIVE,
+    FEATURE,
+    direction,
+    either,
+    log_detection,
+    offset,
+    sensor_place,
+)
+
+# Particles that are scored at once.
+BLOCK = 1 << 14
+
+
+def score_features(
+    flags: frozenset[str],
+    landmark: np.ndarray,
+    signature: np.ndarray,
+    start: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    feature: np.ndarray,
+    partner: np.ndarray,
+    terms: np.ndarray,
+    arcs: np.ndarray,
+    log_p: np.ndarray,
+    parts: np.ndarray,
+    which: np.ndarray,
+    rows: int,
+    cols: int,
+    landmarks: int,
+    particles: int,
+    features: int,
+    size: np.floating,
+    share: np.floating,
+    fixed: np.floating,
+    temperature: np.floating,
+) -> None:
+    """Sum of log p over features: with the partner that is KNOWN, of all (MARGINAL), or of the likeliest landmark.
+
+    With PER_BEAM also what each feature adds, and its likeliest landmark's place in the buckets, -1 where a false
+    positive is likelier. ``share`` is log(1 / landmarks), the prior of each one with MARGINAL and else 0.
+    """
+    numbers = feature.reshape(-1, FEATURE)
+    for begin in range(0, particles, BLOCK):
+        part = slice(begin, min(begin + BLOCK, particles))
+        place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)
+        count = len(place[0])
+        total = (np.full(count, fixed, pose.dtype), np.zeros(count, pose.dtype))
+        lost = np.zeros(count, bool)
+        for k in range(0, features, BLOCK_TERMS):
+            block = np.zeros(count, pose.dtype)
+            for i in range(k, min(k + BLOCK_TERMS, features)):
+                one, turned = numbers[i], direction(pose[part], pose_low[part], numbers[i])
+                if "KNOWN" in flags:
+                    j = np.full(count, partner[i])
+                    found = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
+                    best, chosen = found, j
+                else:
+                    found, best, chosen = search(
+                        flags, landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size
+                    )
+                value = either(found + share, one[FALSE_POSITIVE])
+                lost |= np.isneginf(value)
+                block += np.where(np.isneginf(value), 0, value)
+                if "PER_BEAM" in flags:
+                    at = np.arange(part.start, part.stop) * features + i
+                    parts[at] = value
+                    which[at] = np.where(best + share >= one[FALSE_POSITIVE], chosen, -1)
+            total = add_term(total, block)
+        log_p[part] = np.where(lost, -np.inf, temperature * (total[0] + total[1]))

@@ -1,0 +1,54 @@
+"""Negative information: landmarks that the sensor should see from a pose, and that no feature is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.landmark_grid import BLOCK_PAIRS, bucket_at
+from gpusense.reference.landmarks import Quad, at_places, offset, sensor_place
+
+
+def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: np.floating, least: np.floating) -> np.ndarray:
+    """Whether landmarks are within range, and their angle to the sensor's axis has a cosine of at least ``least``."""
+    d = np.sqrt(off[0] * off[0] + off[2] * off[2])
+    return (d <= range_max) & (cosine * off[0] + sine * off[2] >= least * d)
+
+
+def count_unseen(
+    flags: frozenset[str],
+    landmark: np.ndarray,
+    start: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    which: np.ndarray,
+    log_p: np.ndarray,
+    rows: int,
+    cols: int,
+    particles: int,
+    features: int,
+    size: np.floating,
+    range_max: np.floating,
+    axis_cosine: np.floating,
+    axis_sine: np.floating,
+    least: np.floating,
+    log_missed: np.floating,
+) -> None:
+    """Add ``log_missed`` to log_p for every landmark in view that none of a particle's features is."""
+    block = max(BLOCK_PAIRS // max(int(start[rows * cols]), 1), 1)
+    for begin in range(0, particles, block):
+        part = slice(begin, min(begin + block, particles))
+        place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)
+        cosine = pose[part, 2] * axis_cosine - pose[part, 3] * axis_sine
+        sine = pose[part, 3] * axis_cosine + pose[part, 2] * axis_sine
+        low, high = bucket_at(place[2] - range_max, size, rows), bucket_at(place[2] + range_max, size, rows)
+        first, last = int(start[low.min() * cols]), int(start[(high.max() + 1) * cols])
+        for n in range(len(low)):
+            own = at_places(place, slice(n, n + 1))
+            seen = in_view(offset(landmark[first:last], own), cosine[n], sine[n], range_max, least)
+            at = (begin + n) * features
+            taken = np.unique(which[at : at + features])
+            taken = taken[(taken >= first) & (taken < last)] - first
+            unseen = np.count_nonzero(seen) - np.count_nonzero(seen[taken])
+            if unseen:
+                log_p[begin + n] += unseen * log_missed

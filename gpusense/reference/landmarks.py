@@ -1,0 +1,227 @@
+"""Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components.
+
+    p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
+
+d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
+is the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A
+part that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an
+error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+
+A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
+(x, its low part, y, its low part), and so are an offset and a direction.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import erf
+
+from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
+
+Quad = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+# Range; cosine and sine of the bearing on the robot; signature.
+RANGE_AT, RANGE_LOW, COSINE, SINE, COSINE_LOW, SINE_LOW, SIGNATURE_AT, SIGNATURE_LOW = range(8)
+# 1 / (sigma sqrt 2), 0 for what was not measured; logs of z_detect and the components' peaks, of the false positive.
+RANGE_SCALE, RANGE_SCALE_LOW, BEARING_SCALE, BEARING_SCALE_LOW, SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = range(8, 14)
+PEAK, PEAK_LOW, FALSE_POSITIVE = 14, 15, 16
+# From the bearing to the upper end of the field of view.
+UPPER, UPPER_LOW = 17, 18
+# Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, can matter; RADIUS is
+# negative where none can.
+REACH, RADIUS, HOLE = 19, 20, 21
+# What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
+FARTHEST, AXIS = 22, 23
+# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be;
+# and what squares of distances are off at most.
+RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = 24, 25, 26, 27
+FEATURE = 28
+
+# Arcs of i / 8, of a quarter and of half a turn, as sums of two float64 numbers.
+ARC_STEPS = 8
+ARCS = (
+    (0.0, 0.0),
+    (0.12435499454676144, -3.1253241424539383e-18),
+    (0.24497866312686414, 1.0698755618734451e-17),
+    (0.35877067027057225, -2.4623815582638635e-17),
+    (0.4636476090008061, 2.2698777452961687e-17),
+    (0.5585993153435624, -5.4556305485916264e-18),
+    (0.6435011087932844, 1.5834785051444286e-17),
+    (0.7188299996216245, -2.1478388444456983e-17),
+    (0.7853981633974483, 3.061616997868383e-17),
+    (1.5707963267948966, 6.123233995736766e-17),
+    (3.141592653589793, 1.2246467991473532e-16),
+)
+# Nearer than a micrometre every bearing is as likely.
+ZERO_RANGE = 1e-6
+# arctan t = t + t^3 A(t^2), |t| <= 1 / 16, by its power series.
+ARC_POWERS = tuple((-1.0) ** (i + 1) / (2 * i + 3) for i in range(7))
+
+
+def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
+    """Of each pair of numbers the first or the second one."""
+    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
+
+
+def negative_where(when: np.ndarray, a: Pair) -> Pair:
+    """Pairs of numbers, some of them negated."""
+    return where_pair(when, (-a[0], -a[1]), a)
+
+
+def at_places(quad: Quad, places: np.ndarray | slice) -> Quad:
+    """Some of many offsets, places or directions."""
+    return quad[0][places], quad[1][places], quad[2][places], quad[3][places]
+
+
+def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, size: np.floating) -> Quad:
+    """Sensors in metres from the origin of the buckets, whose side, a power of two, is ``size``."""
+    x = two_sum(pose_cell[:, 0].astype(pose.dtype), pose[:, 0])
+    y = two_sum(pose_cell[:, 1].astype(pose.dtype), pose[:, 1])
+    return size * x[0], size * (x[1] + pose_low[:, 0]), size * y[0], size * (y[1] + pose_low[:, 1])
+
+
+def direction(pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray) -> Quad:
+    """Direction in the world in which a feature was seen: the heading, turned by the bearing."""
+    (cosine, sine), (cosine_low, sine_low) = pose[:, 2:].T, pose_low[:, 2:].T
+    c, s, c_low, s_low = feature[COSINE], feature[SINE], feature[COSINE_LOW], feature[SINE_LOW]
+    cc, ss, cs, sc = (two_product(a, b) for a, b in ((cosine, c), (sine, s), (cosine, s), (sine, c)))
+    x, y = two_sum(cc[0], -ss[0]), two_sum(sc[0], cs[0])
+    x_low = x[1] + ((cc[1] - ss[1]) + ((cosine * c_low + cosine_low * c) - (sine * s_low + sine_low * s)))
+    y_low = y[1] + ((sc[1] + cs[1]) + ((sine * c_low + sine_low * c) + (cosine * s_low + cosine_low * s)))
+    return x[0], x_low, y[0], y_low
+
+
+def offset(landmark: np.ndarray, place: Quad) -> Quad:
+    """From sensors to landmarks; a landmark is x, y, and the low parts of both."""
+    x, y = two_sum(landmark[:, 0], -place[0]), two_sum(landmark[:, 1], -place[2])
+    x = two_sum(x[0], x[1] + (landmark[:, 2] - place[1]))
+    y = two_sum(y[0], y[1] + (landmark[:, 3] - place[3]))
+    return *x, *y
+
+
+def distance_pair(off: Quad) -> Pair:
+    """Length of an offset: the rounded root, and what one step of Newton's method adds."""
+    xx, yy = two_product(off[0], off[0]), two_product(off[2], off[2])
+    d, total = np.sqrt(xx[0] + yy[0]), two_sum(xx[0], yy[0])
+    dd = two_product(d, d)
+    rest = (total[0] - dd[0]) + ((total[1] + ((xx[1] + yy[1]) - dd[1])) + 2 * (off[0] * off[1] + off[2] * off[3]))
+    return d, np.where(d > 0, rest / np.where(d > 0, 2 * d, 1), 0).astype(d.dtype)
+
+
+def across(off: Quad, turned: Quad) -> Pair:
+    """Part of an offset to the left of a direction."""
+    right, left = two_product(turned[0], off[2]), two_product(turned[2], off[0])
+    total = two_sum(right[0], -left[0])
+    low = (turned[0] * off[3] + turned[1] * off[2]) - (turned[2] * off[1] + turned[3] * off[0])
+    return total[0], total[1] + ((right[1] - left[1]) + low)
+
+
+def along(off: Quad, turned: Quad) -> Pair:
+    """Part of an offset along a direction."""
+    x, y = two_product(turned[0], off[0]), two_product(turned[2], off[2])
+    total = two_sum(x[0], y[0])
+    low = (turned[0] * off[1] + turned[1] * off[0]) + (turned[2] * off[3] + turned[3] * off[2])
+    return total[0], total[1] + ((x[1] + y[1]) + low)
+
+
+def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
+    """Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series."""
+    real = arcs.dtype.type
+    a, b = negative_where(np.signbit(ahead[0]), ahead), negative_where(np.signbit(side[0]), side)
+    steep = b[0] > a[0]
+    num, den = where_pair(steep, a, b), where_pair(steep, b, a)
+    safe = np.where(den[0] > 0, den[0], 1).astype(arcs.dtype)
+    step = np.floor(num[0] / safe * real(ARC_STEPS) + real(0.5))
+    slope = step / real(ARC_STEPS)
+    less, more = two_product(slope, den[0]), two_product(slope, num[0])
+    top, bottom = two_sum(num[0], -less[0]), two_sum(safe, more[0])
+    top = two_sum(top[0], top[1] + ((num[1] - slope * den[1]) - less[1]))
+    bottom_low = bottom[1] + ((den[1] + slope * num[1]) + more[1])
+    t = top[0] / bottom[0]
+    back = two_product(t, bottom[0])
+    t_low = (((top[0] - back[0]) - back[1]) + (top[1] - t * bottom_low)) / bottom[0]
+    square, series = t * t, real(0)
+    for power in ARC_POWERS[::-1]:
+        series = series * square + real(power)
+    base = arcs[step.astype(np.int32)]
+    total = two_sum(base[:, 0], t)
+    arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * (square * series))))
+    for when, whole in ((steep, arcs[ARC_STEPS + 1]), (np.signbit(ahead[0]), arcs[ARC_STEPS + 2])):
+        arc = where_pair(when, pair_sum((whole[0], whole[1]), (-arc[0], -arc[1])), arc)
+    return negative_where(np.signbit(side[0]), arc)
+
+
+def range_mass(d: Pair, scale: np.floating, terms: np.ndarray) -> np.ndarray:
+    """Mass of the normal around d on [0, range_max]; that of range_max itself where d is beyond."""
+    above = np.maximum((terms[0] - d[0]) + (terms[1] - d[1]), 0)
+    return d[0].dtype.type(0.5) * (erf(np.minimum(d[0], terms[0]) * scale) + erf(above * scale))
+
+
+def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: np.floating, terms: np.ndarray,
+               arcs: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Mass of the normal around a landmark's bearing on the field of view; at its end where the landmark is beyond.
+
+    A part of the field more than half a turn away from the landmark is nearer the other way round.
+    """
+    half, whole = arcs[ARC_STEPS + 2, 0], 2 * arcs[ARC_STEPS + 2, 0]
+    left = (upper - angle[0]) + (upper_low - angle[1])
+    middle = terms[2] / 2
+    left = np.where(middle - left > half, left + whole, np.where(middle - left < -half, left - whole, left))
+    left = np.clip(left, 0, terms[2])
+    right = terms[2] - left
+    mass = erf(np.minimum(left, half) * scale) + erf(np.minimum(right, half) * scale)
+    for side in (left, right):
+        mass = mass + np.where(side > half, erf(half * scale) - erf((whole - side) * scale), 0)
+    return angle[0].dtype.type(0.5) * mass
+
+
+def add_square(total: Pair, residual: Pair, scale: np.floating, scale_low: np.floating) -> Pair:
+    """An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel."""
+    u = pair_product(residual, (np.asarray(scale), np.asarray(scale_low)))
+    more = pair_sum(total, pair_product(u, u))
+    # What overflows has no low part.
+    return more[0], np.where(np.isfinite(more[1]), more[1], 0).astype(more[1].dtype)
+
+
+def log_detection(
+    flags: frozenset[str],
+    off: Quad,
+    turned: Quad,
+    feature: np.ndarray,
+    signature: np.ndarray,
+    terms: np.ndarray,
+    arcs: np.ndarray,
+) -> np.ndarray:
+    """``log(z_detect p(f | j))`` of one feature at each offset; signature is (s_j, low part, -log m_s, 0)."""
+    real = terms.dtype
+    zero = np.zeros(len(off[0]), real)
+    exponent, mass, norm = (zero, zero), np.ones(len(zero), real), zero
+    d = distance_pair(off)
+    if "RANGE" in flags and feature[RANGE_SCALE] > 0:
+        r = two_sum(d[0], -feature[RANGE_AT])
+        r = two_sum(r[0], r[1] + (d[1] - feature[RANGE_LOW]))
+        exponent = add_square(exponent, r, feature[RANGE_SCALE], feature[RANGE_SCALE_LOW])
+        mass = mass * range_mass(d, feature[RANGE_SCALE], terms)
+    if "BEARING" in flags and feature[BEARING_SCALE] > 0:
+        angle = angle_pair(across(off, turned), along(off, turned), arcs)
+        squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
+        # At zero range the density is 1 / field, which is the peak over that.
+        there = d[0] > real.type(ZERO_RANGE)
+        exponent = where_pair(there, squared, exponent)
+        own = real.type(1)
+        if "FIELD" in flags:
+            own = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
+        mass = mass * np.where(there, own, terms[3] * feature[BEARING_SCALE])
+    if "SIGNATURE" in flags and feature[SIGNATURE_SCALE] > 0:
+        s = two_sum(feature[SIGNATURE_AT], -signature[:, 0])
+        s = two_sum(s[0], s[1] + (feature[SIGNATURE_LOW] - signature[:, 1]))
+        exponent = add_square(exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW])
+        norm = signature[:, 2]
+    log_p = (feature[PEAK] - exponent[0]) + ((feature[PEAK_LOW] - exponent[1]) + norm)
+    return np.where(mass == 1, log_p, log_p - np.log(mass)).astype(real)
+
+
+def either(detected: np.ndarray, false_positive: np.floating) -> np.ndarray:
+    """Logarithm of the sum of both; -inf only where both are 0."""
+    high, low = np.maximum(detected, false_positive), np.minimum(detected, false_positive)
+    return np.where(np.isneginf(high), high, high + np.log1p(np.exp(low - np.where(np.isneginf(high), 0, high))))

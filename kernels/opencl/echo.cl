@@ -1,0 +1,97 @@
+// What a sensor hears: the nearest return among the rays of its cone, one ray for a laser, and the angle there.
+// The angle of incidence lies between the ray and the normal of the surface that it hits. Normals of cells are made
+// beforehand, in a ring of cells around the map: 0 for free cells, NaN for cells without a normal, which count as met
+// head-on.
+// requires: caster
+
+#if ECHO
+// Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 1 and 0 there.
+typedef struct {
+    real t, cosine, sine;
+} Echo;
+
+#if INCIDENCE
+// Whether the normal is that of an obstacle.
+int is_wall(const real2 normal) { return normal.x != 0 || normal.y != 0; }
+
+real2 normal_at(global const real2 *normals, const int rows, const int cols, const int col, const int row) {
+    if (off_grid(col + 1, row + 1, rows + 2, cols + 2)) {
+#if OUTSIDE_OCCUPIED
+        return (real2)(NAN, NAN);
+#else
+        return (real2)(0, 0);
+#endif
+    }
+    return normals[padded(row, col, cols)];
+}
+
+// Normal of the cell in which a ray ends at a distance t, which tells where the exact walk was: across all boundaries in
+// x up to t and those in y before t, or, after a step in y, up to t as well. A corner is passed in x first.
+real2 hit_normal(global const real2 *normals, const int rows, const int cols, const int2 cell, const Ray r, const real t) {
+    if (t == 0) {
+        const real2 own = normal_at(normals, rows, cols, cell.x, cell.y);
+        if (is_wall(own)) return own;
+    }
+    const int col = cell.x + r.step_x * (int)crossed(t, r.speed_x, r.a_x, r.inv_x, 1);
+    const int before = cell.y + r.step_y * (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 0);
+    const real2 found = normal_at(normals, rows, cols, col, before);
+    if (is_wall(found)) return found;
+    return normal_at(normals, rows, cols, col, cell.y + r.step_y * (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 1));
+}
+
+// The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.
+global const real *incidence_terms(global const real *terms, global const real *edges, const int kinds,
+                                   const real cosine) {
+    int bin = 0;
+    while (bin + 1 < kinds && cosine <= edges[bin]) ++bin;
+    return terms + 10 * bin;
+}
+#endif
+
+// The nearest return of a cone's rays. A ray whose angle of incidence has a cosine below critical has none: the surface is
+// a mirror to it.
+Echo nearest_echo(global const entry *map_table, global const real2 *normals, const int rows, const int cols,
+                  const int2 cell, const real4 pose, global const real2 *ray, const int cone_rays, const real critical,
+                  const real limit, const int bins, const real slack, const real tolerance) {
+    Echo echo = {limit, 1, 0};
+    for (int i = 0; i < cone_rays; ++i) {
+        // Most casters need not look beyond what is found; those of tables and lines must.
+        real farthest = echo.t;
+#if LOOKUP
+        farthest = limit;
+#endif
+#if BRESENHAM
+        farthest = limit;
+#endif
+        const real t = cast_ray(map_table, rows, cols, cell, pose, ray[i], farthest, bins, slack, tolerance);
+        if (!(t < echo.t)) continue;
+#if INCIDENCE
+        const Ray r = make_ray(pose, ray[i]);
+        const real2 normal = hit_normal(normals, rows, cols, cell, r, t);
+        const int known = !isnan(normal.x);
+        const real cosine = known ? fabs(r.direction.x * normal.x + r.direction.y * normal.y) : (real)1;
+        if (cosine < critical) continue;
+        echo.cosine = cosine;
+        echo.sine = known ? fabs(r.direction.x * normal.y - r.direction.y * normal.x) : (real)0;
+#endif
+        echo.t = t;
+    }
+    return echo;
+}
+
+// Expected ranges of cones, and the angles of incidence there, NaN where nothing returns: one work-item a particle and cone.
+kernel void cast_echoes(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
+                        global const real4 *pose, global const real2 *ray, global real *ranges, global real *incidence,
+                        const int rows, const int cols, const int particles, const int rays, const int cone_rays,
+                        const real critical, const int bins, const real slack, const real tolerance, const real limit,
+                        const real resolution, const real range_max) {
+    const int k = get_global_id(0), n = get_global_id(1);
+    if (k >= rays || n >= particles) return;
+    const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + k * cone_rays, cone_rays,
+                                   critical, limit, bins, slack, tolerance);
+    ranges[(long)n * rays + k] = expected_range(echo.t, limit, resolution, range_max);
+#if INCIDENCE
+    incidence[(long)n * rays + k] = echo.t < limit ? atan2(echo.sine, echo.cosine) : NAN;
+#endif
+}
+#endif

@@ -1,0 +1,91 @@
+// Likelihood of features by the landmarks near to where each of them points, book table 6.5.
+// Landmarks lie in square buckets, row by row; start has the first of each bucket. A feature looks into the buckets that a
+// disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
+// requires: error_free landmarks
+
+// A sum of densities is kept relative to one of them until another is e to this larger.
+#define RELATIVE 4
+
+// What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place.
+typedef struct {
+    real found, best;
+    int chosen;
+} Match;
+
+// Row or column of the bucket at a position; the nearest one outside.
+int bucket_at(const real position, const real size, const int count) {
+    return (int)clamp(floor(position / size), (real)0, (real)(count - 1));
+}
+
+// Whether a landmark lies in a feature's disc, no farther than what may still matter (squared), and within the limits of the sensor that it does not measure.
+int near(const real4 off, const real4 turned, global const real *feature, const real most) {
+    const real reach = feature[REACH], radius = feature[RADIUS], hole = feature[HOLE];
+    const real x = off.x - reach * turned.x, y = off.z - reach * turned.z, squared = off.x * off.x + off.z * off.z;
+    const real apart = x * x + y * y;
+    if (apart > radius * radius || squared < hole * hole) return 0;
+    // That bound is for the end point itself.
+    if (reach > 0 && reach == feature[RANGE_AT] && apart > most) return 0;
+    const real d = sqrt(squared);
+    return d <= feature[FARTHEST] && turned.x * off.x + turned.z * off.z >= feature[AXIS] * d;
+}
+
+// Square of the radius around a feature's end point outside which exponents are larger than some: with r the error of the
+// range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b) <= b^2. A
+// little is added for what rounding takes from such distances.
+real squared_reach(const real exponent, global const real *feature) {
+    if (!(exponent > 0)) return 0;
+    const real r = sqrt(exponent) * feature[RANGE_SPREAD], b = sqrt(exponent) * feature[BEARING_SPREAD];
+    const real z = feature[RANGE_AT];
+    return (real)1.01 * (r * r + z * (z + r) * (b * b)) + feature[SLACK];
+}
+
+// A match and one more landmark; sum is that of densities relative to found.
+Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
+#if MARGINAL
+    if (isinf(match.found)) {
+        match.found = log_p;
+        *sum = (real2)(isinf(log_p) ? 0 : 1, 0);
+    } else if (log_p > match.found + RELATIVE) {
+        *sum = *sum * exp(match.found - log_p) + (real2)(1, 0);
+        match.found = log_p;
+    } else {
+        *sum = add_term(*sum, exp(log_p - match.found));
+    }
+#endif
+    if (log_p > match.best) {
+        match.best = log_p;
+        match.chosen = j;
+    }
+    return match;
+}
+
+Match search(global const real4 *landmark, global const real4 *signature, global const int *start, const real4 place,
+             const real4 turned, global const real *feature, global const real *terms, global const real2 *arcs,
+             const int rows, const int cols, const real size) {
+    Match match = {-INFINITY, -INFINITY, -1};
+    real2 sum = 0;
+    const real reach = feature[REACH], radius = feature[RADIUS];
+    if (radius < 0) return match;
+    // What cannot be likelier than the best so far is not evaluated.
+    real most = INFINITY;
+    const real x = place.x + reach * turned.x, y = place.z + reach * turned.z;
+    const int left = bucket_at(x - radius, size, cols), right = bucket_at(x + radius, size, cols);
+    const int high = bucket_at(y + radius, size, rows);
+    for (int row = bucket_at(y - radius, size, rows); row <= high; ++row) {
+        const int last = start[row * cols + right + 1];
+        for (int j = start[row * cols + left]; j < last; ++j) {
+            const real4 off = offset(landmark[j], place);
+            if (!near(off, turned, feature, most)) continue;
+            match = with_landmark(match, &sum, log_detection(off, turned, feature, signature[j], terms, arcs), j);
+#if !MARGINAL
+            most = squared_reach(feature[MOST] - match.best, feature);
+#endif
+        }
+    }
+#if MARGINAL
+    if (!isinf(match.found)) match.found += log(sum.x + sum.y);
+#else
+    match.found = match.best;
+#endif
+    return match;
+}

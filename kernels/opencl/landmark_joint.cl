@@ -1,0 +1,66 @@
+// The likeliest joint association of a few features, in which no two of them are the same landmark.
+// Features without a landmark are false positives. Landmarks are taken one after the other; best[s] is the largest sum of
+// log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may join
+// one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+// requires: error_free landmarks landmark_grid
+
+// Features that a work-item has room for.
+#define MOST_FEATURES 8
+
+// One work-item a particle. choice[s] has the landmark of each feature of a set, and its log p at value; sets is 2^features.
+kernel void joint_features(global const real4 *landmark, global const real4 *signature, global const int2 *pose_cell,
+                           global const real4 *pose, global const real4 *pose_low, global const real *feature,
+                           global const real *terms, global const real2 *arcs, global real *best, global int *choice,
+                           global real *value, global real *log_p, global real *parts, global int *which,
+                           const int landmarks, const int particles, const int features, const int sets,
+                           const real size, const real fixed, const real temperature) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    const real4 own = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], own, low, size);
+    global real *sums = best + (long)n * sets, *each = value + (long)n * sets * features;
+    global int *who = choice + (long)n * sets * features;
+    for (int s = 0; s < sets; ++s) sums[s] = s == 0 ? (real)0 : -INFINITY;
+    for (int i = 0; i < sets * features; ++i) who[i] = -1, each[i] = -INFINITY;
+    for (int j = 0; j < landmarks; ++j) {
+        const real4 off = offset(landmark[j], place);
+        real log_each[MOST_FEATURES];
+        for (int k = 0; k < features; ++k) {
+            global const real *one = feature + FEATURE * k;
+            const real4 turned = direction(own, low, one);
+            log_each[k] = -INFINITY;
+            if (one[RADIUS] >= 0 && near(off, turned, one, INFINITY))
+                log_each[k] = either(log_detection(off, turned, one, signature[j], terms, arcs), one[FALSE_POSITIVE]);
+        }
+        // From the full set down: the smaller sets do not have this landmark yet.
+        for (int s = sets - 1; s > 0; --s) {
+            for (int k = 0; k < features; ++k) {
+                if (!(s >> k & 1)) continue;
+                const int less = s ^ 1 << k;
+                const real joined = sums[less] + log_each[k];
+                if (!(joined > sums[s])) continue;
+                sums[s] = joined;
+                for (int i = 0; i < features; ++i) {
+                    who[s * features + i] = i == k ? j : who[less * features + i];
+                    each[s * features + i] = i == k ? log_each[k] : each[less * features + i];
+                }
+            }
+        }
+    }
+    real most = -INFINITY;
+    int chosen = 0;
+    for (int s = 0; s < sets; ++s) {
+        real total = sums[s];
+        for (int k = 0; k < features; ++k)
+            if (!(s >> k & 1)) total += feature[FEATURE * k + FALSE_POSITIVE];
+        if (total > most) most = total, chosen = s;
+    }
+    log_p[n] = isinf(most) ? most : temperature * (fixed + most);
+#if PER_BEAM
+    for (int k = 0; k < features; ++k) {
+        const int j = who[chosen * features + k];
+        which[(long)n * features + k] = j;
+        parts[(long)n * features + k] =
+            j >= 0 ? each[chosen * features + k] : feature[FEATURE * k + FALSE_POSITIVE];
+    }
+#endif
+}

@@ -1,0 +1,218 @@
+// Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components.
+//     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
+// d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m is
+// the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A part
+// that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an error
+// of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+// A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
+// (x, its low part, y, its low part), and so are an offset and a direction.
+// terms[4] = {range_max, its low part, field of view, density of a bearing at zero range over that of its peak and scale}.
+// requires: error_free
+
+// Range; cosine and sine of the bearing on the robot; signature.
+#define RANGE_AT 0
+#define RANGE_LOW 1
+#define COSINE 2
+#define SINE 3
+#define COSINE_LOW 4
+#define SINE_LOW 5
+#define SIGNATURE_AT 6
+#define SIGNATURE_LOW 7
+// 1 / (sigma sqrt 2), 0 for what was not measured; log of z_detect and of the components' peaks; log of the false positive.
+#define RANGE_SCALE 8
+#define RANGE_SCALE_LOW 9
+#define BEARING_SCALE 10
+#define BEARING_SCALE_LOW 11
+#define SIGNATURE_SCALE 12
+#define SIGNATURE_SCALE_LOW 13
+#define PEAK 14
+#define PEAK_LOW 15
+#define FALSE_POSITIVE 16
+// From the bearing to the upper end of the field of view.
+#define UPPER 17
+#define UPPER_LOW 18
+// Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, can matter; RADIUS is
+// negative where none can.
+#define REACH 19
+#define RADIUS 20
+#define HOLE 21
+// What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
+#define FARTHEST 22
+#define AXIS 23
+// sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be; and what
+// squares of distances are off at most.
+#define RANGE_SPREAD 24
+#define BEARING_SPREAD 25
+#define MOST 26
+#define SLACK 27
+#define FEATURE 28
+// Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
+#define ARC_STEPS 8
+// Nearer than a micrometre every bearing is as likely.
+#define ZERO_RANGE ((real)1e-6)
+// Above this the error function is 1 to the last bit.
+#define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
+
+// Sensors in metres from the origin of the buckets, whose side, a power of two, is size.
+real4 sensor_place(const int2 cell, const real4 pose, const real4 low, const real size) {
+    const real2 x = two_sum((real)cell.x, pose.x), y = two_sum((real)cell.y, pose.y);
+    return size * (real4)(x.x, x.y + low.x, y.x, y.y + low.y);
+}
+
+// Direction in the world in which a feature was seen: the heading, turned by the bearing.
+real4 direction(const real4 pose, const real4 pose_low, global const real *feature) {
+    const real c = feature[COSINE], s = feature[SINE], c_low = feature[COSINE_LOW], s_low = feature[SINE_LOW];
+    const real2 cc = two_product(pose.z, c), ss = two_product(pose.w, s);
+    const real2 cs = two_product(pose.z, s), sc = two_product(pose.w, c);
+    const real2 x = two_sum(cc.x, -ss.x), y = two_sum(sc.x, cs.x);
+    const real x_low = (pose.z * c_low + pose_low.z * c) - (pose.w * s_low + pose_low.w * s);
+    const real y_low = (pose.w * c_low + pose_low.w * c) + (pose.z * s_low + pose_low.z * s);
+    return (real4)(x.x, x.y + ((cc.y - ss.y) + x_low), y.x, y.y + ((sc.y + cs.y) + y_low));
+}
+
+// From a sensor to a landmark; a landmark is x, y, and the low parts of both.
+real4 offset(const real4 landmark, const real4 place) {
+    const real2 x = two_sum(landmark.x, -place.x), y = two_sum(landmark.y, -place.z);
+    return (real4)(two_sum(x.x, x.y + (landmark.z - place.y)), two_sum(y.x, y.y + (landmark.w - place.w)));
+}
+
+// Length of an offset: the rounded root, and what one step of Newton's method adds.
+real2 distance_pair(const real4 off) {
+    const real2 xx = two_product(off.x, off.x), yy = two_product(off.z, off.z), sum = two_sum(xx.x, yy.x);
+    const real d = sqrt(sum.x);
+    const real2 dd = two_product(d, d);
+    const real rest =
+        (sum.x - dd.x) + ((sum.y + ((xx.y + yy.y) - dd.y)) + 2 * (off.x * off.y + off.z * off.w));
+    return (real2)(d, d > 0 ? rest / (2 * d) : (real)0);
+}
+
+#if BEARING
+// Part of an offset to the left of a direction.
+real2 across(const real4 off, const real4 turned) {
+    const real2 right = two_product(turned.x, off.z), left = two_product(turned.z, off.x);
+    const real2 sum = two_sum(right.x, -left.x);
+    const real low = (turned.x * off.w + turned.y * off.z) - (turned.z * off.y + turned.w * off.x);
+    return (real2)(sum.x, sum.y + ((right.y - left.y) + low));
+}
+
+// Part of an offset along a direction.
+real2 along(const real4 off, const real4 turned) {
+    const real2 x = two_product(turned.x, off.x), y = two_product(turned.z, off.z);
+    const real2 sum = two_sum(x.x, y.x);
+    const real low = (turned.x * off.y + turned.y * off.x) + (turned.z * off.w + turned.w * off.z);
+    return (real2)(sum.x, sum.y + ((x.y + y.y) + low));
+}
+
+// arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
+real arc_series(const real t) {
+    const real z = t * t;
+    const real high = (real)1 / 9 + z * ((real)-1 / 11 + z * ((real)1 / 13 + z * ((real)-1 / 15)));
+    return z * ((real)-1 / 3 + z * ((real)1 / 5 + z * ((real)-1 / 7 + z * high)));
+}
+
+// Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series.
+real2 angle_pair(const real2 side, const real2 ahead, global const real2 *arcs) {
+    const real2 a = signbit(ahead.x) ? -ahead : ahead, b = signbit(side.x) ? -side : side;
+    const int steep = b.x > a.x;
+    const real2 num = steep ? a : b, den = steep ? b : a;
+    const real safe = den.x > 0 ? den.x : (real)1;
+    const real step = floor(num.x / safe * ARC_STEPS + (real)0.5), slope = step / ARC_STEPS;
+    const real2 less = two_product(slope, den.x), more = two_product(slope, num.x);
+    const real2 first = two_sum(num.x, -less.x), bottom = two_sum(safe, more.x);
+    const real2 top = two_sum(first.x, first.y + ((num.y - slope * den.y) - less.y));
+    const real bottom_low = bottom.y + ((den.y + slope * num.y) + more.y);
+    const real t = top.x / bottom.x;
+    const real2 back = two_product(t, bottom.x);
+    const real t_low = (((top.x - back.x) - back.y) + (top.y - t * bottom_low)) / bottom.x;
+    const real2 base = arcs[(int)step];
+    const real2 sum = two_sum(base.x, t);
+    real2 arc = two_sum(sum.x, sum.y + (base.y + (t_low + t * arc_series(t))));
+    if (steep) arc = pair_sum(arcs[ARC_STEPS + 1], -arc);
+    if (signbit(ahead.x)) arc = pair_sum(arcs[ARC_STEPS + 2], -arc);
+    return signbit(side.x) ? -arc : arc;
+}
+#endif
+
+#if RANGE
+// Mass of the normal around d on [0, range_max]; that of range_max itself where d is beyond.
+real range_mass(const real2 d, const real scale, global const real *terms) {
+    const real below = fmin(d.x, terms[0]) * scale;
+    const real above = fmax((terms[0] - d.x) + (terms[1] - d.y), (real)0) * scale;
+    if (below > ERF_ONE && above > ERF_ONE) return 1;
+    return (real)0.5 * (erf(below) + erf(above));
+}
+#endif
+
+#if FIELD
+// Mass of the normal around a landmark's bearing on the field of view; at its end where the landmark is beyond. A part of
+// the field more than half a turn away from the landmark is nearer the other way round.
+real field_mass(const real2 angle, const real upper, const real upper_low, const real scale, global const real *terms,
+                global const real2 *arcs) {
+    const real half_turn = arcs[ARC_STEPS + 2].x, whole = 2 * half_turn, field = terms[2];
+    real left = (upper - angle.x) + (upper_low - angle.y);
+    if (field / 2 - left > half_turn)
+        left += whole;
+    else if (field / 2 - left < -half_turn)
+        left -= whole;
+    left = clamp(left, (real)0, field);
+    const real right = field - left;
+    real mass = erf(fmin(left, half_turn) * scale) + erf(fmin(right, half_turn) * scale);
+    if (left > half_turn) mass += erf(half_turn * scale) - erf((whole - left) * scale);
+    if (right > half_turn) mass += erf(half_turn * scale) - erf((whole - right) * scale);
+    return (real)0.5 * mass;
+}
+#endif
+
+// An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel.
+real2 add_square(const real2 total, const real2 residual, const real scale, const real scale_low) {
+    const real2 u = pair_product(residual, (real2)(scale, scale_low));
+    const real2 more = pair_sum(total, pair_product(u, u));
+    // What overflows has no low part.
+    return (real2)(more.x, isfinite(more.y) ? more.y : (real)0);
+}
+
+// log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
+real log_detection(const real4 off, const real4 turned, global const real *feature, const real4 signature,
+                   global const real *terms, global const real2 *arcs) {
+    real2 exponent = 0;
+    real mass = 1, norm = 0;
+    const real2 d = distance_pair(off);
+#if RANGE
+    if (feature[RANGE_SCALE] > 0) {
+        const real2 first = two_sum(d.x, -feature[RANGE_AT]);
+        const real2 r = two_sum(first.x, first.y + (d.y - feature[RANGE_LOW]));
+        exponent = add_square(exponent, r, feature[RANGE_SCALE], feature[RANGE_SCALE_LOW]);
+        mass = range_mass(d, feature[RANGE_SCALE], terms);
+    }
+#endif
+#if BEARING
+    if (feature[BEARING_SCALE] > 0) {
+        if (d.x > ZERO_RANGE) {
+            const real2 angle = angle_pair(across(off, turned), along(off, turned), arcs);
+            exponent = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
+#if FIELD
+            mass *= field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs);
+#endif
+        } else {
+            // The density is 1 / field, which is the peak over that.
+            mass *= terms[3] * feature[BEARING_SCALE];
+        }
+    }
+#endif
+#if SIGNATURE
+    if (feature[SIGNATURE_SCALE] > 0) {
+        const real2 first = two_sum(feature[SIGNATURE_AT], -signature.x);
+        const real2 s = two_sum(first.x, first.y + (feature[SIGNATURE_LOW] - signature.y));
+        exponent = add_square(exponent, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW]);
+        norm = signature.z;
+    }
+#endif
+    const real log_p = (feature[PEAK] - exponent.x) + ((feature[PEAK_LOW] - exponent.y) + norm);
+    return mass == 1 ? log_p : log_p - log(mass);
+}
+
+// Logarithm of the sum of both; -inf only where both are 0.
+real either(const real detected, const real false_positive) {
+    const real high = fmax(detected, false_positive), low = fmin(detected, false_positive);
+    return isinf(high) ? high : high + log1p(exp(low - high));
+}

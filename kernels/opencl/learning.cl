@@ -1,0 +1,132 @@
+// Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
+// terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN only fills up a
+// block. p_hit has its mean at z* + range_bias, held within [0, range_max]; p_short's obstacles lie before z*.
+// r are the responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances
+// x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+//     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
+//     Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
+// log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
+//     h_s = u^2 - 1 + T,  h_m = u + P,  h_ss = -2 u^2 - T + U + T^2,  h_sm = -2 u - P + Q,  h_mm = -1 + T + P^2
+// and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
+//     s_l = 1 - v - lambda z,  s_ll = v (f - 1) - lambda z.
+// requires: mixture error_free
+
+#define ROOT_2PI ((real)2.5066282746310002)
+#if INFORMATION
+#define SUMS 40
+#else
+#define SUMS 14
+#endif
+
+// Where p_hit has its mean.
+real hit_mean(const real expected, global const real *terms) {
+    const real mean = expected + terms[10];
+    return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
+}
+
+// log p(z | z*) and the responsibilities of hit, short and rand for it: 0 where the density is 0.
+real4 responsibilities(const real z, const real expected, global const real *terms) {
+    const real hit = log_hit(z, hit_mean(expected, terms), terms), shorter = log_short(z, expected, terms);
+    const real largest = fmax(fmax(hit, shorter), terms[5]);
+    if (isinf(largest)) return (real4)(largest, 0, 0, 0);
+    const real p_hit = exp(hit - largest), p_short = exp(shorter - largest), p_rand = exp(terms[5] - largest);
+    const real p = p_hit + p_short + p_rand;
+    return (real4)(largest + log(p), p_hit / p, p_short / p, p_rand / p);
+}
+
+// What a pair adds to the sums: log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm,
+// r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
+// triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
+// r_hit h_m^2, r_short s_l^2.
+void add_pair(const real z, const real expected, global const real *terms, real *sums) {
+    const real4 r = responsibilities(z, expected, terms);
+    real h_s = 0, h_m = 0, h_ss = 0, h_sm = 0, h_mm = 0, s_l = 0, s_ll = 0;
+    if (r.y > 0) {
+        const real mean = hit_mean(expected, terms), u = (z - mean) * terms[11];
+        const real x_0 = mean * terms[11], x_1 = (terms[6] - mean) * terms[11];
+        real t = 0, p = 0, q = 0, w = 0;
+        const real mass = hit_mass(mean, terms[2], terms[6]);
+        if (mass < 1) {
+            const real phi_0 = exp((real)-0.5 * x_0 * x_0) / (ROOT_2PI * mass);
+            const real phi_1 = exp((real)-0.5 * x_1 * x_1) / (ROOT_2PI * mass);
+            t = x_0 * phi_0 + x_1 * phi_1;
+            p = phi_1 - phi_0;
+            q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + p * t;
+            w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1;
+        }
+        h_s = u * u - 1 + t;
+        h_m = u + p;
+        h_ss = -2 * u * u - t + w + t * t;
+        h_sm = -2 * u - p + q;
+        h_mm = -1 + t + p * p;
+        // A mean that is held does not move with the bias.
+        if (mean != expected + terms[10]) h_m = h_sm = h_mm = 0;
+    }
+    if (r.z > 0) {
+        const real x = terms[4] * expected, f = short_factor(x), v = f - x;
+        s_l = 1 - v - terms[4] * z;
+        s_ll = v * (f - 1) - terms[4] * z;
+    }
+    const real off = z - expected;
+    sums[0] += r.x;
+    sums[1] += r.y;
+    sums[2] += r.z;
+    sums[3] += r.w;
+    sums[4] += r.y * h_s;
+    sums[5] += r.y * h_m;
+    sums[6] += r.z * s_l;
+    sums[7] += r.y * h_ss;
+    sums[8] += r.y * h_sm;
+    sums[9] += r.y * h_mm;
+    sums[10] += r.z * s_ll;
+    sums[11] += r.y * off * off;
+    sums[12] += r.y * off;
+    sums[13] += r.z * z;
+#if INFORMATION
+    sums[14] += r.w > r.y && r.w > r.z ? 1 : 0;
+    const real y[6] = {r.y, r.z, r.w, r.y * h_s, r.y * h_m, r.z * s_l};
+    int place = 15;
+    for (int i = 0; i < 6; ++i)
+        for (int j = i; j < 6; ++j) sums[place++] += y[i] * y[j];
+    sums[36] += r.y * h_s * h_s;
+    sums[37] += r.y * h_s * h_m;
+    sums[38] += r.y * h_m * h_m;
+    sums[39] += r.z * s_l * s_l;
+#endif
+}
+
+// One work-item a block of pairs, each along farther than the last, from number block * across on.
+kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
+                   global real *sums, const int blocks, const int readings, const int across, const int along,
+                   const int width) {
+    const int block = get_global_id(0);
+    if (block >= blocks) return;
+    real total[SUMS], lost[SUMS], part[SUMS];
+    for (int j = 0; j < SUMS; ++j) total[j] = lost[j] = 0;
+    for (int first = 0; first < readings; first += BLOCK_TERMS) {
+        const int last = min(first + BLOCK_TERMS, readings);
+        for (int j = 0; j < SUMS; ++j) part[j] = 0;
+        for (int k = first; k < last; ++k) {
+            const long n = (long)block * across + (long)k * along;
+            if (!isnan(reading[n])) add_pair(reading[n], expected[n], terms, part);
+        }
+        for (int j = 0; j < SUMS; ++j) {
+            const real2 sum = add_term((real2)(total[j], lost[j]), part[j]);
+            total[j] = sum.x;
+            lost[j] = sum.y;
+        }
+    }
+    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + lost[j];
+}
+
+// One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.
+kernel void pair_causes(global const real *reading, global const real *expected, global const real *terms,
+                        global real4 *causes, const int blocks, const int readings, const int across,
+                        const int along) {
+    const int block = get_global_id(0);
+    if (block >= blocks) return;
+    for (int k = 0; k < readings; ++k) {
+        const long n = (long)block * across + (long)k * along;
+        causes[n] = isnan(reading[n]) ? (real4)(NAN) : responsibilities(reading[n], expected[n], terms);
+    }
+}

@@ -1,0 +1,175 @@
+"""What a sensor hears: the nearest return among the rays of its cone, one ray for a laser, and the angle there.
+
+The angle of incidence lies between the ray and the normal of the surface that it hits. Normals of cells are made
+beforehand, in a ring of cells around the map: 0 for free cells, NaN for cells without a normal, which count as met
+head-on.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import ray as ray_file
+from . import rectangles as rectangles_file
+from .prelude import kernel, precision
+from .ranges import caster_of
+
+
+@functools.cache
+def functions(flags):
+    """hit_normal, incidence_terms and nearest_echo specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    caster = caster_of(flags)
+    ENTRY = caster.ENTRY
+    cast_ray = caster.functions(flags).cast_ray
+    geometry = ray_file.functions(flags)
+    Ray, make_ray, crossed, off_grid = geometry.Ray, geometry.make_ray, geometry.crossed, geometry.off_grid
+    padded = rectangles_file.functions(flags).padded
+    INCIDENCE = "INCIDENCE" in flags
+    OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
+    TO_THE_LIMIT = bool({"LOOKUP", "BRESENHAM"} & flags)
+    ZERO, ONE = real(0.0), real(1.0)
+    NOWHERE = real(math.nan)
+
+    # Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 1 and 0 there.
+    @wp.struct
+    class Echo:
+        t: real
+        cosine: real
+        sine: real
+
+    # Whether the normal is that of an obstacle.
+    @wp.func
+    def is_wall(normal: vec2):
+        return normal.x != ZERO or normal.y != ZERO
+
+    @wp.func
+    def normal_at(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, col: wp.int32, row: wp.int32):
+        if off_grid(col + 1, row + 1, rows + 2, cols + 2):
+            if OUTSIDE_OCCUPIED:
+                return vec2(NOWHERE, NOWHERE)
+            else:
+                return vec2(ZERO, ZERO)
+        return normals[padded(row, col, cols)]
+
+    # Normal of the cell in which a ray ends at a distance t, which tells where the exact walk was: across all
+    # boundaries in x up to t and those in y before t, or, after a step in y, up to t as well. A corner is passed in x
+    # first.
+    @wp.func
+    def hit_normal(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, cell: wp.vec2i, r: Ray, t: real):
+        if t == ZERO:
+            own = normal_at(normals, rows, cols, cell.x, cell.y)
+            if is_wall(own):
+                return own
+        col = cell.x + r.step_x * int(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
+        before = cell.y + r.step_y * int(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
+        found = normal_at(normals, rows, cols, col, before)
+        if is_wall(found):
+            return found
+        until = cell.y + r.step_y * int(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
+        return normal_at(normals, rows, cols, col, until)
+
+    # The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.
+    @wp.func
+    def incidence_terms(terms: wp.array(dtype=real), edges: wp.array(dtype=real), kinds: wp.int32, cosine: real):
+        bin = int(0)
+        while bin + 1 < kinds and cosine <= edges[bin]:
+            bin += 1
+        return terms[10 * bin :]
+
+    # The nearest return of a cone's rays, which begin at number first. A ray whose angle of incidence has a cosine
+    # below critical has none: the surface is a mirror to it.
+    @wp.func
+    def nearest_echo(
+        map_table: wp.array(dtype=ENTRY),
+        normals: wp.array(dtype=vec2),
+        rows: wp.int32,
+        cols: wp.int32,
+        cell: wp.vec2i,
+        pose: vec4,
+        ray: wp.array(dtype=vec2),
+        first: wp.int32,
+        cone_rays: wp.int32,
+        critical: real,
+        limit: real,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+    ):
+        echo = Echo()
+        echo.t = limit
+        echo.cosine = ONE
+        for i in range(first, first + cone_rays):
+            # Most casters need not look beyond what is found; those of tables and lines must.
+            farthest = real(echo.t)
+            if TO_THE_LIMIT:
+                farthest = limit
+            t = cast_ray(map_table, rows, cols, cell, pose, ray[i], farthest, bins, slack, tolerance)
+            if t < echo.t:
+                if INCIDENCE:
+                    r = make_ray(pose, ray[i])
+                    normal = hit_normal(normals, rows, cols, cell, r, t)
+                    known = not wp.isnan(normal.x)
+                    cosine = wp.where(known, wp.abs(r.direction.x * normal.x + r.direction.y * normal.y), ONE)
+                    if cosine >= critical:
+                        echo.t = t
+                        echo.cosine = cosine
+                        aslant = wp.abs(r.direction.x * normal.y - r.direction.y * normal.x)
+                        echo.sine = wp.where(known, aslant, ZERO)
+                else:
+                    echo.t = t
+        return echo
+
+    return SimpleNamespace(hit_normal=hit_normal, incidence_terms=incidence_terms, nearest_echo=nearest_echo)
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel cast_echoes specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    ENTRY = caster_of(flags).ENTRY
+    nearest_echo = functions(flags).nearest_echo
+    expected_range = ray_file.functions(flags).expected_range
+    INCIDENCE = "INCIDENCE" in flags
+    NOWHERE = real(math.nan)
+
+    # Expected ranges of cones, and the angles of incidence there, NaN where nothing returns: one work-item a particle
+    # and cone, fewer than 2^31 in a launch.
+    @kernel
+    def cast_echoes(
+        map_table: wp.array(dtype=ENTRY),
+        normals: wp.array(dtype=vec2),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        ray: wp.array(dtype=vec2),
+        ranges: wp.array(dtype=real),
+        incidence: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        rays: wp.int32,
+        cone_rays: wp.int32,
+        critical: real,
+        bins: wp.int32,
+        slack: real,
+        tolerance: real,
+        limit: real,
+        resolution: real,
+        range_max: real,
+    ):
+        n, k = wp.tid()
+        if k >= rays or n >= particles:
+            return
+        echo = nearest_echo(
+            map_table, normals, rows, cols, pose_cell[n], pose[n], ray, k * cone_rays, cone_rays, critical, limit, bins,
+            slack, tolerance,
+        )  # fmt: skip
+        ranges[n * rays + k] = expected_range(echo.t, limit, resolution, range_max)
+        if INCIDENCE:
+            incidence[n * rays + k] = wp.where(echo.t < limit, wp.atan2(echo.sine, echo.cosine), NOWHERE)
+
+    return {"cast_echoes": cast_echoes}[name]

@@ -1,0 +1,157 @@
+"""Likelihood of features by the landmarks near to where each of them points, book table 6.5.
+
+Landmarks lie in square buckets, row by row; start has the first of each bucket. A feature looks into the buckets that a
+disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
+"""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import error_free, landmarks
+from .landmarks import (
+    AXIS,
+    BEARING_SPREAD,
+    FARTHEST,
+    HOLE,
+    MOST,
+    RADIUS,
+    RANGE_AT,
+    RANGE_SPREAD,
+    REACH,
+    SLACK,
+)
+from .prelude import precision
+
+
+@functools.cache
+def functions(flags):
+    """bucket_at, near, with_landmark and search specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    add_term = error_free.functions(flags & {"FLOAT64"}).add_term
+    density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
+    offset, log_detection = density.offset, density.log_detection
+    MARGINAL = "MARGINAL" in flags
+    ZERO, ONE = real(0.0), real(1.0)
+    NEVER = real(-math.inf)
+    # A sum of densities is kept relative to one of them until another is e to this larger.
+    RELATIVE = real(4.0)
+    WIDER = real(1.01)
+
+    # What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place;
+    # and the sum of densities relative to found.
+    @wp.struct
+    class Match:
+        found: real
+        best: real
+        chosen: wp.int32
+        total: vec2
+
+    # Row or column of the bucket at a position; the nearest one outside.
+    @wp.func
+    def bucket_at(position: real, size: real, count: wp.int32):
+        return int(wp.clamp(wp.floor(position / size), ZERO, real(count - 1)))
+
+    # Whether a landmark lies in a feature's disc, no farther than what may still matter (squared), and within the
+    # limits of the sensor that it does not measure.
+    @wp.func
+    def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), one: wp.int32, most: real):
+        reach = feature[one + REACH]
+        radius = feature[one + RADIUS]
+        hole = feature[one + HOLE]
+        x = off[0] - reach * turned[0]
+        y = off[2] - reach * turned[2]
+        squared = off[0] * off[0] + off[2] * off[2]
+        apart = x * x + y * y
+        if apart > radius * radius or squared < hole * hole:
+            return False
+        # That bound is for the end point itself.
+        if reach > ZERO and reach == feature[one + RANGE_AT] and apart > most:
+            return False
+        d = wp.sqrt(squared)
+        return d <= feature[one + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[one + AXIS] * d
+
+    # Square of the radius around a feature's end point outside which exponents are larger than some: with r the error
+    # of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b)
+    # is at most b^2. A little is added for what rounding takes from such distances.
+    @wp.func
+    def squared_reach(exponent: real, feature: wp.array(dtype=real), one: wp.int32):
+        found = real(0.0)
+        if exponent > ZERO:
+            r = wp.sqrt(exponent) * feature[one + RANGE_SPREAD]
+            b = wp.sqrt(exponent) * feature[one + BEARING_SPREAD]
+            z = feature[one + RANGE_AT]
+            found = WIDER * (r * r + z * (z + r) * (b * b)) + feature[one + SLACK]
+        return found
+
+    # A match and one more landmark.
+    @wp.func
+    def with_landmark(match: Match, log_p: real, j: wp.int32):
+        if MARGINAL:
+            if wp.isinf(match.found):
+                match.found = log_p
+                match.total = vec2(wp.where(wp.isinf(log_p), ZERO, ONE), ZERO)
+            elif log_p > match.found + RELATIVE:
+                match.total = match.total * wp.exp(match.found - log_p) + vec2(ONE, ZERO)
+                match.found = log_p
+            else:
+                match.total = add_term(match.total, wp.exp(log_p - match.found))
+        if log_p > match.best:
+            match.best = log_p
+            match.chosen = j
+        return match
+
+    @wp.func
+    def search(
+        landmark: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        place: vec4,
+        turned: vec4,
+        feature: wp.array(dtype=real),
+        one: wp.int32,
+        terms: wp.array(dtype=real),
+        arcs: wp.array(dtype=vec2),
+        rows: wp.int32,
+        cols: wp.int32,
+        size: real,
+    ):
+        match = Match()
+        match.found = NEVER
+        match.best = NEVER
+        match.chosen = -1
+        match.total = vec2(ZERO, ZERO)
+        reach = feature[one + REACH]
+        radius = feature[one + RADIUS]
+        if radius < ZERO:
+            return match
+        # What cannot be likelier than the best so far is not evaluated.
+        most = real(math.inf)
+        x = place[0] + reach * turned[0]
+        y = place[2] + reach * turned[2]
+        left = bucket_at(x - radius, size, cols)
+        right = bucket_at(x + radius, size, cols)
+        high = bucket_at(y + radius, size, rows)
+        row = bucket_at(y - radius, size, rows)
+        while row <= high:
+            j = start[row * cols + left]
+            last = start[row * cols + right + 1]
+            while j < last:
+                off = offset(landmark[j], place)
+                if near(off, turned, feature, one, most):
+                    match = with_landmark(match, log_detection(off, turned, feature, one, signature[j], terms, arcs), j)
+                    if not MARGINAL:
+                        most = squared_reach(feature[one + MOST] - match.best, feature, one)
+                j += 1
+            row += 1
+        if MARGINAL:
+            if not wp.isinf(match.found):
+                match.found = match.found + wp.log(match.total[0] + match.total[1])
+        else:
+            match.found = match.best
+        return match
+
+    return SimpleNamespace(bucket_at=bucket_at, near=near, search=search)

@@ -1,0 +1,137 @@
+"""The likeliest joint association of a few features, in which no two of them are the same landmark.
+
+Features without a landmark are false positives. Landmarks are taken one after the other; best[s] is the largest sum of
+log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may
+join one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from . import landmark_grid, landmarks
+from .landmarks import FALSE_POSITIVE, FEATURE, RADIUS
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel joint_features specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"}
+    density = landmarks.functions(shape)
+    sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
+    log_detection, either = density.log_detection, density.either
+    near = landmark_grid.functions(shape).near
+    PER_BEAM = "PER_BEAM" in flags
+    ZERO, NEVER, EVERYWHERE = real(0.0), real(-math.inf), real(math.inf)
+    # Features that a work-item has room for.
+    LogEach = wp.types.vector(length=8, dtype=real)
+
+    # One work-item a particle. choice[s] has the landmark of each feature of a set, and its log p at value; sets is
+    # 2^features.
+    @kernel
+    def joint_features(
+        landmark: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        feature: wp.array(dtype=real),
+        terms: wp.array(dtype=real),
+        arcs: wp.array(dtype=vec2),
+        best: wp.array(dtype=real),
+        choice: wp.array(dtype=wp.int32),
+        value: wp.array(dtype=real),
+        log_p: wp.array(dtype=real),
+        parts: wp.array(dtype=real),
+        which: wp.array(dtype=wp.int32),
+        landmarks: wp.int32,
+        particles: wp.int32,
+        features: wp.int32,
+        sets: wp.int32,
+        size: real,
+        fixed: real,
+        temperature: real,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        own = pose[n]
+        low = pose_low[n]
+        place = sensor_place(pose_cell[n], own, low, size)
+        sums = n * sets
+        who = n * sets * features
+        i = int(0)
+        while i < sets:
+            best[sums + i] = wp.where(i == 0, ZERO, NEVER)
+            i += 1
+        i = int(0)
+        while i < sets * features:
+            choice[who + i] = -1
+            value[who + i] = NEVER
+            i += 1
+        log_each = LogEach()
+        j = int(0)
+        while j < landmarks:
+            off = offset(landmark[j], place)
+            k = int(0)
+            while k < features:
+                one = FEATURE * k
+                turned = direction(own, low, feature, one)
+                log_each[k] = NEVER
+                if feature[one + RADIUS] >= ZERO:
+                    if near(off, turned, feature, one, EVERYWHERE):
+                        found = log_detection(off, turned, feature, one, signature[j], terms, arcs)
+                        log_each[k] = either(found, feature[one + FALSE_POSITIVE])
+                k += 1
+            # From the full set down: the smaller sets do not have this landmark yet.
+            s = sets - 1
+            while s > 0:
+                k = int(0)
+                while k < features:
+                    if ((s >> k) & 1) != 0:
+                        less = s ^ (1 << k)
+                        joined = best[sums + less] + log_each[k]
+                        if joined > best[sums + s]:
+                            best[sums + s] = joined
+                            i = int(0)
+                            while i < features:
+                                if i == k:
+                                    choice[who + s * features + i] = j
+                                    value[who + s * features + i] = log_each[k]
+                                else:
+                                    choice[who + s * features + i] = choice[who + less * features + i]
+                                    value[who + s * features + i] = value[who + less * features + i]
+                                i += 1
+                    k += 1
+                s -= 1
+            j += 1
+        most = real(-math.inf)
+        chosen = int(0)
+        s = int(0)
+        while s < sets:
+            total = best[sums + s]
+            k = int(0)
+            while k < features:
+                if ((s >> k) & 1) == 0:
+                    total += feature[FEATURE * k + FALSE_POSITIVE]
+                k += 1
+            if total > most:
+                most = total
+                chosen = s
+            s += 1
+        log_p[n] = wp.where(wp.isinf(most), most, temperature * (fixed + most))
+        if PER_BEAM:
+            k = int(0)
+            while k < features:
+                j = choice[who + chosen * features + k]
+                which[n * features + k] = j
+                parts[n * features + k] = wp.where(
+                    j >= 0, value[who + chosen * features + k], feature[FEATURE * k + FALSE_POSITIVE]
+                )
+                k += 1
+
+    return {"joint_features": joint_features}[name]

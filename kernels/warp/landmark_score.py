@@ -1,0 +1,103 @@
+"""Likelihood of a set of features for each particle, log p(f | x, m): the sum over features (tables 6.4 and 6.5)."""
+
+import functools
+import math
+
+import warp as wp
+
+from . import error_free, landmark_grid, landmarks
+from .landmarks import FALSE_POSITIVE, FEATURE
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel score_features specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    add_term = error_free.functions(flags & {"FLOAT64"}).add_term
+    density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
+    sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
+    log_detection, either = density.log_detection, density.either
+    search = landmark_grid.functions(flags - {"KNOWN", "PER_BEAM"}).search
+    KNOWN = "KNOWN" in flags
+    PER_BEAM = "PER_BEAM" in flags
+    ZERO, NEVER = real(0.0), real(-math.inf)
+
+    # One work-item a particle: the sum of log p over features, with the partner that is KNOWN, of all landmarks
+    # (MARGINAL), or of the likeliest one. With PER_BEAM also what each feature adds, and its likeliest landmark's place
+    # in the buckets, -1 where a false positive is likelier. share is log(1 / landmarks), the prior of each one with
+    # MARGINAL and else 0.
+    @kernel
+    def score_features(
+        landmark: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        feature: wp.array(dtype=real),
+        partner: wp.array(dtype=wp.int32),
+        terms: wp.array(dtype=real),
+        arcs: wp.array(dtype=vec2),
+        log_p: wp.array(dtype=real),
+        parts: wp.array(dtype=real),
+        which: wp.array(dtype=wp.int32),
+        rows: wp.int32,
+        cols: wp.int32,
+        landmarks: wp.int32,
+        particles: wp.int32,
+        features: wp.int32,
+        size: real,
+        share: real,
+        fixed: real,
+        temperature: real,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        own = pose[n]
+        low = pose_low[n]
+        place = sensor_place(pose_cell[n], own, low, size)
+        total = vec2(fixed, ZERO)
+        lost = bool(False)
+        first = int(0)
+        while first < features:
+            last = wp.min(first + error_free.BLOCK_TERMS, features)
+            block = real(0.0)
+            k = first
+            while k < last:
+                one = FEATURE * k
+                turned = direction(own, low, feature, one)
+                found = real(0.0)
+                best = real(0.0)
+                chosen = int(0)
+                if KNOWN:
+                    chosen = partner[k]
+                    found = log_detection(
+                        offset(landmark[chosen], place), turned, feature, one, signature[chosen], terms, arcs
+                    )
+                else:
+                    match = search(
+                        landmark, signature, start, place, turned, feature, one, terms, arcs, rows, cols, size
+                    )
+                    found = match.found
+                    best = match.best
+                    chosen = match.chosen
+                value = either(found + share, feature[one + FALSE_POSITIVE])
+                if wp.isinf(value):
+                    lost = True
+                else:
+                    block += value
+                if PER_BEAM:
+                    parts[n * features + k] = value
+                    if KNOWN:
+                        which[n * features + k] = chosen
+                    else:
+                        which[n * features + k] = wp.where(best + share >= feature[one + FALSE_POSITIVE], chosen, -1)
+                k += 1
+            total = add_term(total, block)
+            first = last
+        log_p[n] = wp.where(lost, NEVER, temperature * (total[0] + total[1]))
+
+    return {"score_features": score_features}[name]

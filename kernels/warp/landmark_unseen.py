@@ -1,0 +1,76 @@
+"""Negative information: landmarks that the sensor should see from a pose, and that no feature is."""
+
+import functools
+
+import warp as wp
+
+from . import landmark_grid, landmarks
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel count_unseen specialised by the flags."""
+    types = precision(flags)
+    real, vec4 = types.real, types.vec4
+    density = landmarks.functions(flags & {"FLOAT64"})
+    sensor_place, offset = density.sensor_place, density.offset
+    bucket_at = landmark_grid.functions(flags & {"FLOAT64"}).bucket_at
+
+    # Whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
+    @wp.func
+    def in_view(off: vec4, cosine: real, sine: real, range_max: real, least: real):
+        d = wp.sqrt(off[0] * off[0] + off[2] * off[2])
+        return d <= range_max and cosine * off[0] + sine * off[2] >= least * d
+
+    # One work-item a particle: add log_missed to log_p for every landmark in view that none of its features is.
+    @kernel
+    def count_unseen(
+        landmark: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        which: wp.array(dtype=wp.int32),
+        log_p: wp.array(dtype=real),
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        features: wp.int32,
+        size: real,
+        range_max: real,
+        axis_cosine: real,
+        axis_sine: real,
+        least: real,
+        log_missed: real,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        own = pose[n]
+        place = sensor_place(pose_cell[n], own, pose_low[n], size)
+        cosine = own[2] * axis_cosine - own[3] * axis_sine
+        sine = own[3] * axis_cosine + own[2] * axis_sine
+        left = bucket_at(place[0] - range_max, size, cols)
+        right = bucket_at(place[0] + range_max, size, cols)
+        high = bucket_at(place[2] + range_max, size, rows)
+        unseen = int(0)
+        row = bucket_at(place[2] - range_max, size, rows)
+        while row <= high:
+            j = start[row * cols + left]
+            last = start[row * cols + right + 1]
+            while j < last:
+                if in_view(offset(landmark[j], place), cosine, sine, range_max, least):
+                    taken = int(0)
+                    k = int(0)
+                    while k < features:
+                        if which[n * features + k] == j:
+                            taken = 1
+                        k += 1
+                    unseen += 1 - taken
+                j += 1
+            row += 1
+        if unseen > 0:
+            log_p[n] = log_p[n] + real(unseen) * log_missed
+
+    return {"count_unseen": count_unseen}[name]

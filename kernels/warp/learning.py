@@ -1,0 +1,212 @@
+"""Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
+
+terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN only fills up a
+block. p_hit has its mean at z* + range_bias, held within [0, range_max]; p_short's obstacles lie before z*.
+r are the responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances
+x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+
+    T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
+    Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
+
+log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
+
+    h_s = u^2 - 1 + T,  h_m = u + P,  h_ss = -2 u^2 - T + U + T^2,  h_sm = -2 u - P + Q,  h_mm = -1 + T + P^2
+
+and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
+
+    s_l = 1 - v - lambda z,  s_ll = v (f - 1) - lambda z.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from . import error_free
+from . import mixture as mixture_file
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel e_step or pair_causes specialised by the flags."""
+    types = precision(flags)
+    real, vec4 = types.real, types.vec4
+    INFORMATION = "INFORMATION" in flags
+    SUMS = 40 if INFORMATION else 14
+    sums_type = wp.types.vector(length=SUMS, dtype=real)
+    vec6 = wp.types.vector(length=6, dtype=real)
+    mixture = mixture_file.functions(flags)
+    log_hit, log_short = mixture.log_hit, mixture.log_short
+    hit_mass, short_factor = mixture.hit_mass, mixture.short_factor
+    BLOCK_TERMS = error_free.BLOCK_TERMS
+    ZERO, ONE = real(0.0), real(1.0)
+    MINUS_ONE, MINUS_TWO, MINUS_HALF = real(-1.0), real(-2.0), real(-0.5)
+    ROOT_2PI = real(2.5066282746310002)
+    NOTHING = real(math.nan)
+
+    # Where p_hit has its mean.
+    @wp.func
+    def hit_mean(expected: real, terms: wp.array(dtype=real)):
+        return wp.min(wp.max(expected + terms[10], ZERO), terms[6])
+
+    # log p(z | z*) and the responsibilities of hit, short and rand for it: 0 where the density is 0.
+    @wp.func
+    def responsibilities(z: real, expected: real, terms: wp.array(dtype=real)):
+        hit = log_hit(z, hit_mean(expected, terms), terms)
+        shorter = log_short(z, expected, terms)
+        largest = wp.max(wp.max(hit, shorter), terms[5])
+        if wp.isinf(largest):
+            return vec4(largest, ZERO, ZERO, ZERO)
+        p_hit = wp.exp(hit - largest)
+        p_short = wp.exp(shorter - largest)
+        p_rand = wp.exp(terms[5] - largest)
+        p = p_hit + p_short + p_rand
+        return vec4(largest + wp.log(p), p_hit / p, p_short / p, p_rand / p)
+
+    # What a pair adds to the sums: log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm,
+    # r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the
+    # upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2,
+    # r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+    @wp.func
+    def add_pair(z: real, expected: real, terms: wp.array(dtype=real), before: sums_type):
+        sums = before
+        r = responsibilities(z, expected, terms)
+        h_s = real(0.0)
+        h_m = real(0.0)
+        h_ss = real(0.0)
+        h_sm = real(0.0)
+        h_mm = real(0.0)
+        s_l = real(0.0)
+        s_ll = real(0.0)
+        if r[1] > ZERO:
+            mean = hit_mean(expected, terms)
+            u = (z - mean) * terms[11]
+            x_0 = mean * terms[11]
+            x_1 = (terms[6] - mean) * terms[11]
+            t = real(0.0)
+            p = real(0.0)
+            q = real(0.0)
+            w = real(0.0)
+            mass = hit_mass(mean, terms[2], terms[6])
+            if mass < ONE:
+                phi_0 = wp.exp(MINUS_HALF * x_0 * x_0) / (ROOT_2PI * mass)
+                phi_1 = wp.exp(MINUS_HALF * x_1 * x_1) / (ROOT_2PI * mass)
+                t = x_0 * phi_0 + x_1 * phi_1
+                p = phi_1 - phi_0
+                q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + p * t
+                w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1
+            h_s = u * u - ONE + t
+            h_m = u + p
+            h_ss = MINUS_TWO * u * u - t + w + t * t
+            h_sm = MINUS_TWO * u - p + q
+            h_mm = MINUS_ONE + t + p * p
+            # A mean that is held does not move with the bias.
+            if mean != expected + terms[10]:
+                h_m = ZERO
+                h_sm = ZERO
+                h_mm = ZERO
+        if r[2] > ZERO:
+            x = terms[4] * expected
+            f = short_factor(x)
+            v = f - x
+            s_l = ONE - v - terms[4] * z
+            s_ll = v * (f - ONE) - terms[4] * z
+        off = z - expected
+        sums[0] += r[0]
+        sums[1] += r[1]
+        sums[2] += r[2]
+        sums[3] += r[3]
+        sums[4] += r[1] * h_s
+        sums[5] += r[1] * h_m
+        sums[6] += r[2] * s_l
+        sums[7] += r[1] * h_ss
+        sums[8] += r[1] * h_sm
+        sums[9] += r[1] * h_mm
+        sums[10] += r[2] * s_ll
+        sums[11] += r[1] * off * off
+        sums[12] += r[1] * off
+        sums[13] += r[2] * z
+        if INFORMATION:
+            if r[3] > r[1] and r[3] > r[2]:
+                sums[14] += ONE
+            y = vec6(r[1], r[2], r[3], r[1] * h_s, r[1] * h_m, r[2] * s_l)
+            place = int(15)
+            i = int(0)
+            while i < 6:
+                j = i
+                while j < 6:
+                    sums[place] += y[i] * y[j]
+                    place += 1
+                    j += 1
+                i += 1
+            sums[36] += r[1] * h_s * h_s
+            sums[37] += r[1] * h_s * h_m
+            sums[38] += r[1] * h_m * h_m
+            sums[39] += r[2] * s_l * s_l
+        return sums
+
+    # One work-item a block of pairs, each along farther than the last, from number block * across on.
+    @kernel
+    def e_step(
+        reading: wp.array(dtype=real),
+        expected: wp.array(dtype=real),
+        terms: wp.array(dtype=real),
+        sums: wp.array(dtype=real),
+        blocks: wp.int32,
+        readings: wp.int32,
+        across: wp.int32,
+        along: wp.int32,
+        width: wp.int32,
+    ):
+        block = wp.tid()
+        if block >= blocks:
+            return
+        total = sums_type()
+        lost = sums_type()
+        first = int(0)
+        while first < readings:
+            last = wp.min(first + BLOCK_TERMS, readings)
+            part = sums_type()
+            k = first
+            while k < last:
+                n = block * across + k * along
+                if not wp.isnan(reading[n]):
+                    part = add_pair(reading[n], expected[n], terms, part)
+                k += 1
+            # add_term of all sums at once.
+            head = total + part
+            shift = head - total
+            lost += (total - (head - shift)) + (part - shift)
+            total = head
+            first += BLOCK_TERMS
+        j = int(0)
+        while j < SUMS:
+            sums[block * width + j] = total[j] + lost[j]
+            j += 1
+
+    # One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.
+    @kernel
+    def pair_causes(
+        reading: wp.array(dtype=real),
+        expected: wp.array(dtype=real),
+        terms: wp.array(dtype=real),
+        causes: wp.array(dtype=vec4),
+        blocks: wp.int32,
+        readings: wp.int32,
+        across: wp.int32,
+        along: wp.int32,
+    ):
+        block = wp.tid()
+        if block >= blocks:
+            return
+        k = int(0)
+        while k < readings:
+            n = block * across + k * along
+            if wp.isnan(reading[n]):
+                causes[n] = vec4(NOTHING, NOTHING, NOTHING, NOTHING)
+            else:
+                causes[n] = responsibilities(reading[n], expected[n], terms)
+            k += 1
+
+    return {"e_step": e_step, "pair_causes": pair_causes}[name]

@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
-from gpusense.reference.error_free import Pair, add_term, pair_product, pair_sum, two_product, two_sum
+from gpusense.reference.error_free import Pair, add_term, pair_product, pair_sum, two_sum
 from gpusense.reference.log_terms import bounded_square, either
+from gpusense.reference.offsets import distance_pair, offset
 
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
 # A beacon is its place (x, its low part, y, its low part) and the reading minus the bias (and its low part).
@@ -27,16 +28,6 @@ OFFSET, OFFSET_LOW, POWER, T_SCALE, ARC, ODD = range(7, 13)
 TERMS = 13
 # Above this an arc is a quarter turn to the last bit, and its tangent's square is finite.
 STEEPEST = 1e18
-
-
-def distance_pair(x: Pair, y: Pair) -> Pair:
-    """Length of (x, y): the rounded root, and what one step of Newton's method adds."""
-    xx, yy = two_product(x[0], x[0]), two_product(y[0], y[0])
-    total = two_sum(xx[0], yy[0])
-    d = np.sqrt(total[0])
-    dd = two_product(d, d)
-    rest = (total[0] - dd[0]) + ((total[1] + ((xx[1] + yy[1]) - dd[1])) + 2 * (x[0] * x[1] + y[0] * y[1]))
-    return d, np.where(d > 0, rest / np.where(d > 0, 2 * d, 1), 0).astype(d.dtype)
 
 
 def log_normal(
@@ -100,12 +91,10 @@ def score_beacons(
     kind: int,
 ) -> None:
     """Sum over beacons of log p of their ranges; the first ``count`` numbers of the series are a t's."""
-    x, y = (place[:particles, 0], place[:particles, 1]), (place[:particles, 2], place[:particles, 3])
+    own = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
     zero = np.zeros(particles, place.dtype)
     total: Pair = (zero, zero)
     for one in beacon.reshape(-1)[: BEACON * beacons].reshape(-1, BEACON):
-        off_x, off_y = two_sum(one[0], -x[0]), two_sum(one[2], -y[0])
-        off_x = two_sum(off_x[0], off_x[1] + (one[1] - x[1]))
-        off_y = two_sum(off_y[0], off_y[1] + (one[3] - y[1]))
-        total = add_term(total, log_range(distance_pair(off_x, off_y), one, terms, series[:count], kind))
+        d = distance_pair(offset(one[None, [0, 2, 1, 3]], own))
+        total = add_term(total, log_range(d, one, terms, series[:count], kind))
     log_p[:particles] = np.where(np.isinf(total[0]), total[0], total[0] + total[1])

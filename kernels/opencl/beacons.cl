@@ -3,7 +3,7 @@
 // d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or two normals of which one is
 // wide; m is f's mass on [0, range_max], where d + bias is held to that interval. For a whole nu the mass of a t between 0
 // and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
-// requires: error_free log_terms
+// requires: error_free log_terms offsets
 
 #define NORMAL 0
 #define STUDENT_T 1
@@ -34,15 +34,6 @@
 #define STEEPEST ((real)1e18)
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
-
-// Length of (x, y): the rounded root, and what one step of Newton's method adds.
-real2 distance_pair(const real2 x, const real2 y) {
-    const real2 xx = two_product(x.x, x.x), yy = two_product(y.x, y.x), sum = two_sum(xx.x, yy.x);
-    const real d = sqrt(sum.x);
-    const real2 dd = two_product(d, d);
-    const real rest = (sum.x - dd.x) + ((sum.y + ((xx.y + yy.y) - dd.y)) + 2 * (x.x * x.y + y.x * y.y));
-    return (real2)(d, d > 0 ? rest / (2 * d) : (real)0);
-}
 
 // Log of a truncated normal; near and far are the distances of its mean from the interval's ends.
 real log_normal(const real2 residual, const real near, const real far, global const real *terms, const int first,
@@ -97,9 +88,8 @@ kernel void score_beacons(global const real4 *place, global const real *beacon, 
     real2 total = 0;
     for (int i = 0; i < beacons; ++i) {
         global const real *one = beacon + BEACON * i;
-        const real2 to_x = two_sum(one[0], -own.x), to_y = two_sum(one[2], -own.z);
-        const real2 x = two_sum(to_x.x, to_x.y + (one[1] - own.y)), y = two_sum(to_y.x, to_y.y + (one[3] - own.w));
-        total = add_term(total, log_range(distance_pair(x, y), one, terms, series, count, kind));
+        const real2 d = distance_pair(offset((real4)(one[0], one[2], one[1], one[3]), own));
+        total = add_term(total, log_range(d, one, terms, series, count, kind));
     }
     log_p[n] = isinf(total.x) ? total.x : total.x + total.y;
 }

@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from . import error_free, log_terms
+from . import error_free, log_terms, offsets
 from .prelude import kernel, precision
 
 STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
@@ -32,29 +32,16 @@ def make(name, flags):
     """The kernel score_beacons in the precision of the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    exact, logs = error_free.functions(flags), log_terms.functions(flags)
-    two_sum, two_product, add_term = exact.two_sum, exact.two_product, exact.add_term
+    exact, logs, between = error_free.functions(flags), log_terms.functions(flags), offsets.functions(flags)
+    two_sum, add_term = exact.two_sum, exact.add_term
+    offset, distance_pair = between.offset, between.distance_pair
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
     bounded_square, either = logs.bounded_square, logs.either
-    ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     # Above this an arc is a quarter turn to the last bit, and its tangent's square is finite.
     STEEPEST = real(1e18)
     # Above this the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
-
-    # Length of (x, y): the rounded root, and what one step of Newton's method adds.
-    @wp.func
-    def distance_pair(x: vec2, y: vec2):
-        xx = two_product(x.x, x.x)
-        yy = two_product(y.x, y.x)
-        total = two_sum(xx.x, yy.x)
-        d = wp.sqrt(total.x)
-        dd = two_product(d, d)
-        rest = (total.x - dd.x) + ((total.y + ((xx.y + yy.y) - dd.y)) + TWO * (x.x * x.y + y.x * y.y))
-        more = real(0.0)
-        if d > ZERO:
-            more = rest / (TWO * d)
-        return vec2(d, more)
 
     # Log of a truncated normal; near and far are the distances of its mean from the interval's ends.
     @wp.func
@@ -146,11 +133,9 @@ def make(name, flags):
         i = int(0)
         while i < beacons:
             one = BEACON * i
-            to_x = two_sum(beacon[one], -own.x)
-            to_y = two_sum(beacon[one + 2], -own.z)
-            x = two_sum(to_x.x, to_x.y + (beacon[one + 1] - own.y))
-            y = two_sum(to_y.x, to_y.y + (beacon[one + 3] - own.w))
-            total = add_term(total, log_range(distance_pair(x, y), beacon, one, terms, series, count, kind))
+            at = vec4(beacon[one], beacon[one + 2], beacon[one + 1], beacon[one + 3])
+            d = distance_pair(offset(at, own))
+            total = add_term(total, log_range(d, beacon, one, terms, series, count, kind))
             i += 1
         log_p[n] = wp.where(wp.isinf(total.x), total.x, total.x + total.y)
 

@@ -68,13 +68,13 @@ class Motion:
     the way (1/m) and of the way by turns (m/rad).
     """
 
-    turn_by_turn: float = 0.1
+    turn_by_turn: float = 0.3
     turn_by_way: float = 0.1
-    way_by_way: float = 0.1
+    way_by_way: float = 0.2
     way_by_turn: float = 0.02
     drift: float = 0.01
     """Of the position, in x and in y [m / sqrt(s)]."""
-    drift_heading: float = 0.01
+    drift_heading: float = 0.07
     """Of the heading [rad / sqrt(s)]."""
 
 

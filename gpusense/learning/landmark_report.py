@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.learning.landmark_em import NOTHING, SIGMAS, bounds_of, free, newton_direction
+from gpusense.learning.landmark_em import NOTHING, SIGMAS, bounds_of, free
 from gpusense.learning.landmark_pairs import BEARING_BIAS, ODDS, RANGE_BIAS, Floats, Integers, Pairs, Value, hessian
 from gpusense.learning.landmark_result import LandmarkFit
 from gpusense.parameters import LandmarkParameters
@@ -39,7 +39,6 @@ def report(
     own = _errors(second, free(pairs, value, bias))
     places = free(pairs, value, True)
     with_bias = _errors(second, places)
-    first_order = newton_direction(value.gradient, second, places)[0]
     parts = np.array(pairs.measured)
     held = _held(pairs, value)
     errors = {name: float(own[k] * point.sigma[k]) if parts[k] else math.nan for k, name in enumerate(SIGMAS)}
@@ -62,7 +61,7 @@ def report(
     biases = []
     for k, column in enumerate((RANGE_BIAS, BEARING_BIAS)):
         there = bool(parts[k]) and value.responsibility.sum() > NOTHING
-        moved = point.bias[k] + (0.0 if bias else float(first_order[column]))
+        moved = point.bias[k] if bias or not there else _mean(pairs, value, k)
         biases += [moved if there else math.nan, float(with_bias[column]) if there else math.nan]
     false = np.full(total, np.nan)
     false[kept] = value.false
@@ -100,6 +99,13 @@ def _errors(second: Floats, places: Integers) -> Floats:
         if size[0] > _FLAT:
             errors[places] = scale * np.sqrt((axes**2 / size).sum(axis=1))
     return errors
+
+
+def _mean(pairs: Pairs, value: Value, part: int) -> float:
+    """The mean residual of what is a landmark: what EM's next step would take for the offset."""
+    there = ~np.isnan(pairs.residuals[:, part])
+    weight = value.responsibility[there]
+    return float(weight @ pairs.residuals[there, part] / weight.sum()) if weight.sum() > 0 else math.nan
 
 
 def _held(pairs: Pairs, value: Value) -> dict[str, str]:

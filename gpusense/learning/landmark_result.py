@@ -28,8 +28,8 @@ class LandmarkFit:
         standard_errors: Of sigma_range, sigma_bearing, sigma_signature, z_detect, z_false and p_detect, from the
             observed information (p_detect: of a share). NaN where there is none; ``held`` has the reasons.
         held: Why a parameter has no standard error, by its name.
-        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else what it would be to first order;
-            NaN without ranges [m].
+        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else the mean residual of the
+            features that are landmarks; NaN without ranges [m].
         range_bias_error: Its standard error [m].
         bearing_bias: Offset of bearings, as for ranges [rad].
         bearing_bias_error: Its standard error [rad].

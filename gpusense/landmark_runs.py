@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,15 +135,16 @@ def association(
         seed: Of the random numbers.
 
     Returns:
-        Shares of features: right, none (false positives) and wrong.
+        Shares of features: right, none (taken for a false positive but recorded as a landmark) and wrong.
     """
     rng = np.random.default_rng(seed)
     poses = run.truth + rng.normal(size=run.truth.shape) * (sigma_position, sigma_position, sigma_heading)
     found = np.empty(len(run.ids), np.int64)
     for first, last in _scans(run):
         found[first:last] = model.associate(poses[[run.scan[first]]], run.features[first:last])[0][0]
-    right, none = float(np.mean(found == run.ids)), float(np.mean(found == -1))
-    return {"right": right, "none": none, "wrong": 1 - right - none}
+    right = found == run.ids
+    none = ~right & (found == -1)
+    return {"right": float(right.mean()), "none": float(none.mean()), "wrong": float((~right & ~none).mean())}
 
 
 def localise(
@@ -228,3 +229,22 @@ def _move(
     cloud[:, 0] += far * np.cos(heading) + noise.drift * size * draws[:, 3]
     cloud[:, 1] += far * np.sin(heading) + noise.drift * size * draws[:, 4]
     cloud[:, 2] = heading + turned(second, 2) + noise.drift_heading * size * draws[:, 5]
+
+
+def repaired(run: LandmarkRun, found: Suspicions) -> LandmarkRun:
+    """The run with the positions of exchanged landmarks put back."""
+    xy = run.landmarks.xy.copy()
+    for each in found.exchanged:
+        xy[[each.first, each.second]] = xy[[each.second, each.first]]
+    return replace(run, landmarks=LandmarkMap(xy, run.landmarks.signatures))
+
+
+def first_scans(run: LandmarkRun, count: int | None) -> LandmarkRun:
+    """The run's first scans; all where ``count`` is None."""
+    if count is None or count >= len(run.time):
+        return run
+    kept = run.scan < count
+    return replace(
+        run, time=run.time[:count], odometry=run.odometry[:count], truth=run.truth[:count],
+        features=run.features[kept], scan=run.scan[kept], ids=run.ids[kept],
+    )  # fmt: skip

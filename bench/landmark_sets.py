@@ -49,7 +49,8 @@ def _beacons(data: Path) -> LandmarkRun:
         gs.LandmarkMap([row[1:] for row in places]), np.array([row[0] for row in places]),
         (clock[first] - clock[0]) / 1e9, tracks[0], tracks[1], features, scan[[i for i, _ in kept]],
         np.array([index[int(float(row["beacon_id"]))] for _, row in kept]), 6.0,
-        2.1 * float(np.abs(features[:, 1]).max()), {"beacons without a place": len(seen) - len(kept), "moments after SLAM is lost": len(first) - sound},
+        2.1 * float(np.abs(features[:, 1]).max()), {"beacons without a place": len(seen) - len(kept),
+        "moments after SLAM is lost": len(first) - sound},
     )  # fmt: skip
     return first_scans(run, sound)
 

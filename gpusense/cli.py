@@ -14,7 +14,7 @@ from typing import NoReturn
 from gpusense._version import __version__
 
 # In the order of the help: each is a module of gpusense.commands.
-COMMANDS = ("devices", "selftest", "demo", "score", "fit", "bench")
+COMMANDS = ("devices", "selftest", "demo", "score", "fit", "landmarks", "bench")
 
 BAD_INPUT = 2
 INTERRUPTED = 130

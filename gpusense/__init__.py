@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from gpusense.learning.suspicious import suspicious_landmarks
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
+    from gpusense.models.absolute import HeadingModel, PositionModel
+    from gpusense.models.beacons import BeaconModel
     from gpusense.models.beam import BeamModel
+    from gpusense.models.bumper import BumperModel
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.models.landmark import LandmarkModel
@@ -37,17 +40,24 @@ if TYPE_CHECKING:
     from gpusense.positions.ranges import trilaterate
     from gpusense.prepare import distance_transform
     from gpusense.scanner import Reading, Scanner, classify
+    from gpusense.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
     from gpusense.weights import Weights, normalize_weights, resample
 
 _HOME = {
+    "BeaconModel": "gpusense.models.beacons",
+    "BeaconParameters": "gpusense.sensor_parameters",
     "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
+    "BumperModel": "gpusense.models.bumper",
+    "BumperParameters": "gpusense.sensor_parameters",
     "CasterMethod": "gpusense.models.caster",
     "Device": "gpusense.backends",
     "DiscreteBeamModel": "gpusense.discrete",
     "DiscreteCauses": "gpusense.discrete",
     "DiscreteFit": "gpusense.discrete",
+    "HeadingModel": "gpusense.models.absolute",
+    "HeadingParameters": "gpusense.sensor_parameters",
     "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
     "LandmarkFit": "gpusense.learning.landmark_result",
@@ -59,6 +69,8 @@ _HOME = {
     "OccupancyGrid": "gpusense.grid",
     "Odometry": "gpusense.logs",
     "PositionFix": "gpusense.positions.fix",
+    "PositionModel": "gpusense.models.absolute",
+    "PositionParameters": "gpusense.sensor_parameters",
     "RayCaster": "gpusense.models.caster",
     "Reading": "gpusense.scanner",
     "Scan": "gpusense.logs",
@@ -84,14 +96,20 @@ _HOME = {
 }
 
 __all__ = [
+    "BeaconModel",
+    "BeaconParameters",
     "BeamFit",
     "BeamModel",
     "BeamParameters",
+    "BumperModel",
+    "BumperParameters",
     "CasterMethod",
     "Device",
     "DiscreteBeamModel",
     "DiscreteCauses",
     "DiscreteFit",
+    "HeadingModel",
+    "HeadingParameters",
     "IncidenceFit",
     "IncidenceParameters",
     "LandmarkFit",
@@ -103,6 +121,8 @@ __all__ = [
     "OccupancyGrid",
     "Odometry",
     "PositionFix",
+    "PositionModel",
+    "PositionParameters",
     "RayCaster",
     "Reading",
     "Scan",

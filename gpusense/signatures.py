@@ -295,4 +295,31 @@ KERNELS: dict[str, Kernel] = {
         "int which [particles * features]", "out real log_p [particles]", *_MAP, "int particles", "int features",
         "real size", "real range_max", "real axis_cosine", "real axis_sine", "real least", "real log_missed",
     ),
+    "place_relative": _kernel(
+        "relative", "particle", "coordinate poses [particles * 3]", "out real4 place [particles]",
+        "out int verdict [2]", "double origin_x", "double origin_y", "double mount_x", "double mount_y",
+        "int particles",
+    ),
+    "wrap_headings": _kernel(
+        "relative", "particle", "coordinate poses [particles * 3]", "out real2 residual [particles]",
+        "out int verdict [2]", "double target", "double target_low", "int particles",
+    ),
+    "score_position": _kernel(
+        "absolute", "particle", "real4 place [particles]", "real terms [9]", "out real log_p [particles]",
+        "int particles",
+    ),
+    "score_heading": _kernel(
+        "absolute", "particle", "real2 residual [particles]", "real terms [12]", "out real log_p [particles]",
+        "int particles", "int kind",
+    ),
+    "score_beacons": _kernel(
+        "beacons", "particle", "real4 place [particles]", "real beacon [6 * beacons]", "real terms [13]",
+        "real series [count]", "out real log_p [particles]", "int particles", "int beacons", "int count", "int kind",
+    ),
+    "score_contact": _kernel(
+        "contact", "particle", "int table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
+        "real2 point [points]", "real2 point_low [points]", "int start [segments + 1]", "int pressed [segments]",
+        "real terms [10]", "out real log_p [particles]", "int rows", "int cols", "int particles", "int segments",
+        "real guard",
+    ),
 }  # fmt: skip

@@ -62,6 +62,7 @@ def test_explain_of_a_full_beam_model(backend):
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())
     needless = {"unknown branch", "bounds tests", "log-domain sum", "exponents in two parts"}
+    needless |= {"order of particles"} if model.device.kind == "gpu" else set()
     assert set(left_out(model)) == needless | {"reduction of huge headings"}
 
 

@@ -102,6 +102,13 @@ class Watch:
             each.clear()
 
 
+def scan_uploads(device, size: int, *counts: int) -> list[int]:
+    """Bytes of a scan's arrays: one copy of all, each from a multiple of 64 numbers on, where a call is gathered."""
+    if getattr(device, "_gathers", False):
+        return [sum(size * -(-count // 64) * 64 for count in counts)]
+    return [size * count for count in counts]
+
+
 def call_of(what: str, device, precision: str):
     """What scores or casts poses, and the bytes that a call of some poses copies there and back."""
     size = np.dtype(precision).itemsize
@@ -111,11 +118,13 @@ def call_of(what: str, device, precision: str):
         return lambda some, z: caster.cast(some, SCANNER.bearings), *copied
     if what == "beam":
         model = gs.BeamModel(GRID, SCANNER, backend=device, precision=precision)
-        copied = (lambda n: [24 * n, 2 * size * BEAMS, size * BEAMS], lambda n: [size * n])
+        copied = (lambda n: [24 * n, *scan_uploads(device, size, 2 * BEAMS, BEAMS)], lambda n: [size * n])
     else:
         how = gs.LikelihoodFieldParameters(interpolation="bilinear" if what == "smooth field" else "nearest")
         model = gs.LikelihoodFieldModel(GRID, SCANNER, how, backend=device, precision=precision)
-        copied = (lambda n: [24 * n, 2 * size * BEAMS, 2 * size * BEAMS], lambda n: [size * n])
+        # On GPUs also how near to an edge an end point of each block of readings may be.
+        counts = (2 * BEAMS, 2 * BEAMS, *([BLOCKS] if device.info.kind == "gpu" else []))
+        copied = (lambda n: [24 * n, *scan_uploads(device, size, *counts)], lambda n: [size * n])
     return model.log_likelihood, *copied
 
 
@@ -133,9 +142,6 @@ def test_the_second_call(what, precision, path, as_gpu, monkeypatch):
     first = call(poses(COUNT, 1), scan(1))
     assert watch.allocated and watch.up
     more = [28] if order and what in ("beam", "caster") else []
-    if gpu and "field" in what:
-        # How near to an edge an end point of each block of readings may be.
-        more = [np.dtype(precision).itemsize * BLOCKS]
     # Fewer particles need no more of anything.
     for count, seed in ((COUNT, 2), (COUNT, 3), (COUNT - 100, 4), (COUNT, 1)):
         watch.clear()
@@ -172,6 +178,6 @@ def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     watch.clear()
     model.log_likelihood(some, scan(2))
     assert watch.allocated == [] and watch.compiled == []
-    guards = [4 * BLOCKS] if gpu else []
-    assert sorted(watch.up) == sorted([24 * 128, 24 * 128, 24 * 100, 8 * BEAMS, 8 * BEAMS, *guards])
+    readings = scan_uploads(device, 4, 2 * BEAMS, 2 * BEAMS, *([BLOCKS] if gpu else []))
+    assert sorted(watch.up) == sorted([24 * 128, 24 * 128, 24 * 100, *readings])
     assert watch.down == [4 * 128, 4 * 128, 4 * 100]

@@ -14,11 +14,10 @@ from gpusense.reference.landmarks import (
     HOLE,
     RADIUS,
     REACH,
-    Quad,
     at_places,
     log_detection,
-    offset,
 )
+from gpusense.reference.offsets import Quad, offset
 
 # Pairs of a particle and a landmark that are evaluated at once.
 BLOCK_PAIRS = 1 << 18

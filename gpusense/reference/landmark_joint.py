@@ -15,11 +15,11 @@ from gpusense.reference.landmarks import (
     FEATURE,
     RADIUS,
     direction,
-    either,
     log_detection,
-    offset,
     sensor_place,
 )
+from gpusense.reference.log_terms import either
+from gpusense.reference.offsets import offset
 
 
 def joint_features(

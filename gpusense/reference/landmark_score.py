@@ -10,11 +10,11 @@ from gpusense.reference.landmarks import (
     FALSE_POSITIVE,
     FEATURE,
     direction,
-    either,
     log_detection,
-    offset,
     sensor_place,
 )
+from gpusense.reference.log_terms import either
+from gpusense.reference.offsets import offset
 
 # Particles that are scored at once.
 BLOCK = 1 << 14

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.landmark_grid import BLOCK_PAIRS, bucket_at
-from gpusense.reference.landmarks import Quad, at_places, offset, sensor_place
+from gpusense.reference.landmarks import at_places, sensor_place
+from gpusense.reference.offsets import Quad, offset
 
 
 def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: np.floating, least: np.floating) -> np.ndarray:

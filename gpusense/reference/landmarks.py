@@ -17,8 +17,7 @@ import numpy as np
 from scipy.special import erf
 
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
-
-Quad = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+from gpusense.reference.offsets import Quad, distance_pair
 
 # Range; cosine and sine of the bearing on the robot; signature.
 RANGE_AT, RANGE_LOW, COSINE, SINE, COSINE_LOW, SINE_LOW, SIGNATURE_AT, SIGNATURE_LOW = range(8)
@@ -89,23 +88,6 @@ def direction(pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray) -> Qu
     x_low = x[1] + ((cc[1] - ss[1]) + ((cosine * c_low + cosine_low * c) - (sine * s_low + sine_low * s)))
     y_low = y[1] + ((sc[1] + cs[1]) + ((sine * c_low + sine_low * c) + (cosine * s_low + cosine_low * s)))
     return x[0], x_low, y[0], y_low
-
-
-def offset(landmark: np.ndarray, place: Quad) -> Quad:
-    """From sensors to landmarks; a landmark is x, y, and the low parts of both."""
-    x, y = two_sum(landmark[:, 0], -place[0]), two_sum(landmark[:, 1], -place[2])
-    x = two_sum(x[0], x[1] + (landmark[:, 2] - place[1]))
-    y = two_sum(y[0], y[1] + (landmark[:, 3] - place[3]))
-    return *x, *y
-
-
-def distance_pair(off: Quad) -> Pair:
-    """Length of an offset: the rounded root, and what one step of Newton's method adds."""
-    xx, yy = two_product(off[0], off[0]), two_product(off[2], off[2])
-    d, total = np.sqrt(xx[0] + yy[0]), two_sum(xx[0], yy[0])
-    dd = two_product(d, d)
-    rest = (total[0] - dd[0]) + ((total[1] + ((xx[1] + yy[1]) - dd[1])) + 2 * (off[0] * off[1] + off[2] * off[3]))
-    return d, np.where(d > 0, rest / np.where(d > 0, 2 * d, 1), 0).astype(d.dtype)
 
 
 def across(off: Quad, turned: Quad) -> Pair:
@@ -219,9 +201,3 @@ def log_detection(
         norm = signature[:, 2]
     log_p = (feature[PEAK] - exponent[0]) + ((feature[PEAK_LOW] - exponent[1]) + norm)
     return np.where(mass == 1, log_p, log_p - np.log(mass)).astype(real)
-
-
-def either(detected: np.ndarray, false_positive: np.floating) -> np.ndarray:
-    """Logarithm of the sum of both; -inf only where both are 0."""
-    high, low = np.maximum(detected, false_positive), np.minimum(detected, false_positive)
-    return np.where(np.isneginf(high), high, high + np.log1p(np.exp(low - np.where(np.isneginf(high), 0, high))))

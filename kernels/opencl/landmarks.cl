@@ -7,7 +7,7 @@
 // A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
 // (x, its low part, y, its low part), and so are an offset and a direction.
 // terms[4] = {range_max, its low part, field of view, density of a bearing at zero range over that of its peak and scale}.
-// requires: error_free
+// requires: error_free log_terms offsets
 
 // Range; cosine and sine of the bearing on the robot; signature.
 #define RANGE_AT 0
@@ -68,22 +68,6 @@ real4 direction(const real4 pose, const real4 pose_low, global const real *featu
     const real x_low = (pose.z * c_low + pose_low.z * c) - (pose.w * s_low + pose_low.w * s);
     const real y_low = (pose.w * c_low + pose_low.w * c) + (pose.z * s_low + pose_low.z * s);
     return (real4)(x.x, x.y + ((cc.y - ss.y) + x_low), y.x, y.y + ((sc.y + cs.y) + y_low));
-}
-
-// From a sensor to a landmark; a landmark is x, y, and the low parts of both.
-real4 offset(const real4 landmark, const real4 place) {
-    const real2 x = two_sum(landmark.x, -place.x), y = two_sum(landmark.y, -place.z);
-    return (real4)(two_sum(x.x, x.y + (landmark.z - place.y)), two_sum(y.x, y.y + (landmark.w - place.w)));
-}
-
-// Length of an offset: the rounded root, and what one step of Newton's method adds.
-real2 distance_pair(const real4 off) {
-    const real2 xx = two_product(off.x, off.x), yy = two_product(off.z, off.z), sum = two_sum(xx.x, yy.x);
-    const real d = sqrt(sum.x);
-    const real2 dd = two_product(d, d);
-    const real rest =
-        (sum.x - dd.x) + ((sum.y + ((xx.y + yy.y) - dd.y)) + 2 * (off.x * off.y + off.z * off.w));
-    return (real2)(d, d > 0 ? rest / (2 * d) : (real)0);
 }
 
 #if BEARING
@@ -209,10 +193,4 @@ real log_detection(const real4 off, const real4 turned, global const real *featu
 #endif
     const real log_p = (feature[PEAK] - exponent.x) + ((feature[PEAK_LOW] - exponent.y) + norm);
     return mass == 1 ? log_p : log_p - log(mass);
-}
-
-// Logarithm of the sum of both; -inf only where both are 0.
-real either(const real detected, const real false_positive) {
-    const real high = fmax(detected, false_positive), low = fmin(detected, false_positive);
-    return isinf(high) ? high : high + log1p(exp(low - high));
 }

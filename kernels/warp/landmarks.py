@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import error_free
+from . import error_free, log_terms, offsets
 from .prelude import precision
 
 # Range; cosine and sine of the bearing on the robot; signature.
@@ -52,6 +52,8 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags & {"FLOAT64"})
     two_sum, two_product, pair_sum, pair_product = exact.two_sum, exact.two_product, exact.pair_sum, exact.pair_product
+    between = offsets.functions(flags & {"FLOAT64"})
+    distance_pair = between.distance_pair
     RANGE = "RANGE" in flags
     BEARING = "BEARING" in flags
     SIGNATURE = "SIGNATURE" in flags
@@ -87,30 +89,6 @@ def functions(flags):
         x_low = (pose[2] * c_low + pose_low[2] * c) - (pose[3] * s_low + pose_low[3] * s)
         y_low = (pose[3] * c_low + pose_low[3] * c) + (pose[2] * s_low + pose_low[2] * s)
         return vec4(x[0], x[1] + ((cc[1] - ss[1]) + x_low), y[0], y[1] + ((sc[1] + cs[1]) + y_low))
-
-    # From a sensor to a landmark; a landmark is x, y, and the low parts of both.
-    @wp.func
-    def offset(landmark: vec4, place: vec4):
-        x = two_sum(landmark[0], -place[0])
-        y = two_sum(landmark[1], -place[2])
-        x = two_sum(x[0], x[1] + (landmark[2] - place[1]))
-        y = two_sum(y[0], y[1] + (landmark[3] - place[3]))
-        return vec4(x[0], x[1], y[0], y[1])
-
-    # Length of an offset: the rounded root, and what one step of Newton's method adds.
-    @wp.func
-    def distance_pair(off: vec4):
-        xx = two_product(off[0], off[0])
-        yy = two_product(off[2], off[2])
-        total = two_sum(xx[0], yy[0])
-        d = wp.sqrt(total[0])
-        dd = two_product(d, d)
-        low = TWO * (off[0] * off[1] + off[2] * off[3])
-        rest = (total[0] - dd[0]) + ((total[1] + ((xx[1] + yy[1]) - dd[1])) + low)
-        more = real(0.0)
-        if d > ZERO:
-            more = rest / (TWO * d)
-        return vec2(d, more)
 
     # Part of an offset to the left of a direction.
     @wp.func
@@ -266,25 +244,12 @@ def functions(flags):
             log_p = log_p - wp.log(mass)
         return log_p
 
-    # Logarithm of the sum of both; -inf only where both are 0.
-    @wp.func
-    def either(detected: real, false_positive: real):
-        high = wp.max(detected, false_positive)
-        low = wp.min(detected, false_positive)
-        found = high
-        if not wp.isinf(high):
-            # log1p, which Warp does not have: what the sum with 1 rounds away is put back.
-            small = wp.exp(low - high)
-            more = ONE + small
-            found = high + (wp.log(more) + ((small - (more - ONE)) / more))
-        return found
-
     return SimpleNamespace(
         sensor_place=sensor_place,
         direction=direction,
-        offset=offset,
+        offset=between.offset,
         distance_pair=distance_pair,
         angle_pair=angle_pair,
         log_detection=log_detection,
-        either=either,
+        either=log_terms.functions(flags & {"FLOAT64"}).either,
     )

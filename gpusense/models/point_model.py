@@ -1,0 +1,109 @@
+"""What the models without a scan share: the device, batching, and poses relative to a point or an angle."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gpusense import _checks, arrays
+from gpusense.backends import Backend, BackendInfo, get_backend
+from gpusense.backends.base import Buffer
+from gpusense.cloud import Cloud, finish
+from gpusense.models.scan_model import chunk_of, in_chunks, real_dtype
+from gpusense.reference import relative
+from gpusense.workspace import Workspace
+
+Part = tuple[int, int]
+_INT = np.dtype(np.int32)
+
+
+class PointModel:
+    """A measurement model of one reading, or a few, for each of many poses."""
+
+    def __init__(self, backend: str | Backend, precision: str) -> None:
+        self._backend = get_backend(backend)
+        self._real = real_dtype(precision, self._backend)
+        self._workspace = Workspace(self._backend)
+        # Threads may share a model: its buffers serve one call at a time.
+        self._lock = threading.Lock()
+        self._flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
+
+    @property
+    def device(self) -> BackendInfo:
+        """The device the model is compiled for."""
+        return self._backend.info
+
+    @property
+    def precision(self) -> str:
+        """``"float32"`` or ``"float64"``."""
+        return self._real.name
+
+    def _check_scale(self, name: str, value: float, what: str = "") -> None:
+        """Hold a deviation to what the model's precision can square.
+
+        Raises:
+            ValueError: it is outside.
+        """
+        limit = 100 if self._real == np.float64 else 12
+        if not 10.0**-limit <= value <= 10.0**limit:
+            rule = f"{what}must be >= 1e-{limit} and <= 1e{limit} in {self._real.name}"
+            raise ValueError(f"{name}: {rule}, got {_checks.show(value)}")
+
+    def _score(
+        self, poses: object, out: object, items: int, launch: Callable[[Cloud, Part, Buffer], None] | None
+    ) -> Any:
+        """log p of each pose by launches over parts of them; 0 without a launch.
+
+        Raises:
+            TypeError, ValueError: poses that are not (N, 3) finite numbers, or an unfit place for the result.
+        """
+        backend, space = self._backend, self._workspace
+        cloud = Cloud(poses, backend)
+        flat = arrays.check_out(out, (cloud.count,), self._real, poses, backend)
+        if flat is None:
+            flat = (
+                arrays.blank(backend, cloud.count, self._real) if cloud.on_device else np.empty(cloud.count, self._real)
+            )
+
+        def run(begin: int, end: int) -> None:
+            if cloud.on_device:
+                result = backend.part(flat, begin, end - begin)
+            else:
+                result = space.empty("log_p", end - begin, self._real)
+            if launch is None:
+                # Nothing is measured, but poses that are not finite are refused as ever.
+                if cloud.on_device:
+                    self._relative(cloud, (begin, end), "place_relative", (0.0,) * 4)
+                    backend.upload(np.zeros(end - begin, self._real), result)
+                return
+            launch(cloud, (begin, end), result)
+            if not cloud.on_device:
+                space.download(result, flat[begin:end])
+
+        with self._lock, space:
+            if launch is None and not cloud.on_device:
+                flat[:] = 0
+            in_chunks(cloud.count, chunk_of(backend, max(items, 1)), space, run)
+            finish(space, cloud.on_device)
+        if out is not None:
+            return out
+        return arrays.result_for(poses, flat) if cloud.on_device else arrays.like(poses, flat)
+
+    def _relative(self, cloud: Cloud, part: Part, kernel: str, scalars: tuple[float, ...]) -> Buffer:
+        """Places or residuals of some poses, as a kernel of the file ``relative`` finds them."""
+        backend, space, count = self._backend, self._workspace, part[1] - part[0]
+        width = {"place_relative": 4, "wrap_headings": 2}[kernel]
+        given = cloud.given(backend, space, part)
+        if given is None:
+            assert cloud.host is not None
+            found = np.empty((count, width), self._real)
+            body = getattr(relative, kernel)
+            body(frozenset(), cloud.host[slice(*part)], found, np.zeros(2, _INT), *scalars, count)
+            return space.upload(kernel, found)
+        found_there = space.empty(kernel, width * count, self._real)
+        verdict = space.empty("verdict", 2, _INT, zero=True)
+        backend.compile(kernel, self._flags | cloud.code())((count,), given, found_there, verdict, *scalars, count)
+        return found_there

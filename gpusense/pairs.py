@@ -1,0 +1,43 @@
+"""Numbers of a kernel to twice a model's precision: found with 50 digits, given as a rounded number and what it lacks.
+
+Where a peak is high its logarithm and the exponent nearly cancel, and every digit of either counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from decimal import Decimal, localcontext
+
+import numpy as np
+
+PI = Decimal("3.14159265358979323846264338327950288419716939937511")
+DIGITS = 50
+
+
+def exact(value: float) -> Decimal:
+    """A float as it is."""
+    return Decimal(value)
+
+
+def log_of(value: Decimal | float) -> Decimal | float:
+    """Natural logarithm with 50 digits; -inf of 0."""
+    with localcontext(prec=DIGITS):
+        return Decimal(value).ln() if value > 0 else -math.inf
+
+
+def total(*values: Decimal | float) -> Decimal | float:
+    """A sum of logarithms; -inf if one of them is."""
+    with localcontext(prec=DIGITS):
+        return sum((Decimal(v) for v in values), Decimal(0)) if all(map(math.isfinite, values)) else -math.inf
+
+
+def two_parts(values: Iterable[Decimal | float], real: np.dtype) -> list[np.floating]:
+    """Each number rounded, and what rounding took from it; infinite ones lack nothing."""
+    parts = []
+    with localcontext(prec=DIGITS):
+        for value in values:
+            high = real.type(float(value))
+            rest = Decimal(value) - Decimal(float(high)) if math.isfinite(value) else 0
+            parts += [high, real.type(float(rest))]
+    return parts

@@ -1,0 +1,94 @@
+"""Densities of sensors that know where they are: a position in the plane, and a heading.
+
+A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
+its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
+von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
+*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything: that is a uniform density.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_sum
+from gpusense.reference.log_terms import bounded_square, either, log_one_plus
+
+# How a heading is distributed: sums of normals, their Fourier series, von Mises.
+NEARBY, SERIES, VON_MISES = 0, 1, 2
+WRAPS, WAVES = 3, 6
+# A heading's numbers: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part,
+# 2 pi / sigma^2, and from WAVE on 2 q^(n n).
+SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, DECAY, WAVE = range(7)
+HALF_TURN = 3.141592653589793
+# sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
+SINE = (
+    -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,
+    -2.505210838544172e-08, 1.6059043836821613e-10, -7.647163731819816e-13, 2.8114572543455206e-15,
+    -8.22063524662433e-18, 1.9572941063391263e-20,
+)  # fmt: skip
+
+
+def half_sine(residual: Pair) -> Pair:
+    """``sin(r / 2)`` of an angle in [-pi, pi]."""
+    real = residual[0].dtype.type
+    x, x_low = real(0.5) * residual[0], real(0.5) * residual[1]
+    z, series = x * x, real(0)
+    for term in SINE[::-1]:
+        series = series * z + real(term)
+    return two_sum(x, x_low + x * (z * series))
+
+
+def log_other_turns(residual: Pair, decay: np.floating) -> np.ndarray:
+    """Log of all turns' normals over that of the nearest turn."""
+    real = residual[0].dtype.type
+    half, size = real(HALF_TURN), np.abs(residual[0])
+    low = np.where(residual[0] < 0, -residual[1], residual[1])
+    rest = np.maximum((half - size) + (real(HALF_TURN - float(half)) - low), 0)
+    others = np.zeros_like(size)
+    for k in range(1, WRAPS + 1):
+        others = others + np.exp(-decay * real(k) * (real(k - 1) * half + rest))
+        others = others + np.exp(-decay * real(k) * (real(k) * half + size))
+    return log_one_plus(others)
+
+
+def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
+    """Log of the Fourier series over its first term, by Clenshaw's recurrence."""
+    real = residual[0].dtype.type
+    s = half_sine(residual)[0]
+    cosine = 1 - 2 * s * s
+    newer, older = np.zeros_like(s), np.zeros_like(s)
+    for n in range(WAVES, 0, -1):
+        newer, older = terms[WAVE + n - 1] + real(2) * cosine * newer - older, newer
+    return log_one_plus(cosine * newer - older)
+
+
+def score_position(
+    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int
+) -> None:
+    """``terms`` = (a, b, c, peak), each followed by its low part, and the log of the uniform part.
+
+    The exponent is ``(a x)^2 + (b x + c y)^2``, where (x, y) lies from the reading to the sensor.
+    """
+    x, y = (place[:particles, 0], place[:particles, 1]), (place[:particles, 2], place[:particles, 3])
+    a, b, c = ((np.asarray(terms[i]), np.asarray(terms[i + 1])) for i in (0, 2, 4))
+    first = bounded_square(pair_product(x, a))
+    second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)))
+    exponent = pair_sum(first, second)
+    log_p[:particles] = either((terms[6] - exponent[0]) + (terms[7] - exponent[1]), terms[8])
+
+
+def score_heading(
+    flags: frozenset[str], residual: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, kind: int
+) -> None:
+    """Residuals are headings minus the reading in [-pi, pi]."""
+    r = residual[:particles, 0], residual[:particles, 1]
+    scale = np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])
+    if kind == SERIES:
+        found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+    else:
+        root = half_sine(r) if kind == VON_MISES else r
+        exponent = bounded_square(pair_product(root, scale))
+        found = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
+        if kind == NEARBY:
+            found = found + log_other_turns(r, terms[DECAY])
+    log_p[:particles] = either(found, terms[RANDOM])

@@ -1,0 +1,84 @@
+// Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, and only then rounded.
+// What is left of a large coordinate or of many turns is small, and small numbers keep their digits in any precision.
+// requires: heading
+
+#if POSES_FLOAT32
+typedef float coordinate;
+#else
+typedef double coordinate;
+#endif
+
+// Farther off than this is as good as here; squares of it are finite in float32.
+#define FARTHEST 1152921504606846976.0
+
+double2 pair_sum_float64(const double2 a, const double2 b) {
+    const double2 sum = two_sum_float64(a.x, b.x);
+    return two_sum_float64(sum.x, sum.y + (a.y + b.y));
+}
+
+// theta - target in [-pi, pi]; the target is in there already.
+double2 wrapped_difference(const double theta, const double2 target) {
+#if HUGE_HEADINGS
+    const Turn turn = fabs(theta) <= LIMIT ? reduce_ordinary(theta) : reduce_huge(theta);
+#else
+    const Turn turn = reduce_ordinary(theta);
+#endif
+    // Up to three quarters are exact: the last bits of one are 0.
+    const double quarters = (double)turn.quadrant;
+    double2 angle = pair_sum_float64((double2)(quarters * QUARTER, quarters * QUARTER_LOW), turn.rest);
+    angle = pair_sum_float64(angle, -target);
+    const double turns = angle.x > 2.0 * QUARTER ? -4.0 : angle.x < -2.0 * QUARTER ? 4.0 : 0.0;
+    return pair_sum_float64(angle, (double2)(turns * QUARTER, turns * QUARTER_LOW));
+}
+
+// A coordinate as a sum of two numbers in the model's precision.
+real2 rounded_place(const double2 at) {
+    const double high = at.x > FARTHEST ? FARTHEST : at.x < -FARTHEST ? -FARTHEST : at.x;
+    const double low = high == at.x ? at.y : 0.0;
+    const real rounded = (real)high;
+    return (real2)(rounded, (real)((high - (double)rounded) + low));
+}
+
+// One work-item a particle: the place of its sensor relative to an origin as x, its low part, y, its low part. verdict,
+// which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
+kernel void place_relative(global const coordinate *poses, global real4 *place, global int *verdict,
+                           const double origin_x, const double origin_y, const double mount_x, const double mount_y,
+                           const int particles) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    const long first = 3 * (long)n;
+    const double given_x = poses[first], given_y = poses[first + 1], theta = poses[first + 2];
+    if (!((given_x - given_x) + (given_y - given_y) + (theta - theta) == 0)) {
+        atomic_or(&verdict[0], 1);
+        place[n] = (real4)(0, 0, 0, 0);
+        return;
+    }
+    double2 x = two_sum_float64(given_x, -origin_x), y = two_sum_float64(given_y, -origin_y);
+    const int near = fabs(x.x) <= FARTHEST && fabs(y.x) <= FARTHEST;
+    if (near && (mount_x != 0 || mount_y != 0)) {
+        const double2 heading = cos_sin(theta);
+        const double2 moved_x = two_sum_float64(x.x, heading.x * mount_x - heading.y * mount_y);
+        const double2 moved_y = two_sum_float64(y.x, heading.y * mount_x + heading.x * mount_y);
+        x = two_sum_float64(moved_x.x, moved_x.y + x.y);
+        y = two_sum_float64(moved_y.x, moved_y.y + y.y);
+    }
+    place[n] = (real4)(rounded_place(x), rounded_place(y));
+}
+
+// One work-item a particle: its heading minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict as for
+// places.
+kernel void wrap_headings(global const coordinate *poses, global real2 *residual, global int *verdict,
+                          const double target, const double target_low, const int particles) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+    const long first = 3 * (long)n;
+    const double x = poses[first], y = poses[first + 1];
+    double theta = poses[first + 2];
+    if (!((x - x) + (y - y) + (theta - theta) == 0)) {
+        atomic_or(&verdict[0], 1);
+        theta = 0;
+    }
+    const double2 angle = wrapped_difference(theta, (double2)(target, target_low));
+    const real rounded = (real)angle.x;
+    residual[n] = (real2)(rounded, (real)((angle.x - (double)rounded) + angle.y));
+}

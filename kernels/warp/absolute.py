@@ -1,0 +1,133 @@
+"""Densities of sensors that know where they are: a position in the plane, and a heading.
+
+A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
+its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
+von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
+*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything: that is a uniform density.
+"""
+
+import functools
+
+import warp as wp
+
+from . import error_free, log_terms
+from .prelude import kernel, precision
+
+# How a heading is distributed: sums of normals, their Fourier series, von Mises.
+NEARBY, SERIES, VON_MISES = wp.constant(0), wp.constant(1), wp.constant(2)
+WRAPS, WAVES = wp.constant(3), wp.constant(6)
+# A heading's numbers: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part,
+# 2 pi / sigma^2, and from WAVE on 2 q^(n n).
+SCALE, SCALE_LOW, PEAK, PEAK_LOW = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+RANDOM, DECAY, WAVE = wp.constant(4), wp.constant(5), wp.constant(6)
+# sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
+SINE = (
+    -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,
+    -2.505210838544172e-08, 1.6059043836821613e-10, -7.647163731819816e-13, 2.8114572543455206e-15,
+    -8.22063524662433e-18, 1.9572941063391263e-20,
+)  # fmt: skip
+
+
+@functools.cache
+def make(name, flags):
+    """A kernel of the file specialised by the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    exact, logs = error_free.functions(flags), log_terms.functions(flags)
+    two_sum, pair_sum, pair_product = exact.two_sum, exact.pair_sum, exact.pair_product
+    bounded_square, log_one_plus, either = logs.bounded_square, logs.log_one_plus, logs.either
+    ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
+    HALF_TURN = real(3.141592653589793)
+    HALF_TURN_LOW = real(0.0 if "FLOAT64" in flags else -8.742277657347586e-08)
+    # exp of minus this is below half an eps.
+    NEGLIGIBLE = real(40.0)
+    S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
+
+    # sin(r / 2) of an angle in [-pi, pi].
+    @wp.func
+    def half_sine(residual: vec2):
+        x = HALF * residual.x
+        z = x * x
+        higher = S5 + z * (S6 + z * (S7 + z * (S8 + z * S9)))
+        series = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * higher))))
+        return two_sum(x, HALF * residual.y + x * (z * series))
+
+    # Log of all turns' normals over that of the nearest turn.
+    @wp.func
+    def log_other_turns(residual: vec2, decay: real):
+        size = wp.abs(residual.x)
+        low = residual.y
+        if residual.x < ZERO:
+            low = -low
+        rest = wp.max((HALF_TURN - size) + (HALF_TURN_LOW - low), ZERO)
+        others = real(0.0)
+        k = int(1)
+        # Mostly nothing is to be added.
+        if decay * rest > NEGLIGIBLE:
+            k = WRAPS + 1
+        while k <= WRAPS:
+            turns = real(k)
+            others += wp.exp(-decay * turns * ((turns - ONE) * HALF_TURN + rest))
+            others += wp.exp(-decay * turns * (turns * HALF_TURN + size))
+            k += 1
+        return log_one_plus(others)
+
+    # Log of the Fourier series over its first term, by Clenshaw's recurrence.
+    @wp.func
+    def log_waves(residual: vec2, terms: wp.array(dtype=real)):
+        sine = half_sine(residual)
+        cosine = ONE - TWO * sine.x * sine.x
+        newer = real(0.0)
+        older = real(0.0)
+        n = WAVES
+        while n > 0:
+            following = terms[WAVE + n - 1] + TWO * cosine * newer - older
+            older = newer
+            newer = following
+            n -= 1
+        return log_one_plus(cosine * newer - older)
+
+    # One work-item a particle. terms = {a, b, c, peak}, each followed by its low part, and the log of the uniform part.
+    # The exponent is (a x)^2 + (b x + c y)^2, where (x, y) lies from the reading to the sensor.
+    @kernel
+    def score_position(
+        place: wp.array(dtype=vec4), terms: wp.array(dtype=real), log_p: wp.array(dtype=real), particles: wp.int32
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        own = place[n]
+        x = vec2(own.x, own.y)
+        y = vec2(own.z, own.w)
+        first = bounded_square(pair_product(x, vec2(terms[0], terms[1])))
+        mixed = pair_sum(pair_product(x, vec2(terms[2], terms[3])), pair_product(y, vec2(terms[4], terms[5])))
+        exponent = pair_sum(first, bounded_square(mixed))
+        log_p[n] = either((terms[6] - exponent.x) + (terms[7] - exponent.y), terms[8])
+
+    # One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
+    @kernel
+    def score_heading(
+        residual: wp.array(dtype=vec2),
+        terms: wp.array(dtype=real),
+        log_p: wp.array(dtype=real),
+        particles: wp.int32,
+        kind: wp.int32,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        r = residual[n]
+        found = real(0.0)
+        if kind == SERIES:
+            found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+        else:
+            root = r
+            if kind == VON_MISES:
+                root = half_sine(r)
+            exponent = bounded_square(pair_product(root, vec2(terms[SCALE], terms[SCALE_LOW])))
+            found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
+            if kind == NEARBY:
+                found += log_other_turns(r, terms[DECAY])
+        log_p[n] = either(found, terms[RANDOM])
+
+    return {"score_position": score_position, "score_heading": score_heading}[name]

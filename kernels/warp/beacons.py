@@ -1,0 +1,142 @@
+"""Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one.
+
+    p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
+
+d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or two normals of which one is
+wide; m is f's mass on [0, range_max], where d + bias is held to that interval. For a whole nu the mass of a t between 0
+and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
+"""
+
+import functools
+
+import warp as wp
+
+from . import error_free, log_terms, offsets
+from .prelude import kernel, precision
+
+STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
+# A beacon is its place (x, its low part, y, its low part) and the reading minus the bias (and its low part).
+BEACON = wp.constant(6)
+# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; then of two normals the wide
+# one's scale and peak. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and instead of
+# the wide normal 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the arc's factor, 1 for an odd nu.
+SCALE, SCALE_LOW, PEAK, RANDOM = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(4)
+RANGE_MAX, BIAS = wp.constant(5), wp.constant(6)
+WIDE_SCALE, WIDE_PEAK = wp.constant(7), wp.constant(9)
+OFFSET, OFFSET_LOW, POWER, T_SCALE = wp.constant(7), wp.constant(8), wp.constant(9), wp.constant(10)
+ARC, ODD = wp.constant(11), wp.constant(12)
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel score_beacons in the precision of the flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    exact, logs, between = error_free.functions(flags), log_terms.functions(flags), offsets.functions(flags)
+    two_sum, add_term = exact.two_sum, exact.add_term
+    offset, distance_pair = between.offset, between.distance_pair
+    pair_sum, pair_product = exact.pair_sum, exact.pair_product
+    bounded_square, either = logs.bounded_square, logs.either
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+    # Above this an arc is a quarter turn to the last bit, and its tangent's square is finite.
+    STEEPEST = real(1e18)
+    # Above this the error function is 1 to the last bit.
+    ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
+
+    # Log of a truncated normal; near and far are the distances of its mean from the interval's ends.
+    @wp.func
+    def log_normal(residual: vec2, near: real, far: real, terms: wp.array(dtype=real), first: wp.int32, peak: wp.int32):
+        scale = terms[first]
+        below = near * scale
+        above = far * scale
+        exponent = bounded_square(pair_product(residual, vec2(scale, terms[first + 1])))
+        found = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y)
+        if wp.min(below, above) <= ERF_ONE:
+            found = found - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
+        return found
+
+    # Mass of a Student t between -t and t, where t >= 0 is in units of its scale and sqrt(nu).
+    @wp.func
+    def t_mass(any_t: real, terms: wp.array(dtype=real), series: wp.array(dtype=real), count: wp.int32):
+        t = wp.min(any_t, STEEPEST)
+        cosine = ONE / wp.sqrt(ONE + t * t)
+        square = cosine * cosine
+        total = real(0.0)
+        i = count - 1
+        while i >= 0:
+            total = total * square + series[i]
+            i -= 1
+        factor = t * cosine
+        if terms[ODD] > ZERO:
+            factor = factor * cosine
+        return terms[ARC] * wp.atan(t) + factor * total
+
+    # Log of a truncated Student t: -(nu + 1) / 2 log of (1 + u^2 / nu) / k, two numbers that include the peak.
+    @wp.func
+    def log_student_t(
+        residual: vec2,
+        near: real,
+        far: real,
+        terms: wp.array(dtype=real),
+        series: wp.array(dtype=real),
+        count: wp.int32,
+    ):
+        squared = bounded_square(pair_product(residual, vec2(terms[SCALE], terms[SCALE_LOW])))
+        x = pair_sum(vec2(terms[OFFSET], terms[OFFSET_LOW]), squared)
+        below = t_mass(near * terms[T_SCALE], terms, series, count)
+        above = t_mass(far * terms[T_SCALE], terms, series, count)
+        return (terms[PEAK] - terms[POWER] * (wp.log(x.x) + x.y / x.x)) - wp.log(HALF * (below + above))
+
+    # Log p of one range at a distance.
+    @wp.func
+    def log_range(
+        d: vec2,
+        beacon: wp.array(dtype=real),
+        one: wp.int32,
+        terms: wp.array(dtype=real),
+        series: wp.array(dtype=real),
+        count: wp.int32,
+        kind: wp.int32,
+    ):
+        first = two_sum(d.x, -beacon[one + 4])
+        r = two_sum(first.x, first.y + (d.y - beacon[one + 5]))
+        near = wp.clamp(d.x + terms[BIAS], ZERO, terms[RANGE_MAX])
+        far = terms[RANGE_MAX] - near
+        found = real(0.0)
+        if kind == STUDENT_T:
+            found = log_student_t(r, near, far, terms, series, count)
+        else:
+            found = log_normal(r, near, far, terms, SCALE, PEAK)
+        if kind == TWO_NORMALS:
+            found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
+        return either(found, terms[RANDOM])
+
+    # One work-item a particle: the sum over beacons of log p of their ranges; the first count numbers of the series are
+    # a t's.
+    @kernel
+    def score_beacons(
+        place: wp.array(dtype=vec4),
+        beacon: wp.array(dtype=real),
+        terms: wp.array(dtype=real),
+        series: wp.array(dtype=real),
+        log_p: wp.array(dtype=real),
+        particles: wp.int32,
+        beacons: wp.int32,
+        count: wp.int32,
+        kind: wp.int32,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        own = place[n]
+        total = vec2(ZERO, ZERO)
+        i = int(0)
+        while i < beacons:
+            one = BEACON * i
+            at = vec4(beacon[one], beacon[one + 2], beacon[one + 1], beacon[one + 3])
+            d = distance_pair(offset(at, own))
+            total = add_term(total, log_range(d, beacon, one, terms, series, count, kind))
+            i += 1
+        log_p[n] = wp.where(wp.isinf(total.x), total.x, total.x + total.y)
+
+    return {"score_beacons": score_beacons}[name]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_line import error_of
 
+import gpusense as gs
 from gpusense.cli import main
 from gpusense.logs.mrclam import dead_reckoning, read_mrclam
 
@@ -148,3 +149,20 @@ def test_recorded_robot(capsys, data_dir, needs):
     assert code == 0 and [(e["first"], e["second"]) for e in document["exchanged"]] == [(11, 17)]
     assert document["left_out"]["unknown barcodes"] == 2 and document["left_out"]["other robots"] > 1000
     assert document["filter"]["error_median"] < 0.15 and document["filter"]["error_90"] < 0.4
+
+
+@pytest.mark.parametrize("association", ["nearest", "joint"])
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_scans_of_different_sizes_are_those_of_a_new_model(needs, selection, association):
+    """A model keeps its buffers, which only grow."""
+    rng = np.random.default_rng(3)
+    lm = gs.LandmarkMap(rng.uniform(-4, 4, (10, 2)))
+    backend = needs(selection)
+    kept = gs.LandmarkModel(lm, backend=backend, association=association)
+    poses = rng.normal(size=(7, 3))
+    for count in (2, 3, 1, 5, 4, 6):
+        features = rng.uniform(0.5, 4, (count, 2))
+        fresh = gs.LandmarkModel(lm, backend=backend, association=association)
+        assert (kept.log_likelihood(poses, features) == fresh.log_likelihood(poses, features)).all()
+        for one, other in zip(kept.associate(poses, features), fresh.associate(poses, features), strict=True):
+            assert (one == other).all()

@@ -34,6 +34,8 @@ NOTHING = 1e-3
 # Newton steps begin once an EM step gains less than this, or after so many of them.
 _LITTLE, _MANY = 0.5, 30
 _HALVINGS = 30
+# Pairs less probable than this after EM are left out of Newton steps: all of them together change less than rounding.
+_FAR = 1e-18
 # A deviation is at least this part of range_max, of a radian, and of the signatures' span.
 _SMALLEST = 1e-6
 
@@ -72,21 +74,23 @@ def first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Point:
 
 def climb(
     pairs: Pairs, start: Point, bias: bool, max_iterations: int, tolerance: float
-) -> tuple[Value, list[float], bool]:
-    """The end, the log-likelihoods on the way, and whether less than ``tolerance`` nats are left."""
+) -> tuple[Pairs, Value, list[float], bool]:
+    """The pairs that matter, the end, log-likelihoods on the way, and whether less than ``tolerance`` nats are left."""
     value = evaluate(pairs, start)
     trace, newton = [value.log_likelihood], False
     for iteration in range(1, max_iterations + 1):
         before = value.log_likelihood
         value = _without_needless(pairs, _em_step(pairs, value, bias))
-        newton |= value.log_likelihood - before < _LITTLE or iteration >= _MANY
         left = math.inf
+        if not newton and (value.log_likelihood - before < _LITTLE or iteration >= _MANY):
+            newton, pairs = True, pairs.part(value.responsibility > _FAR)
+            value = evaluate(pairs, value.point)
         if newton:
             value, left = _newton_step(pairs, value, bias)
         trace.append(value.log_likelihood)
         if left <= tolerance:
-            return value, trace, True
-    return value, trace, False
+            return pairs, value, trace, True
+    return pairs, value, trace, False
 
 
 def _noise(value: Value) -> float:

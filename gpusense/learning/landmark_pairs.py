@@ -90,6 +90,11 @@ class Pairs:
         there: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
         return bool(there[0]), bool(there[1]), bool(there[2])
 
+    def part(self, kept: NDArray[np.bool]) -> Pairs:
+        """Some of the pairs, of the same features."""
+        names = ("feature", "landmark", "prior", "residuals", "means", "in_view")
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+
 
 @dataclass(frozen=True, eq=False)
 class Value:

@@ -43,6 +43,9 @@ def report(
     held = _held(pairs, value)
     errors = {name: float(own[k] * point.sigma[k]) if parts[k] else math.nan for k, name in enumerate(SIGMAS)}
     errors["z_detect"] = errors["z_false"] = float(own[ODDS] * point.z_detect * (1 - point.z_detect))
+    for name in errors:
+        if errors[name] == math.inf:
+            held[name] = "the features do not tell it"
     p, errors["p_detect"] = base.p_detect, math.nan
     expected, detected = seen or (0, 0.0)
     if expected:

@@ -99,10 +99,10 @@ def fit_landmark_parameters(
     base = LandmarkParameters(range_max=range_max, field_of_view=field_of_view, signature_span=signature_span)
     seen = _sightings(poses, features, landmarks, correspondence, scan, base, mount)
     start = first_guess(seen.pairs, initial)
-    value, trace, converged = climb(seen.pairs, start, bias, most, least)
-    seen_by_scan = None if scan is None else _seen(seen, landmarks, value)
+    pairs, value, trace, converged = climb(seen.pairs, start, bias, most, least)
+    seen_by_scan = None if scan is None else _seen(replace(seen, pairs=pairs), landmarks, value)
     base = base if initial is None else replace(base, p_detect=initial.p_detect)
-    return report(seen.pairs, seen.kept, seen.total, value, trace, converged, bias, base, seen_by_scan)
+    return report(pairs, seen.kept, seen.total, value, trace, converged, bias, base, seen_by_scan)
 
 
 def _sightings(

@@ -149,6 +149,25 @@ def test_degenerate_data_are_named():
         assert np.isfinite(found.trace).all() and str(found) and found.to_dict()["status"] == found.status
 
 
+@pytest.mark.parametrize("view", [2 * math.pi, 2.0])
+def test_landmarks_under_the_robot_have_no_bearing(view):
+    """Every bearing is as likely, 1 / field of view; landmarks at one place share what is theirs."""
+    rng = np.random.default_rng(0)
+    lm = gs.LandmarkMap([[0, 0], [0, 0], [3, 1]])
+    poses = np.zeros((40, 3))
+    poses[20:, 0] = 1e-9
+    features = np.column_stack([np.abs(rng.normal(0, 0.1, 40)), rng.uniform(-1, 1, 40)])
+    ids = np.zeros(40, int)
+    ids[-1] = -1
+    options = {"range_max": 5.0, "field_of_view": view}
+    found = gs.fit_landmark_parameters(poses, features, lm, correspondence=ids, **options)
+    model = gs.LandmarkModel(lm, found.parameters, backend="numpy", precision="float64")
+    own = sum(float(model.log_likelihood(poses[[n]], features[[n]], ids[[n]])[0]) for n in range(40))
+    assert found.converged and own == pytest.approx(found.log_likelihood, abs=1e-9 * 40)
+    assert found.held["sigma_bearing"] == "kept, since no landmark has this part"
+    assert gs.fit_landmark_parameters(poses, features, lm, **options).converged
+
+
 def test_start_and_limits_of_iterations():
     seen = world.simulate(6)
     far = gs.LandmarkParameters(sigma_range=2.0, sigma_bearing=1.0, z_detect=0.5, z_false=0.5)

@@ -72,6 +72,7 @@ class Pairs:
         means: (P, 3) expected range, bearing and signature.
         in_view: (P,) whether the landmark is within the limits.
         uniform: (F,) log density of a false positive.
+        given: Whether some feature has a range, a bearing and a signature, compared with a landmark's or not.
         limits: Of the sensor.
     """
 
@@ -82,6 +83,7 @@ class Pairs:
     means: Floats
     in_view: NDArray[np.bool]
     uniform: Floats
+    given: tuple[bool, bool, bool]
     limits: Limits
 
     @property
@@ -170,7 +172,11 @@ def make_pairs(
     # A landmark without a bearing has every one with the same density.
     lost = np.isnan(bearing) & ~np.isnan(features[feature, BEARING])
     prior = prior - lost * math.log(lengths[BEARING])
-    return Pairs(feature, landmark, prior, residuals, means, within(d, bearing, limits), uniform, limits)
+    given: NDArray[np.bool] = np.any(~np.isnan(features), axis=0)
+    return Pairs(
+        feature, landmark, prior, residuals, means, within(d, bearing, limits), uniform,
+        (bool(given[0]), bool(given[1]), bool(given[2])), limits,
+    )  # fmt: skip
 
 
 def evaluate(pairs: Pairs, point: Point) -> Value:

@@ -53,11 +53,8 @@ def report(
         errors["p_detect"] = math.sqrt(p * (1 - p) / expected)
     else:
         held["p_detect"] = "not counted: features were not given by scans" if seen is None else "no landmark in view"
-    values: dict[str, Any] = {name: point.sigma[k] if parts[k] else None for k, name in enumerate(SIGMAS)}
-    if not parts.any():
-        # Nothing was compared: deviations are those of the start, as far as something was measured.
-        values = {name: point.sigma[k] for k, name in enumerate(SIGMAS[:2])}
-    span = pairs.limits.span if parts[2] else base.signature_span
+    values: dict[str, Any] = {name: point.sigma[k] if pairs.given[k] else None for k, name in enumerate(SIGMAS)}
+    span = pairs.limits.span if pairs.given[2] else base.signature_span
     parameters = replace(
         base, **values, z_detect=point.z_detect, z_false=1 - point.z_detect, p_detect=p, signature_span=span
     )
@@ -118,8 +115,12 @@ def _held(pairs: Pairs, value: Value) -> dict[str, str]:
     detections = value.responsibility.sum() > NOTHING
     for k, name in enumerate(SIGMAS):
         sigma = value.point.sigma[k]
-        if not pairs.measured[k] or not detections:
-            held[name] = "kept, since no feature is a landmark" if not detections else "no feature has this part"
+        if not pairs.given[k]:
+            held[name] = "no feature has this part"
+        elif not detections:
+            held[name] = "kept, since no feature is a landmark"
+        elif not pairs.measured[k]:
+            held[name] = "kept, since no landmark has this part"
         elif sigma <= low[k] * (1 + 1e-9):
             held[name] = f"at its lower bound {low[k]:.3g}: the residuals are zero"
         elif sigma >= high[k] * (1 - 1e-9):
@@ -137,7 +138,7 @@ def _notes(pairs: Pairs, value: Value, converged: bool, held: dict[str, str]) ->
     used = np.unique(pairs.landmark[value.responsibility > 0.5])
     if len(used) == 1:
         notes.append(f"landmark {used[0]} alone was seen: an error of its position counts as an offset or as noise")
-    count = sum(pairs.measured) + 1
+    count = sum(pairs.given) + 1
     if len(value.false) < count:
         notes.append(f"{len(value.false)} features cannot tell {count} parameters")
     notes += [f"{name}: {reason}" for name, reason in held.items() if reason != "no feature has this part"]

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from gpusense.landmarks import LandmarkMap
     from gpusense.learning.fit import fit_beam_parameters
     from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.landmark_result import LandmarkFit
+    from gpusense.learning.landmarks import fit_landmark_parameters
     from gpusense.learning.result import BeamFit
+    from gpusense.learning.suspicious import suspicious_landmarks
     from gpusense.logs import Odometry, Scan, read_log
     from gpusense.map_io import read_map, write_map
     from gpusense.models.absolute import HeadingModel, PositionModel
@@ -57,6 +60,7 @@ _HOME = {
     "HeadingParameters": "gpusense.sensor_parameters",
     "IncidenceFit": "gpusense.learning.incidence",
     "IncidenceParameters": "gpusense.parameters",
+    "LandmarkFit": "gpusense.learning.landmark_result",
     "LandmarkMap": "gpusense.landmarks",
     "LandmarkModel": "gpusense.models.landmark",
     "LandmarkParameters": "gpusense.parameters",
@@ -77,12 +81,14 @@ _HOME = {
     "distance_transform": "gpusense.prepare",
     "fit_beam_parameters": "gpusense.learning.fit",
     "fit_incidence_parameters": "gpusense.learning.incidence",
+    "fit_landmark_parameters": "gpusense.learning.landmarks",
     "locate": "gpusense.positions.both",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
     "resample": "gpusense.weights",
     "surface_normals": "gpusense.normals",
+    "suspicious_landmarks": "gpusense.learning.suspicious",
     "triangulate": "gpusense.positions.bearings",
     "triangulate_triangle": "gpusense.positions.bearings",
     "trilaterate": "gpusense.positions.ranges",
@@ -106,6 +112,7 @@ __all__ = [
     "HeadingParameters",
     "IncidenceFit",
     "IncidenceParameters",
+    "LandmarkFit",
     "LandmarkMap",
     "LandmarkModel",
     "LandmarkParameters",
@@ -127,12 +134,14 @@ __all__ = [
     "distance_transform",
     "fit_beam_parameters",
     "fit_incidence_parameters",
+    "fit_landmark_parameters",
     "locate",
     "normalize_weights",
     "read_log",
     "read_map",
     "resample",
     "surface_normals",
+    "suspicious_landmarks",
     "triangulate",
     "triangulate_triangle",
     "trilaterate",

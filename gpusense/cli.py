@@ -14,7 +14,7 @@ from typing import NoReturn
 from gpusense._version import __version__
 
 # In the order of the help: each is a module of gpusense.commands.
-COMMANDS = ("devices", "selftest", "demo", "score", "fit", "bench")
+COMMANDS = ("devices", "selftest", "demo", "score", "fit", "landmarks", "bench")
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -41,6 +41,17 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the message without the usage and exit."""
         self.exit(BAD_INPUT, _error_line(message))
+
+
+class Layout(argparse.RawDescriptionHelpFormatter):
+    """Text as it is written, and room for the longest command's name, whose indentation argparse forgets."""
+
+    def add_argument(self, action: argparse.Action) -> None:
+        """Add an argument to the help."""
+        super().add_argument(action)
+        if action.dest == "command" and action.choices is not None:
+            longest = max(len(str(name)) for name in action.choices)
+            self._action_max_length = max(self._action_max_length, self._current_indent + 2 + longest)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -101,7 +112,7 @@ def _dispatch(argv: list[str]) -> int:
 
 def _build(names: Sequence[str]) -> Parser:
     """The parser of these commands."""
-    layout = argparse.RawDescriptionHelpFormatter
+    layout = Layout
     parser = Parser(
         prog="gpusense", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=layout, allow_abbrev=False
     )

@@ -202,6 +202,22 @@ def test_localisation_with_fitted_parameters_runs(needs: Callable[[str], str], d
     assert log["scored_scans"] == 2 and all(1 <= row["rank"]["median"] < 20 for row in log["rows"])
 
 
+def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    chosen = [word for name in ("mrclam_2", "beacons", "lego", "freiburg") for word in ("--set", name)]
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), *chosen, "--scans", "600", "--particles", "300"]
+    report = run_script("landmarks_real.py", *arguments, output=tmp_path / "landmarks_real")
+    assert str(data_dir) not in json.dumps(report)
+    mrclam, beacons, lego, freiburg = report["sets"]
+    assert [each["landmarks"] for each in mrclam["exchanged"]] == [[11, 17]]
+    assert not any(one["exchanged"] or one["misplaced"] for one in (beacons, lego, freiburg))
+    assert freiburg["left_out"] == {"ranges below 0": 1} and "filter" not in freiburg["rows"][0]
+    for one in report["sets"]:
+        assert all(row["fit"]["converged"] for row in one["rows"])
+        assert all(row["association"][0]["right"] > 0.75 for row in one["rows"] if "association" in row)
+    for row in [*mrclam["rows"], *lego["rows"]]:
+        assert row["filter"]["error_median"] < 0.2
+
+
 def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
     command = [sys.executable, str(BENCH / "discrete_convergence.py"), "--output", str(tmp_path), "--most", "64"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)

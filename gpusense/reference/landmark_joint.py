@@ -48,7 +48,7 @@ def joint_features(
 ) -> None:
     """``choice[s]`` has the landmark of each feature of a set, and its log p at ``value``; ``sets`` is 2^features."""
     real = pose.dtype
-    numbers = feature.reshape(-1, FEATURE)
+    numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], size)
     turned = [direction(pose[:particles], pose_low[:particles], one) for one in numbers[:features]]
     sums = best[: particles * sets].reshape(particles, sets)

@@ -50,7 +50,7 @@ def score_features(
     With PER_BEAM also what each feature adds, and its likeliest landmark's place in the buckets, -1 where a false
     positive is likelier. ``share`` is log(1 / landmarks), the prior of each one with MARGINAL and else 0.
     """
-    numbers = feature.reshape(-1, FEATURE)
+    numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     for begin in range(0, particles, BLOCK):
         part = slice(begin, min(begin + BLOCK, particles))
         place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)

@@ -1,0 +1,159 @@
+"""Noise, association and localisation of real robots among landmarks.
+
+    python bench/landmarks_real.py --data DATA --output bench/results/landmarks_real      # some minutes
+
+For each run: parameters fitted at the logged poses with known and with unknown landmarks; landmarks whose readings
+stand where another one is; how often the likeliest landmark of a feature is the recorded one, at logged poses and at
+poses moved at random; and the error of a plain particle filter (odometry, ``LandmarkModel``, systematic resampling)
+that is told the landmarks, or not, with the parameters of the fit of its kind. It starts 0.5 m and 0.3 rad (one
+deviation) around the first logged pose. Two landmarks of the UTIAS data are exchanged in the published positions: they
+are left so, and for comparison put back as reported ("repaired"). Fits and filters use the same run.
+
+freiburg is simulated and has no true path: no filter. The LEGO robot's headings are made of the features themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from landmark_sets import run_of
+from speed import command_line, machine
+
+import gpusense as gs
+from gpusense import landmark_runs as lr
+
+SETS = ("mrclam_1", "mrclam_2", "mrclam_3", "beacons", "lego", "freiburg")
+MOVED = ((0.0, 0.0), (0.1, 0.05), (0.3, 0.15))
+
+
+def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The figures of one run."""
+    run = lr.first_scans(run_of(data, name), arguments.scans)
+    fit = lr.fit_run(run)
+    found = lr.suspicions(run, fit)
+    variants = {"as recorded": run}
+    if found.exchanged:
+        variants["repaired"] = lr.repaired(run, found)
+    rows = []
+    for variant, own in variants.items():
+        for known in (True, False):
+            learned = lr.fit_run(own, known=known)
+            model = gs.LandmarkModel(own.landmarks, lr.usable(learned.parameters), backend=arguments.backend)
+            row: dict[str, Any] = {"map": variant, "known": known, "fit": learned.to_dict()}
+            if not known:
+                row["association"] = [
+                    {"sigma_position": m, "sigma_heading": h,
+                     **lr.association(own, model, sigma_position=m, sigma_heading=h)} for m, h in MOVED
+                ]  # fmt: skip
+            if name != "freiburg":
+                track = lr.localise(own, model, known=known, particles=arguments.particles, seed=arguments.seed)
+                row["filter"] = track.summary()
+            rows.append(row)
+            print(f"{name}: {variant}, {'known' if known else 'unknown'}", file=sys.stderr, flush=True)
+    label = run.labels.tolist()
+    return {
+        "set": name, "scans": len(run.time), "features": len(run.ids), "landmarks": len(run.landmarks),
+        "range_max": run.range_max, "field_of_view": run.field_of_view, "left_out": run.left_out, "rows": rows,
+        "exchanged": [
+            {"landmarks": [label[e.first], label[e.second]], "gain": e.gain, "before": e.before, "after": e.after}
+            for e in found.exchanged
+        ],
+        "misplaced": [{"landmark": label[m.landmark], "agree": m.agree} for m in found.misplaced],
+    }  # fmt: skip
+
+
+def to_markdown(sets: list[dict[str, Any]]) -> str:
+    """Tables of all runs."""
+    lines = [
+        "| run (scans, features) | map | landmarks | sigma_range [m] | sigma_bearing [rad] | z_false | p_detect "
+        "| range bias [m] | bearing bias [rad] |",
+        "| --- " * 9 + "|",
+    ]
+    for one in sets:
+        for row in one["rows"]:
+            p, e, f = row["fit"]["parameters"], row["fit"]["standard_errors"], row["fit"]
+            lines.append(
+                f"| {one['set']} ({one['scans']}, {one['features']}) | {row['map']} | {_told(row)} "
+                f"| {p['sigma_range']:.4f} +- {_number(e['sigma_range'])} "
+                f"| {p['sigma_bearing']:.4f} +- {_number(e['sigma_bearing'])} | {p['z_false']:.4f} "
+                f"| {p['p_detect']:.2f} | {f['range_bias']:+.4f} | {f['bearing_bias']:+.4f} |"
+            )
+    lines += ["", "| run | map | landmarks | error [m], median / 90 % / largest | heading [rad], median / 90 % |",
+              "| --- " * 5 + "|"]  # fmt: skip
+    for one in sets:
+        for row in one["rows"]:
+            if "filter" in row:
+                f = row["filter"]
+                lines.append(
+                    f"| {one['set']} | {row['map']} | {_told(row)} | {f['error_median']:.3f} / {f['error_90']:.3f} / "
+                    f"{f['error_max']:.2f} | {f['heading_median']:.3f} / {f['heading_90']:.3f} |"
+                )
+    head = " | ".join(f"moved {m:g} m, {h:g} rad" for m, h in MOVED)
+    lines += ["", f"| association right / none / wrong [%] | map | {head} |", "| --- " * (2 + len(MOVED)) + "|"]
+    for one in sets:
+        for row in one["rows"]:
+            if "association" in row:
+                cells = " | ".join(
+                    f"{100 * a['right']:.1f} / {100 * a['none']:.1f} / {100 * a['wrong']:.1f}"
+                    for a in row["association"]
+                )
+                lines.append(f"| {one['set']} | {row['map']} | {cells} |")
+    lines.append("")
+    for one in sets:
+        for e in one["exchanged"]:
+            lines.append(
+                f"- {one['set']}: landmarks {e['landmarks'][0]} and {e['landmarks'][1]} are exchanged: "
+                f"{100 * e['before'][0]:.0f} and {100 * e['before'][1]:.0f} % of their readings agree, "
+                f"{100 * e['after'][0]:.0f} and {100 * e['after'][1]:.0f} % the other way round ({e['gain']:.0f} nats)"
+            )
+        lines += [
+            f"- {one['set']}: {100 * m['agree']:.0f} % of the readings of landmark {m['landmark']} agree with its place"
+            for m in one["misplaced"]
+        ]
+    return "\n".join(lines)
+
+
+def _told(row: dict[str, Any]) -> str:
+    return "known" if row["known"] else "unknown"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1g}"
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
+    parser.add_argument("--set", action="append", choices=SETS, help="default: all")
+    parser.add_argument("--scans", type=int, help="at most so many of each run")
+    parser.add_argument("--particles", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--backend", default="auto")
+    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
+    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
+    arguments = parser.parse_args()
+    if arguments.data is None:
+        parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
+    sets = [measure(arguments.data, name, arguments) for name in arguments.set or SETS]
+    # The folder of the data is no one's business.
+    command = command_line("bench/landmarks_real.py").replace(str(arguments.data), "DATA")
+    host = machine(arguments.commit)
+    described = ", ".join(f"{name} {value}" for name, value in host.items())
+    text = f"{to_markdown(sets)}\n\n{arguments.particles} particles. Machine: {described}. Command: `{command}`.\n"
+    print(text)
+    if arguments.output:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        report = {"command": command, "machine": host, "particles": arguments.particles, "sets": sets}
+        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+        arguments.output.with_suffix(".md").write_text(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

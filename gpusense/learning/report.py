@@ -92,7 +92,11 @@ def _bias(problem: Problem, value: Value) -> tuple[float, float]:
     if math.isfinite(error):
         # One Newton step from 0 in all coordinates.
         return float(newton_direction(with_bias, value)[0][BIAS]), error
-    return float(value.sums[12] / value.sums[1]) if value.sums[1] > 0 else 0.0, error
+    # Too far from the optimum for that: the mean of correct readings, weighted by their responsibilities.
+    correct = float(value.sums[1])
+    if correct <= 0:
+        return 0.0, error
+    return float(value.sums[12]) / correct, value.point.sigma / math.sqrt(correct)
 
 
 def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray[np.float64]:

@@ -159,6 +159,6 @@ def test_threads_share_the_blocks_with_the_same_bits(needs, monkeypatch: pytest.
     z, expected = draw(TYPICAL, 3001, 3)
     device = problem_of(z, expected, backend=needs("warp")).device
     sums, causes = device.sums(POINTS["ordinary"]), device.causes(POINTS["ordinary"])
-    monkeypatch.setattr("gpusense.backends._warp._PIECE_WORK", 64)
+    monkeypatch.setattr("gpusense.backends._warp_pieces._PIECE_WORK", 64)
     assert (device.sums(POINTS["ordinary"]) == sums).all()
     assert (device.causes(POINTS["ordinary"]) == causes).all()

@@ -128,11 +128,11 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     """A launcher of the field's scores that three threads share, and what runs a launcher on some particles."""
-    from gpusense.backends import _warp
+    from gpusense.backends import _warp, _warp_pieces
 
-    monkeypatch.setattr(_warp, "_threads", lambda: 3)
-    _warp._pool.cache_clear()
-    monkeypatch.setattr(_warp, "_PIECE_WORK", 50)
+    monkeypatch.setattr(_warp_pieces, "_threads", lambda: 3)
+    _warp_pieces._pool.cache_clear()
+    monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
     rng = np.random.default_rng(0)
     particles, readings, rows, cols = 61, 20, 30, 40
     angles = rng.uniform(-4, 4, particles)
@@ -149,7 +149,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     backend = _warp.WarpBackend(warp_backend.info, "cpu")
     flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
     launch = backend.compile("score_field", flags)
-    assert isinstance(launch, _warp._Pieces)
+    assert isinstance(launch, _warp_pieces._Pieces)
     inputs = [backend.upload(array) for array in arrays]
     scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5)
     real = np.dtype(np.float32)
@@ -161,7 +161,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
         return backend.download(log_p, found[0]), backend.download(parts, found[1])
 
     yield launch, run
-    _warp._pool.cache_clear()
+    _warp_pieces._pool.cache_clear()
 
 
 @pytest.mark.parametrize("count", [1, 4, 5, 6, 60, 61])

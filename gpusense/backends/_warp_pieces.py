@@ -16,6 +16,7 @@ import threading
 from typing import Any
 
 from gpusense.backends._warp_launch import Launch, slice_of
+from gpusense.backends._warp_queue import HELPERS
 from gpusense.backends.base import Launcher
 from gpusense.signatures import Argument, Kernel
 
@@ -57,7 +58,7 @@ def _threads() -> int:
 @functools.cache
 def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
     """The threads of a process, all launches'; the calling thread works as well."""
-    return concurrent.futures.ThreadPoolExecutor(_threads() - 1, "gpusense")
+    return concurrent.futures.ThreadPoolExecutor(_threads() - 1, HELPERS)
 
 
 class _Pieces:

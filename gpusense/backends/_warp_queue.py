@@ -28,6 +28,8 @@ _MOST_VIEWS, _MOST_GRAPHS, _MOST_SEEN = 1024, 256, 512
 _STALE = 16
 # Beyond this a call is long enough for its starts not to count.
 _MOST_STEPS = 64
+# How the threads that share launches on the processor are called.
+HELPERS = "gpusense pieces"
 
 
 class Step(Protocol):
@@ -176,9 +178,10 @@ class Graphs:
     def _record(self, steps: list[Step]) -> Any:
         """A graph of steps, none of which is started; None where there can be none now.
 
-        While one thread records, Warp refuses to let others wait for the device: only a thread alone does.
+        While one thread records, Warp refuses to let others wait for the device: only a thread alone does. Those that
+        share launches on the processor wait for no device.
         """
-        if threading.active_count() > 1:
+        if sum(not thread.name.startswith(HELPERS) for thread in threading.enumerate()) > 1:
             return None
         try:
             if self._device.is_cuda and self._stream is None:

@@ -14,14 +14,13 @@ error of the mean is also given at the temperature 0.1.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import command_line, machine
+from speed import command_line, machine, write_report
 
 import gpusense as gs
 from gpusense import fitting, held_out
@@ -112,10 +111,8 @@ def main() -> int:
     text = f"{to_markdown(logs)}\n\n{arguments.particles} particles. Machine: {described}. Command: `{command}`.\n"
     print(text)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": command, "machine": host, "particles": arguments.particles, "logs": logs}
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(text)
+        write_report(arguments.output, report, text)
     return 0
 
 

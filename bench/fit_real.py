@@ -30,7 +30,6 @@ from __future__ import annotations
 import argparse
 import csv
 import gzip
-import json
 import os
 import sys
 import time
@@ -40,7 +39,7 @@ from typing import Any
 
 import numpy as np
 from sonar_field import recorded, ring_of
-from speed import command_line, machine
+from speed import command_line, machine, write_report
 
 import gpusense as gs
 from gpusense import fitting, held_out
@@ -279,10 +278,8 @@ def main() -> int:
     text = f"{to_markdown(reports)}\n\nDevice: {device}. Machine: {described}. Command: `{command}`.\n"
     print(text)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": command, "machine": host, "device": device, "sets": reports}
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(text)
+        write_report(arguments.output, report, text)
     return 0 if all(report["fit"]["converged"] for report in reports) else 1
 
 

@@ -13,14 +13,13 @@ float64 reference on the first particles, in eps (1 + |log p|) of float32 and a 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, best, command_line, machine
+from speed import Recorder, best, command_line, machine, write_report
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -126,10 +125,8 @@ def main() -> int:
     table = f"{to_markdown(rows)}\n\nMachine: {described}. Command: `{command}`.\n"
     print(table)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": command, "machine": host, "rows": rows}
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(table)
+        write_report(arguments.output, report, table)
     return 0
 
 

@@ -15,14 +15,13 @@ freiburg is simulated and has no true path: no filter. The LEGO robot's headings
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
 from typing import Any
 
 from landmark_sets import run_of
-from speed import command_line, machine
+from speed import command_line, machine, write_report
 
 import gpusense as gs
 from gpusense import landmark_runs as lr
@@ -148,10 +147,8 @@ def main() -> int:
     text = f"{to_markdown(sets)}\n\n{arguments.particles} particles. Machine: {described}. Command: `{command}`.\n"
     print(text)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": command, "machine": host, "particles": arguments.particles, "sets": sets}
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(text)
+        write_report(arguments.output, report, text)
     return 0
 
 

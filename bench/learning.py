@@ -20,13 +20,12 @@ or an end differs by more than 1e-4 nats.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import best, command_line, machine
+from speed import best, command_line, machine, write_report
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -206,13 +205,11 @@ def main() -> int:
     )
     print(text)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
         report = {
             "command": command, "machine": host, "rows": rows, "scenes": scenes, "identified": identified,
             "within": within, "fall": fell, "off": off,
         }  # fmt: skip
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(text)
+        write_report(arguments.output, report, text)
     return 1 if fell > FALLS or within < SHARE * identified or off > NATS else 0
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, command_line, machine
+from speed import Recorder, command_line, machine, write_report
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -224,10 +223,8 @@ def main() -> int:
     table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {described}. Command: `{command}`.\n"
     print(table)
     if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
         report = {"command": command, "scene": scene, "machine": host, "rows": rows}
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(table)
+        write_report(arguments.output, report, table)
     return 0
 
 

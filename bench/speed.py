@@ -174,6 +174,13 @@ def machine(commit: str) -> dict[str, str]:
     }  # fmt: skip
 
 
+def write_report(output: Path, report: dict[str, Any], text: str) -> None:
+    """Write a report beside its text: a path without ending, for a .json and a .md file."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+    output.with_suffix(".md").write_text(text)
+
+
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -140,11 +140,14 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
 }
 
-// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
-kernel void beam_tiles(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                       global const real4 *pose, global const int *order, global const real2 *ray,
-                       global const int *first, global const real *reading, global const real *terms,
-                       global const real *edges, global const real *sensor, global real *parts, const int rows,
+// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], fewer than 2^31
+// numbers. What is told not to overlap need not be read again after each of them is written.
+kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
+                       global const int2 *restrict pose_cell, global const real4 *restrict pose,
+                       global const int *restrict order, global const real2 *restrict ray,
+                       global const int *restrict first, global const real *restrict reading,
+                       global const real *restrict terms, global const real *restrict edges,
+                       global const real *restrict sensor, global real *restrict parts, const int rows,
                        const int cols, const int particles, const int rays, const int readings, const int kinds,
                        const int cone_rays, const real critical, const int bins, const real slack,
                        const real tolerance, const int cells, const real per_metre, const real limit,
@@ -157,13 +160,15 @@ kernel void beam_tiles(global const entry *map_table, global const real2 *normal
 #else
     const int n = place;
 #endif
+    const int2 cell = pose_cell[n];
+    const real4 own_pose = pose[n];
     for (int r = tile_ray(item, spread); r < rays; r += tile_step(spread)) {
 #if ECHO
-        const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + r * cone_rays,
+        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, own_pose, ray + r * cone_rays,
                                        cone_rays, critical, limit, bins, slack, tolerance);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, rows, cols, cell, own_pose, ray[r], limit, bins, slack, tolerance);
 #endif
         const real expected = expected_range(t, limit, resolution, range_max);
 #if INCIDENCE
@@ -178,7 +183,7 @@ kernel void beam_tiles(global const entry *map_table, global const real2 *normal
         {
 #endif
             const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
-            parts[(long)place * across + (long)k * along] = term;
+            parts[place * across + k * along] = term;
         }
     }
 }

@@ -48,7 +48,7 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     real k_x = COUNT + (real)start.k_x, k_y = COUNT + (real)start.k_y, t = start.t;
     uint sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
     // A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
-    while (sides != 0 && t < limit) {
+    while (sides > OCCUPIED && t < limit) {
         const real end_x = as_real(as_bits(k_x) + (sides & 255)), end_y = as_real(as_bits(k_y) + (sides >> 8));
         const real t_x = ((end_x - (COUNT + 1)) + r.a_x) * r.inv_x, t_y = ((end_y - (COUNT + 1)) + r.a_y) * r.inv_y;
         const int by_x = t_x <= t_y;
@@ -61,8 +61,7 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
 #if OUTSIDE_OCCUPIED
     return t < limit ? t : limit;
 #else
-    const int col = cell.x + r.step_x * whole(k_x), row = cell.y + r.step_y * whole(k_y);
-    return t >= limit || off_grid(col, row, rows, cols) ? limit : t;
+    return t < limit && sides == OCCUPIED ? t : limit;
 #endif
 }
 
@@ -94,15 +93,14 @@ lanes cast_rays(global const entry *map_table, const int rows, const int cols, c
         const ilanes x = as_ilanes(k_x) - (int)FIRST, y = as_ilanes(k_y) - (int)FIRST;
         const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
         const ilanes sides = GATHER(ilanes, map_table, at);
-        const ilanes stopped = going & (sides == 0);
+        const ilanes stopped = going & (sides <= OCCUPIED);
         if (some(stopped)) {
 #if OUTSIDE_OCCUPIED
             found = stopped ? t : found;
 #else
-            const ilanes col = cell.x + (right ? x : -x), row = cell.y + (up ? y : -y);
-            found = stopped && col >= 0 && col < cols && row >= 0 && row < rows ? t : found;
+            found = stopped & (sides == OCCUPIED) ? t : found;
 #endif
-            going &= sides != 0;
+            going &= sides > OCCUPIED;
             if (!some(going)) return found;
         }
         const lanes end_x = as_lanes(as_ilanes(k_x) + (sides & 255)), end_y = as_lanes(as_ilanes(k_y) + (sides >> 8));

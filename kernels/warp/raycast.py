@@ -23,9 +23,10 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
     make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
-    crossed, as_bits, farther, whole = geometry.crossed, geometry.as_bits, geometry.farther, geometry.whole
+    crossed, as_bits, farther = geometry.crossed, geometry.as_bits, geometry.farther
     COUNT, FIRST = geometry.COUNT, geometry.FIRST
     padded = rectangles_file.functions(flags).padded
+    OCCUPIED = wp.uint32(rectangles_file.OCCUPIED)
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     SECTORS_2 = "SECTORS_2" in flags
@@ -77,7 +78,7 @@ def functions(flags):
         t = real(start.t)
         sides = wp.uint32(map_table[wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))])
         # A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
-        while sides != wp.uint32(0) and t < limit:
+        while sides > OCCUPIED and t < limit:
             end_x = farther(k_x, sides & wp.uint32(255))
             end_y = farther(k_y, sides >> wp.uint32(8))
             t_x = ((end_x - ABOVE_COUNT) + r.a_x) * r.inv_x
@@ -93,8 +94,6 @@ def functions(flags):
         if OUTSIDE_OCCUPIED:
             return wp.min(t, limit)
         else:
-            col = cell.x + r.step_x * whole(k_x)
-            row = cell.y + r.step_y * whole(k_y)
-            return wp.where(t >= limit or off_grid(col, row, rows, cols), limit, t)
+            return wp.where(t < limit and sides == OCCUPIED, t, limit)
 
     return SimpleNamespace(cast_ray=cast_ray)

@@ -47,17 +47,18 @@ class Cloud:
         poses: Numbers, or an array on the device.
         backend: The device.
         name: What messages call them.
+        several: An array on the device is (S, N, 3), the poses of S scans one after the other.
 
     Raises:
         TypeError: not numbers, or an array that this device cannot read.
         ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
     """
 
-    def __init__(self, poses: object, backend: Backend, name: str = "poses") -> None:
+    def __init__(self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False) -> None:
         self.host: np.ndarray | None = None
         self.on_device = arrays.on_device(poses)
         if self.on_device:
-            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name)
+            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name, several)
             return
         given = arrays.to_host(poses, name)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:

@@ -104,13 +104,18 @@ def _batch(
     )
 
 
-def runs(evaluated: np.ndarray, most: int) -> Iterator[tuple[int, int]]:
-    """Neighbouring scans of which all are evaluated, at most so many, and each of the others; in their order."""
+def runs(scan: PreparedScan, most: int) -> Iterator[tuple[int, int]]:
+    """Neighbouring scans of a batch that are scored by the same code, at most so many; in their order.
+
+    That are scans with shared rays, or without; scans of which nothing is evaluated come one by one.
+    """
+    assert scan.batch is not None
+    counts = scan.batch.counts
+    kinds = np.where(counts == 0, 0, np.where(counts == np.diff(scan.batch.start), 1, 2))
     begin = 0
-    while begin < len(evaluated):
-        end = begin + 1
-        if evaluated[begin]:
-            rest = np.flatnonzero(~evaluated[begin : begin + most])
-            end = begin + (int(rest[0]) if len(rest) else min(most, len(evaluated) - begin))
+    while begin < len(kinds):
+        longest = most if kinds[begin] else 1
+        others = np.flatnonzero(kinds[begin : begin + longest] != kinds[begin])
+        end = begin + int(others[0]) if len(others) else min(begin + longest, len(kinds))
         yield begin, end
         begin = end

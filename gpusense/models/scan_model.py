@@ -336,7 +336,7 @@ class ScanModel(ABC):
         self._last_scan = self._prepared(call.ranges[-1])
         assert scans.batch is not None
         most = max(self._chunk(max(scans.most_readings, 1) * self._rays_each) // count, 1)
-        for begin, end in runs(scans.batch.counts > 0, most):
+        for begin, end in runs(scans, most):
             part = (begin * count, end * count)
             target = call.target(backend, *part)
             if scans.batch.counts[begin] == 0:

@@ -221,7 +221,9 @@ def test_several_models_are_gathered(count, gathering, monkeypatch):
     models = [kind(GRID, SCANNER, backend=device) for kind in (*MODELS, gs.LikelihoodFieldModel)]
     models.append(models[0])
     poses, z = [cloud(s, count) for s in range(4)], [scan(s) for s in range(4)]
-    expected = plainly(device, monkeypatch, lambda: [m.log_likelihood(*one) for m, *one in zip(models, poses, z)])
+    expected = plainly(
+        device, monkeypatch, lambda: [m.log_likelihood(*one) for m, *one in zip(models, poses, z, strict=True)]
+    )
     there = [to_device(own) for own in poses]
     for given in (poses, poses, poses, there, there, [poses[0], *there[1:]]):
         found = gs.log_likelihoods(models, given, z)

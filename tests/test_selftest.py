@@ -210,13 +210,13 @@ def add_to_squares(*arguments):
 
 def add_to_scan(*arguments):
     score_beams(*arguments)
-    arguments[11][3] += 0.01
+    arguments[13][3] += 0.01
 
 
 def add_to_beam(*arguments):
     score_beams(*arguments)
     if "PER_BEAM" in arguments[0]:
-        arguments[12][7] += np.float32(1e-4)
+        arguments[14][7] += np.float32(1e-4)
 
 
 def densities_of_another_mixture(flags, z, expected, terms):
@@ -227,7 +227,7 @@ def densities_of_another_mixture(flags, z, expected, terms):
 def add_without_parts(flags, *arguments):
     score_beams(flags, *arguments)
     if "PER_BEAM" not in flags:
-        arguments[10][:] = np.nextafter(arguments[10], np.inf)
+        arguments[12][:] = np.nextafter(arguments[12], np.inf)
 
 
 reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope

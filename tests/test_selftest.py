@@ -270,9 +270,10 @@ def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
     if module is not None:
         right = getattr(module, kernel)
 
-        def wrong(flags, first, second, third, *rest):
-            right(flags, first, second, third, *rest)
-            third[0] = third[1] if kernel == "order_fill" else third[0] + 1
+        def wrong(flags, *arguments):
+            right(flags, *arguments)
+            written = arguments[2] if kernel == "order_fill" else arguments[4]
+            written[0] = written[1] if kernel == "order_fill" else written[0] + 1
 
         monkeypatch.setattr(module, kernel, wrong)
     whole = selftest.built_in_scene()

@@ -218,6 +218,7 @@ class LikelihoodFieldModel(ScanModel):
         readings = len(scan.readings)
 
         careful = "CAREFUL" in self._flags
+        quick = careful and self._log_table and self._specialize
         scalars = (scan.constant + self._lead, self.temperature)
         reach = longest + 2
 
@@ -227,7 +228,7 @@ class LikelihoodFieldModel(ScanModel):
             poses = cloud.given(backend, space, part)
             flags, gpu = self._flags, backend.info.kind == "gpu" and not per_beam
             if gpu:
-                if careful and self._log_table and self._specialize:
+                if quick:
                     inside = all_within(corners, self.grid, mount, region, reach, _RING)
                     flags = self._inside if inside else self._quick
                 self._last_code = flags | cloud.headings()
@@ -251,7 +252,11 @@ class LikelihoodFieldModel(ScanModel):
                 space.keep()
                 return parts
             flags |= cloud.headings() | ({"PER_BEAM"} if per_beam else set())
-            flags = self._last_code = widened(backend.info, "score_field", flags)
+            flags = widened(backend.info, "score_field", flags)
+            # Warp's compiler for processors makes vectors of loops over readings, others of work-items, or lanes do.
+            if quick and (backend.info.backend, backend.info.kind) == ("warp", "cpu"):
+                flags |= {"QUICK"}
+            self._last_code = flags
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             backend.compile("score_field", flags)(
                 (count,), *given, result, parts, region.rows, region.cols, count, readings, guard, *scalars

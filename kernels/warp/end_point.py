@@ -25,11 +25,12 @@ def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """table_cell, careful_offset, whole_cells, end_point and rounded_cell specialised by the flags."""
+    """table_cell, careful_offset, whole_cells, end_point, point_at and rounded_cell specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
     two_sum, two_product, pair_sum = exact.two_sum, exact.two_product, exact.pair_sum
+    number = "double" if "FLOAT64" in flags else "float"
     BILINEAR = "BILINEAR" in flags
     CAREFUL = "CAREFUL" in flags
     INSIDE = "INSIDE" in flags
@@ -122,6 +123,10 @@ def functions(flags):
         end.to_next_y = to_next_y
         return end
 
+    # The vector at i, read as two numbers: compilers for processors make no vectors of loops that load vectors.
+    @wp.func_native(f"return wp::vec_t<2, {number}>(points.data[i].c[0], points.data[i].c[1]);")
+    def point_at(points: wp.array(dtype=vec2), i: wp.int32) -> vec2: ...
+
     # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. How far the place is off
     # a cell's centre comes second.
     @wp.func
@@ -138,5 +143,6 @@ def functions(flags):
         whole_cells=whole_cells,
         EndPoint=EndPoint,
         end_point=end_point,
+        point_at=point_at,
         rounded_cell=rounded_cell,
     )

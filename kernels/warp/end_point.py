@@ -25,12 +25,11 @@ def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """table_cell, careful_offset, whole_cells, end_point, point_at and rounded_cell specialised by the flags."""
+    """table_cell, careful_offset, whole_cells, end_point and rounded_cell specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
     two_sum, two_product, pair_sum = exact.two_sum, exact.two_product, exact.pair_sum
-    number = "double" if "FLOAT64" in flags else "float"
     BILINEAR = "BILINEAR" in flags
     CAREFUL = "CAREFUL" in flags
     INSIDE = "INSIDE" in flags
@@ -38,8 +37,10 @@ def functions(flags):
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_ONE = real(-1.0)
     EDGE = real(2.0**-33)
-    # Adding and taking off 1.5 * 2^23 rounds to nearest.
-    ROUNDING = real(12582912.0)
+    # Adding and taking off a large number rounds to nearest, and the bits of the sum hold the integer.
+    ROUNDING = real(1.5 * 2.0**52 if "FLOAT64" in flags else 1.5 * 2.0**23)
+    bits = wp.int64 if "FLOAT64" in flags else wp.int32
+    ROUNDING_BITS = bits(0x4338000000000000 if "FLOAT64" in flags else 0x4B400000)
 
     # The same as field_cell where no end point of the cloud leaves the table.
     @wp.func
@@ -123,19 +124,16 @@ def functions(flags):
         end.to_next_y = to_next_y
         return end
 
-    # The vector at i, read as two numbers: compilers for processors make no vectors of loops that load vectors.
-    @wp.func_native(f"return wp::vec_t<2, {number}>(points.data[i].c[0], points.data[i].c[1]);")
-    def point_at(points: wp.array(dtype=vec2), i: wp.int32) -> vec2: ...
-
     # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. How far the place is off
     # a cell's centre comes second.
     @wp.func
     def rounded_cell(lowered: vec4, point: vec2):
         x = lowered.x + (lowered.z * point.x - lowered.w * point.y)
         y = lowered.y + (lowered.w * point.x + lowered.z * point.y)
-        whole_x = (x + ROUNDING) - ROUNDING
-        whole_y = (y + ROUNDING) - ROUNDING
-        return wp.vec2i(int(whole_x), int(whole_y)), wp.max(wp.abs(x - whole_x), wp.abs(y - whole_y))
+        to_x = x + ROUNDING
+        to_y = y + ROUNDING
+        cell = wp.vec2i(int(wp.cast(to_x, bits) - ROUNDING_BITS), int(wp.cast(to_y, bits) - ROUNDING_BITS))
+        return cell, wp.max(wp.abs(x - (to_x - ROUNDING)), wp.abs(y - (to_y - ROUNDING)))
 
     return SimpleNamespace(
         table_cell=table_cell,
@@ -143,6 +141,5 @@ def functions(flags):
         whole_cells=whole_cells,
         EndPoint=EndPoint,
         end_point=end_point,
-        point_at=point_at,
         rounded_cell=rounded_cell,
     )

@@ -235,3 +235,21 @@ def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"discrete_convergence.png", "discrete_rows.png"}
     first, second = ([float(cell) for cell in line.split("|")[2:-1]] for line in done.stdout.splitlines()[2:])
     assert all(1.3 < wide / narrow < 3 for wide, narrow in zip(first, second, strict=True))
+
+
+def test_stretches_of_machine_code_end_at_labels_and_branches(
+    needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs("warp")
+    monkeypatch.syspath_prepend(str(BENCH))
+    code = """
+.text.kernel:
+        /*0000*/                   LDC R1, c[0x0][0x28] ;
+        /*0010*/              @!P0 BRA `(.L_x_1) ;
+        /*0020*/                   FADD R2, R2, -12582912 ;
+        /*0030*/              @!UP1 FMUL R2.reuse, R2, R3 ;
+.L_x_1:
+        /*0040*/                   EXIT ;
+"""
+    found = importlib.import_module("cuda_code").stretches(code)
+    assert [names for names in found if names] == [["LDC", "BRA"], ["FADD", "FMUL"], ["EXIT"]]

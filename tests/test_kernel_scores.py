@@ -211,6 +211,7 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
 FIELD_SCENES = [
     *((name, names, np.float32) for name in FIELDS for names in (("CAREFUL",), ("ALL_READINGS", "CAREFUL"))),
     *((name, names, np.float64) for name in FIELDS for names in ((), ("ALL_READINGS",))),
+    ("log table", ("CAREFUL", "QUICK"), np.float32),
 ]
 
 
@@ -227,6 +228,18 @@ def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real
     assert_near(found["parts"], truth, 2 * per_beam(truth, real))
     total = temperature * (truth.sum(axis=1) + fixed)
     assert_near(found["log_p"], total, 2 * per_scan(truth, real, fixed=fixed, temperature=temperature))
+
+
+def test_quick_cells_change_no_bit(device: Backend) -> None:
+    whole = field_scene("log table", np.float32, all_readings=False)
+    count = len(whole["pose"])
+    for readings in (1, 16, 17, whole["parts"].shape[1]):
+        scene = whole | {name: whole[name][:readings] for name in ("point", "point_low")}
+        scene["parts"] = np.full((count, readings), np.nan, np.float32)
+        plain = scene_flags(np.float32, *FIELDS["log table"], "CAREFUL")
+        _, expected = score_field(device, plain, scene, -2.5, 0.75)
+        _, found = score_field(device, plain | {"QUICK"}, scene, -2.5, 0.75)
+        assert differing(found["log_p"], expected["log_p"]) == 0
 
 
 def test_an_impossible_end_point_makes_the_scan_impossible(device: Backend) -> None:

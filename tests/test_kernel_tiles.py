@@ -215,8 +215,6 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 
 # ---- the likelihood field
 
-BLOCKED = [*FIELD_SCENES, ("log table", ("CAREFUL", "QUICK"), np.float32)]
-
 
 def guards_of(point: np.ndarray) -> np.ndarray:
     """How near to an edge an end point of each block of readings may be."""
@@ -255,7 +253,7 @@ def field_blocks(
     return parts_at(found["parts"], count, blocks, way), parts_at(reference["parts"], count, blocks, way), bound
 
 
-@pytest.mark.parametrize(("name", "names", "real"), BLOCKED)
+@pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     found, expected, bound = field_blocks(device, name, real, names, 1, "particles", 77, 150)
     if name == "log table":

@@ -222,6 +222,7 @@ class LikelihoodFieldModel(ScanModel):
         scans = 1 if batch is None else len(batch.counts)
 
         careful = "CAREFUL" in self._flags
+        quick = careful and self._log_table and self._specialize
         scalars = (scan.constant + self._lead, self.temperature)
         reach = longest + 2
 
@@ -232,7 +233,7 @@ class LikelihoodFieldModel(ScanModel):
             flags, gpu = self._flags, backend.info.kind == "gpu" and not per_beam
             per_scan, several = count // scans, _NO_FLAGS if batch is None else _SCANS
             if gpu:
-                if careful and self._log_table and self._specialize:
+                if quick:
                     inside = all_within(corners, self.grid, mount, region, reach, _RING)
                     flags = self._inside if inside else self._quick
                 flags |= several
@@ -256,7 +257,11 @@ class LikelihoodFieldModel(ScanModel):
                 space.keep()
                 return parts
             flags |= several | cloud.headings() | ({"PER_BEAM"} if per_beam else set())
-            flags = self._last_code = widened(backend.info, "score_field", flags)
+            flags = widened(backend.info, "score_field", flags)
+            # Warp's compiler for processors makes vectors of loops over readings, others of work-items, or lanes do.
+            if quick and (backend.info.backend, backend.info.kind) == ("warp", "cpu"):
+                flags |= {"QUICK"}
+            self._last_code = flags
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             # Vectors of particles hold those of one scan.
             size = scans * -(-per_scan // _GROUP) * _GROUP if "WIDE" in flags else count

@@ -83,7 +83,7 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 }
 
 #if !WIDE
-// One work-item a particle.
+// One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                         global const real *terms, global const int *start, global const real *fixed_of,

@@ -6,7 +6,7 @@ import warp as wp
 
 from . import error_free
 from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision
+from .prelude import kernel, precision, reader
 
 
 @functools.cache
@@ -15,6 +15,7 @@ def make(name, flags):
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     add_term = error_free.functions(flags).add_term
+    number_at = reader(real)
     block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=real)
     ORDERED = "ORDERED" in flags
     CUBES = "CUBES" in flags
@@ -59,7 +60,7 @@ def make(name, flags):
             term = block_terms()
             for i in range(BLOCK_TERMS):
                 if first + i < own:
-                    term[i] = parts[part + (first + i) * along]
+                    term[i] = number_at(parts, part + (first + i) * along)
             if block == 1:
                 for i in range(BLOCK_TERMS):
                     total = add_term(total, term[i])

@@ -44,6 +44,8 @@ def relative_omissions(mount: tuple[float, float], precision: str) -> list[Omiss
 class PointModel(ABC):
     """A measurement model of one reading, or a few, for each of many poses."""
 
+    _specialize = True
+
     def __init__(self, backend: str | Backend, precision: str, temperature: float) -> None:
         self.temperature = _checks.real("temperature", temperature, above=0, high=1)
         self._backend = get_backend(backend)
@@ -70,10 +72,13 @@ class PointModel(ABC):
         """What this scene does not need, why, and what leaving it out saves; readings and poses as of the last call."""
         name, omissions = self._describe()
         title = f"{name}, {self.precision}, {self.device.selection} ({self.device.name})"
+        code = self._last_code or frozenset()
+        if not self._specialize:
+            return str(Plan(f"{title}, specialize=False", code, ()))
         omissions = [*omissions, *self._last_left_out]
-        if self._last_code is not None and "HUGE_HEADINGS" not in self._last_code:
+        if self._last_code is not None and "HUGE_HEADINGS" not in code:
             omissions.append(ORDINARY_HEADINGS)
-        return str(Plan(title, self._last_code or frozenset(), tuple(omissions)))
+        return str(Plan(title, code, tuple(omissions)))
 
     @abstractmethod
     def _describe(self) -> tuple[str, list[Omission]]:

@@ -137,6 +137,22 @@ def test_landmarks_runs(selection: str, needs: Callable[[str], str], tmp_path: P
     assert all(row["rate"] > 0 and row["error"] < 16 for row in rows)
 
 
+def test_all_that_landmarks_can_be_runs(tmp_path: Path) -> None:
+    arguments = ["--landmarks", "30", "--particles", "40", "--features", "4", "--repeats", "1", "--seconds", "0.01"]
+    arguments += ["--what", "all", "--cloud", "tracking", "--backend", "numpy"]
+    rows = run_script("landmarks.py", *arguments, output=tmp_path / "all")["rows"]
+    assert len({row["what"] for row in rows}) == len(rows) == 10 and {row["cloud"] for row in rows} == {"tracking"}
+    assert all(row["rate"] > 0 and row["error"] < 16 and row["features"] > 0 for row in rows)
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_absolute_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "60", "--beacons", "3", "--repeats", "1", "--seconds", "0.01"]
+    rows = run_script("absolute.py", "--backend", needs(selection), *arguments, output=tmp_path / "absolute")["rows"]
+    assert {row["what"].split(",")[0] for row in rows} == {"position fix", "heading", "beacons", "bumper"}
+    assert all(row["rate"] > 0 and row["launch_rate"] > 0 and row["error"] < 16 for row in rows)
+
+
 def test_sonar_field_runs(tmp_path: Path) -> None:
     """Every way is tuned and scored, and the drawings are made; the recorded run is left out where there is none."""
     report = run_script(

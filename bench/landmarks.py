@@ -7,7 +7,7 @@
 Writes a Markdown table and a JSON file with machine, sizes, times, errors and the command. There is a landmark in every
 16 m2, 100 in a square of 40 m; features are those nearest to a pose within 20 m, with noise. Known: it is given which
 landmark each feature is; nearest: the likeliest of all. The others (``--what all``) are as nearest, but for what their
-names say; those with a field of view have the features in it, joint at most 5. Clouds are around the pose (tracking) or
+names say; those with a field of view have features in it, joint at most 5. Clouds are around the pose (tracking) or
 all over the map (global). Rates are of whole calls with NumPy in and out, and of their launches alone. Errors are of
 log p against the float64 reference on the first particles, in eps (1 + |log p|) of float32 and a feature.
 """
@@ -29,7 +29,6 @@ from gpusense.backends import get_backend
 
 EACH = 16.0
 CHECKED = 200
-FIELD = 2.0
 # Names and what they change in parameters and model.
 WHAT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "known": ({}, {}),
@@ -37,7 +36,7 @@ WHAT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "ranges only": ({"sigma_bearing": None}, {}),
     "bearings only": ({"sigma_range": None}, {}),
     "signatures": ({"sigma_signature": 0.3}, {}),
-    "field of view": ({"field_of_view": FIELD}, {}),
+    "field of view": ({"field_of_view": 2.0}, {}),
     "sum": ({}, {"association": "sum"}),
     "joint": ({}, {"association": "joint"}),
     "negative information": ({}, {"negative": True}),
@@ -47,7 +46,7 @@ WHAT: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Scene:
-    """A map, (F, 3) features, the landmarks that they are, and clouds of particles."""
+    """A map, what is seen of the landmarks within 20 m, the nearest first, and clouds of particles."""
 
     landmarks: gs.LandmarkMap
     features: np.ndarray
@@ -55,45 +54,44 @@ class Scene:
     clouds: dict[str, np.ndarray]
 
 
-def make_scene(count: int, features: int, particles: int, seed: int) -> Scene:
+def make_scene(count: int, particles: int, seed: int) -> Scene:
     """A map, what is seen from a pose in its middle, and clouds around it and all over the map."""
     rng = np.random.default_rng(seed)
     side = float(np.sqrt(EACH * count))
     xy = rng.uniform(-side / 2, side / 2, (count, 2))
     pose = np.array([0.5, -0.5, 0.3])
     away = xy - pose[:2]
-    seen = np.argsort(np.hypot(*away.T))[:features]
-    found = np.stack([np.hypot(*away[seen].T), np.arctan2(away[seen, 1], away[seen, 0]) - pose[2]], axis=1)
-    found += rng.normal(0, (0.2, 0.05), found.shape)
+    distance = np.hypot(*away.T)
+    seen = np.argsort(distance)[: np.count_nonzero(distance < 20.0)]
+    found = np.stack([distance[seen], np.arctan2(away[seen, 1], away[seen, 0]) - pose[2], seen % 7], axis=1)
+    found += rng.normal(0, (0.2, 0.05, 0.2), found.shape)
     found[:, 0] = np.clip(found[:, 0], 0.01, 20.0)
     clouds = {
         "tracking": pose + rng.normal(0, (0.3, 0.3, 0.1), (particles, 3)),
         "global": rng.uniform(-1, 1, (particles, 3)) * (side / 2, side / 2, np.pi),
     }
-    signatures = np.arange(count) % 7
-    full = np.column_stack([found, signatures[seen] + rng.normal(0, 0.2, len(seen))])
-    return Scene(gs.LandmarkMap(xy, signatures), full, seen, clouds)
+    return Scene(gs.LandmarkMap(xy, np.arange(count) % 7), found, seen, clouds)
 
 
-def calls_of(scene: Scene, what: str, cloud: str) -> tuple[Any, Any, np.ndarray]:
-    """What makes a model, what calls it, and (F, 2 or 3) features."""
+def calls_of(scene: Scene, what: str, cloud: str, features: int) -> tuple[Any, Any, int]:
+    """What makes a model, what calls it, and how many features it is given."""
     changes, options = WHAT[what]
-    parameters = gs.LandmarkParameters(**changes)
-    features, poses = scene.features[:, : 3 if parameters.sigma_signature else 2], scene.clouds[cloud]
-    if parameters.field_of_view == FIELD:
-        turned = np.arctan2(np.sin(features[:, 1]), np.cos(features[:, 1]))
-        features = features[np.abs(turned) < FIELD / 2]
-    features = features[:5] if what == "joint" else features
+    parameters, poses = gs.LandmarkParameters(**changes), scene.clouds[cloud]
+    bearing = scene.features[:, 1]
+    in_view = np.abs(np.arctan2(np.sin(bearing), np.cos(bearing))) < parameters.field_of_view / 2
+    chosen = np.flatnonzero(in_view)[: min(features, 5) if what == "joint" else features]
+    given = scene.features[chosen, : 3 if parameters.sigma_signature else 2]
+    known = scene.seen[chosen] if what == "known" else None
 
     def make(**own: Any) -> gs.LandmarkModel:
         return gs.LandmarkModel(scene.landmarks, parameters, **options, **own)
 
     def call(model: gs.LandmarkModel, count: int | None = None) -> np.ndarray:
         if what == "associate":
-            return model.associate(poses[:count], features)[1].sum(axis=1)
-        return model.log_likelihood(poses[:count], features, scene.seen if what == "known" else None)
+            return model.associate(poses[:count], given)[1].sum(axis=1)
+        return model.log_likelihood(poses[:count], given, known)
 
-    return make, call, features
+    return make, call, len(given)
 
 
 def row_of(backend: str, scene: Scene, what: str, cloud: str, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -102,7 +100,7 @@ def row_of(backend: str, scene: Scene, what: str, cloud: str, arguments: argpars
     Raises:
         RuntimeError: the error is above 16 eps (1 + |log p|), so no time counts.
     """
-    make, call, features = calls_of(scene, what, cloud)
+    make, call, count = calls_of(scene, what, cloud, arguments.features)
     device = Recorder(get_backend(backend))
     model = make(backend=device)
     start = time.perf_counter()
@@ -118,14 +116,14 @@ def row_of(backend: str, scene: Scene, what: str, cloud: str, arguments: argpars
     least, median = best(lambda: call(model), arguments.repeats, arguments.seconds)
     alone, _ = best(again, arguments.repeats, arguments.seconds)
     exact = call(make(backend="numpy", precision="float64"), CHECKED)
-    size = len(features) * np.finfo(np.float32).eps * (1 + np.abs(exact) / len(features))
+    size = count * np.finfo(np.float32).eps * (1 + np.abs(exact) / count)
     error = float(np.max(np.abs(found[:CHECKED] - exact) / size))
     if not error < 16:
         raise RuntimeError(f"{backend}, {what}: the error is {error:.3g} eps (1 + |log p|), so no time counts")
-    work = len(scene.clouds[cloud]) * len(features)
+    work = len(scene.clouds[cloud]) * count
     return {
         "backend": device.info.selection, "device": device.info.name, "landmarks": len(scene.landmarks),
-        "what": what, "cloud": cloud, "particles": len(scene.clouds[cloud]), "features": len(features),
+        "what": what, "cloud": cloud, "particles": len(scene.clouds[cloud]), "features": count,
         "first_s": first, "steady_s": least, "median_s": median, "rate": work / least, "launch_s": alone,
         "launch_rate": work / alone, "error": error,
     }  # fmt: skip
@@ -168,7 +166,7 @@ def main() -> int:
     rows = []
     for backend in arguments.backend or present:
         for count in arguments.landmarks or (20, 100, 10_000, 100_000):
-            scene = make_scene(count, arguments.features, arguments.particles, arguments.seed)
+            scene = make_scene(count, arguments.particles, arguments.seed)
             for cloud in arguments.cloud or scene.clouds:
                 rows += [row_of(backend, scene, what, cloud, arguments) for what in chosen]
     command, host = command_line("bench/landmarks.py"), machine(arguments.commit)

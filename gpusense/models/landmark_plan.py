@@ -65,7 +65,8 @@ def feature_omissions(
     if known:
         found.append(Omission("search", "correspondences are known", f"{count - 1} of {count} landmarks"))
     elif len(prepared.columns) and np.isfinite(prepared.radius).any():
-        spared = share(count - looked_at(prepared, buckets), count)
-        why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
-        found.append(Omission("far landmarks", why, f"about {spared} of {count} landmarks"))
+        spared = count - looked_at(prepared, buckets)
+        if spared >= 0.5:
+            why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
+            found.append(Omission("far landmarks", why, f"about {share(spared, count)} of {count} landmarks"))
     return found

@@ -9,8 +9,8 @@ that is told the landmarks, or not, with the parameters of the fit of its kind. 
 deviation) around the first logged pose. Two landmarks of the UTIAS data are exchanged in the published positions: they
 are left so, and for comparison put back as reported ("repaired"). Fits and filters use the same run.
 
-freiburg is simulated and has no true path, but nearly exact odometry: that is taken for the path, and the filter gets it
-with noise added. The LEGO robot's headings are made of the features themselves.
+freiburg is simulated and has no true path, but nearly exact odometry: that is taken for the path, and the filter gets
+it with noise added. The LEGO robot's headings are made of the features themselves.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from array_libraries import Array, installed
 from test_absolute import GRID, models, poses_around
-from test_device_arrays import copies, device, to_device  # noqa: F401
+from test_device_arrays import copies, device, each_framework, framework, to_device  # noqa: F401
 
 import gpusense as gs
 from gpusense.models import scan_model
@@ -108,6 +108,19 @@ def test_associations_of_poses_on_the_device(device):  # noqa: F811
     for found, expected in zip(there, here, strict=True):
         assert isinstance(found, np.ndarray)
         np.testing.assert_array_equal(found, expected)
+
+
+@each_framework
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_frameworks(sensor, name, needs):
+    cuda, there, back, _ = framework(name, needs)
+    call, given = calls(cuda)[sensor], there(POSES)
+    found = call(given)
+    assert type(found) is type(given) and differing(back(found), call(POSES)) == 0
+    bad = POSES.copy()
+    bad[5, 2] = np.inf
+    with pytest.raises(ValueError, match="poses: must be finite"):
+        call(there(bad))
 
 
 @pytest.mark.parametrize("name", SENSORS)

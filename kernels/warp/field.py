@@ -130,6 +130,7 @@ def make(name, flags):
     CUBES = "CUBES" in flags
     PER_BEAM = "PER_BEAM" in flags
     QUICK = "QUICK" in flags
+    SCANS = "SCANS" in flags
     ZERO, HALF = real(0.0), real(0.5)
     # A constant for loops that Warp shall unroll.
     WHOLE_BLOCK = 16
@@ -173,6 +174,8 @@ def make(name, flags):
         point: wp.array(dtype=vec2),
         point_low: wp.array(dtype=vec2),
         terms: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
+        fixed_of: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         rows: wp.int32,
@@ -182,6 +185,8 @@ def make(name, flags):
         guard: real,
         fixed: real,
         temperature: real,
+        per_scan: wp.int32,
+        ahead: wp.int32,
     ):
         n = wp.tid()
         if n >= particles:
@@ -191,15 +196,23 @@ def make(name, flags):
         from_low = vec4()
         if CAREFUL:
             from_low = pose_low[n]
-        total = vec2(fixed, ZERO)
+        begin = int(0)
+        size = readings
+        lead = fixed
+        if SCANS:
+            scan = (n + ahead) // per_scan
+            begin = start[scan]
+            size = start[scan + 1] - begin
+            lead = fixed_of[scan]
+        total = vec2(lead, ZERO)
         block = real(0.0)
         # A while loop shows the compiler that k is not negative; range would cost a tenth on processors.
         k = int(0)
-        while k < readings:
-            to = point[k]
+        while k < size:
+            to = point[begin + k]
             to_low = vec2()
             if CAREFUL:
-                to_low = point_low[k]
+                to_low = point_low[begin + k]
             term = reading_value(table, origin, from_pose, from_low, to, to_low, terms, rows, cols, guard)
             if PER_BEAM:
                 parts[n * readings + k] = term
@@ -218,7 +231,7 @@ def make(name, flags):
             log_p[n] = temperature * (total.x + total.y)
 
     # For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-    # parts[n * across + block * along]. Each block has its own guard.
+    # parts[n * across + block * along]. Each block has its own guard; of several scans each has as many as the longest.
     @kernel
     def field_blocks(
         table: wp.array(dtype=real),
@@ -229,6 +242,7 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2),
         terms: wp.array(dtype=real),
         guard: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
         parts: wp.array(dtype=real),
         rows: wp.int32,
         cols: wp.int32,
@@ -237,6 +251,7 @@ def make(name, flags):
         across: wp.int32,
         along: wp.int32,
         spread: wp.int32,
+        per_scan: wp.int32,
     ):
         item = wp.tid()
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
@@ -248,16 +263,24 @@ def make(name, flags):
         if CAREFUL:
             low = pose_low[n]
         lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+        before = int(0)
+        size = readings
+        guards = int(0)
+        if SCANS:
+            scan = n // per_scan
+            before = start[scan]
+            size = start[scan + 1] - before
+            guards = scan * ((readings + BLOCK_TERMS - 1) // BLOCK_TERMS)
         block = (item // GROUP) & ((1 << spread) - 1)
-        while block * BLOCK_TERMS < readings:
-            begin = block * BLOCK_TERMS
-            end = wp.min(begin + BLOCK_TERMS, readings)
+        while block * BLOCK_TERMS < size:
+            begin = before + block * BLOCK_TERMS
+            end = wp.min(begin + BLOCK_TERMS, before + size)
             total = real(0.0)
-            own_guard = guard[block]
+            own_guard = guard[guards + block]
             if QUICK:
                 sure = HALF - own_guard
                 worst = real(0.0)
-                if begin + BLOCK_TERMS <= readings:
+                if begin + BLOCK_TERMS <= end:
                     for i in range(WHOLE_BLOCK):
                         cell, off = rounded_cell(lowered, point[begin + i])
                         worst = wp.max(worst, off)

@@ -313,20 +313,21 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_position": _kernel(
         "absolute", "particle", "real4 place [particles]", "real terms [9]", "out real log_p [particles]",
-        "int particles",
+        "int particles", "real temperature",
     ),
     "score_heading": _kernel(
         "absolute", "particle", "real2 residual [particles]", "real terms [12]", "out real log_p [particles]",
-        "int particles", "int kind",
+        "int particles", "int kind", "real temperature",
     ),
     "score_beacons": _kernel(
         "beacons", "particle", "real4 place [particles]", "real beacon [6 * beacons]", "real terms [13]",
         "real series [count]", "out real log_p [particles]", "int particles", "int beacons", "int count", "int kind",
+        "real temperature",
     ),
     "score_contact": _kernel(
         "contact", "particle", "int table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [points]", "real2 point_low [points]", "int start [segments + 1]", "int pressed [segments]",
         "real terms [10]", "out real log_p [particles]", "int rows", "int cols", "int particles", "int segments",
-        "real guard",
+        "real guard", "real temperature",
     ),
 }  # fmt: skip

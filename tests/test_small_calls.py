@@ -104,7 +104,7 @@ def gathering(needs, monkeypatch):
     monkeypatch.setattr(device, "_gathers", True)
     monkeypatch.setattr(device, "_graphs", Graphs(device._device))
     started, launch = [], wp.capture_launch
-    monkeypatch.setattr(wp, "capture_launch", lambda graph: started.append(launch(graph)))
+    monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
     return device, started
 
 

@@ -130,7 +130,5 @@ def test_what_is_fixed_is_a_row_of_parts(precision: type, device: Backend) -> No
     for one, rows in itertools.product((get_backend("numpy"), device), (1, 16)):
         parts = np.full(100 * 18, 77, precision)
         found = run(one, "fill_fixed", scene_flags(precision), (100,), fixed, parts, 100, rows)["parts"]
-        assert (
-            (found[:100] == -3.5).all() and (found[100 * rows :] == 77).all()
+        assert (found[:100] == -3.5).all() and (found[100 * rows :] == 77).all()
         assert (found[100 : 100 * rows] == 0).all()
-        )

@@ -232,13 +232,16 @@ class Repeated:
         # Whether they were started, each on its own, which loads what a graph must not wait for.
         self._begun = False
         self._streams: dict[int, wp.Stream] = {}
-        # The streams on which they were started since the last wait; None for the device's own.
+        # The streams on which they were started since the last wait; the processor has none.
         self._used: set[wp.Stream | None] = set()
         self._lock = threading.Lock()
 
     def __call__(self, stream: Any = None) -> None:
         """See Replay.__call__."""
-        where = None if stream is None else self._stream(stream)
+        if stream is None:
+            where = self._device.stream if self._device.is_cuda else None
+        else:
+            where = self._stream(stream)
         # A graph must not be started by two threads at once.
         with self._lock:
             self._used.add(where)
@@ -253,10 +256,10 @@ class Repeated:
 
     def wait(self) -> None:
         """See Replay.wait."""
-        if self._device.is_cuda:
-            for stream in self._used | {None}:
-                wp.synchronize_stream(self._device if stream is None else stream)
-        self._used.clear()
+        used, self._used = self._used, set()
+        for stream in used:
+            if stream is not None:
+                wp.synchronize_stream(stream)
 
     def _stream(self, given: Any) -> wp.Stream:
         """A stream of any library as Warp knows it."""

@@ -6,7 +6,10 @@
 Times are of whole calls of ``log_likelihood``: NumPy arrays in and out, and poses and result on the device where it has
 arrays (Warp's CUDA); for several scans in one call see ``several_scans.py``. Each is taken beside the plain way (copies
 by commands, each launch started on its own), in turns, so that their ratio holds on a busy machine; results of both
-must have the same bits. "Kernels" are the launches of a call, started one after another with everything on the device.
+must have the same bits. Bound calls (``bind``) are taken beside ``log_likelihood`` with the same arrays, with a wait
+after each call and after many: poses, readings and result are on the device where it has arrays, and in host memory
+elsewhere, where a bound call is the ordinary one. "Kernels" are the launches of an ordinary call, started one after the
+other with everything on the device.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ from gpusense.worlds import building, cloud_around, free_pose, simulate_scan
 MODELS = {"field": gs.LikelihoodFieldModel, "beam model": gs.BeamModel}
 # What takes the number of a call.
 Call = Callable[[int], Any]
+# How the other way is gone.
+Way = Callable[[], contextlib.AbstractContextManager[None]]
 # Calls of one way before the other has its turn.
 TURN = 20
 # Calls whose results are compared.
@@ -50,17 +55,17 @@ def plainly(device: Any) -> Iterator[None]:
             setattr(device, name, value)
 
 
-def in_turns(device: Any, short: Call, plain: Call, calls: int) -> tuple[list[float], list[float]]:
-    """Seconds of calls of the short and of the plain way."""
+def in_turns(short: Call, plain: Call, calls: int, way: Way, each: int) -> tuple[list[float], list[float]]:
+    """Seconds of one of each calls of the short and of the other way."""
     times: tuple[list[float], list[float]] = ([], [])
     while len(times[0]) < calls:
-        for run, found, way in ((short, times[0], contextlib.nullcontext()), (plain, times[1], plainly(device))):
-            with way:
+        for run, found, how in ((short, times[0], contextlib.nullcontext()), (plain, times[1], way())):
+            with how:
                 run(0)
                 for i in range(min(TURN, calls)):
                     start = time.perf_counter()
                     run(i)
-                    found.append(time.perf_counter() - start)
+                    found.append((time.perf_counter() - start) / each)
     return times
 
 
@@ -93,14 +98,17 @@ class Bench:
             count: cloud_around(self.pose, count, 0.1, 0.1, rng).astype(np.float64) for count in arguments.particles
         }
 
-    def add(self, what: str, short: Call, plain: Call, kernels: float, calls: int) -> None:
-        """A row of a call in two ways."""
-        with plainly(self.device):
+    def add(
+        self, what: str, short: Call, plain: Call, kernels: float, calls: int, way: Way | None = None, each: int = 1
+    ) -> None:
+        """A row of a call in two ways, the other of which is the plain one unless one is given."""
+        way = functools.partial(plainly, self.device) if way is None else way
+        with way():
             expected = [read(plain(i)) for i in range(CHECKED)]
         # Three rounds: the first calls are not what the others are, since what is kept of a call is kept then.
         found = [read(short(i)) for _ in range(3) for i in range(CHECKED)]
         bits = sum(int(np.count_nonzero(one != other)) for one, other in zip(found, 3 * expected, strict=True))
-        times, plain_times = in_turns(self.device, short, plain, calls)
+        times, plain_times = in_turns(short, plain, calls, way, each)
         row = {
             "backend": self.device.info.selection, "device": self.device.info.name, "what": what, "calls": len(times),
             "median_s": float(np.median(times)), "most_s": float(np.quantile(times, 0.9)), "least_s": min(times),
@@ -142,7 +150,7 @@ class Bench:
                     self.add(
                         f"{size}, NumPy in and out{what}", call, functools.partial(call, one=plain), kernels, calls
                     )
-                    if not self.device.info.selection.startswith("warp:cuda"):
+                    if not self.cuda:
                         continue
                     there = on_device(self.device, poses)
                     out = on_device(self.device, np.zeros(count, np.float32))
@@ -153,10 +161,40 @@ class Bench:
                     self.add(f"{size}, on the device, out={what}", into, into, kernels, calls)
                     call_there = functools.partial(call, poses=there)
                     self.add(f"{size}, on the device{what}", call_there, call_there, kernels, calls)
+                self.bound(f"{size}, bound", model, poses, kernels)
         graphs = getattr(self.device, "_graphs", None)
         if graphs is not None and self.device._gathers:
             refused = ", and the driver refused one" if graphs.failed else ""
             print(f"{self.device.info.selection}: {len(graphs._graphs)} graphs are kept{refused}", file=sys.stderr)
+
+    @property
+    def cuda(self) -> bool:
+        """Whether the device has arrays of its own."""
+        return self.device.info.selection.startswith("warp:cuda")
+
+    def bound(self, what: str, model: Any, poses: np.ndarray, kernels: float) -> None:
+        """A bound call against an ordinary one with the same arrays, of which the readings come from the host."""
+        result, scan, calls = np.zeros(len(poses), np.float32), self.scans[0], self.arguments.calls
+        there = functools.partial(on_device, self.device) if self.cuda else np.array
+        given, own, other = there(poses), there(result), there(result)
+        call = model.bind(given, there(scan), out=own)
+
+        def repeated(_: int, count: int) -> Any:
+            for _ in range(count):
+                call()
+            call.check()
+            return call.out
+
+        def ordinary(_: int, count: int) -> Any:
+            for _ in range(count):
+                model.log_likelihood(given, scan, out=other)
+            return other
+
+        for count, words in ((1, "a wait each"), (TURN, f"{TURN} calls a wait")):
+            self.add(
+                f"{what}, {words}", functools.partial(repeated, count=count), functools.partial(ordinary, count=count),
+                kernels, max(calls // count, 3), contextlib.nullcontext, count,
+            )  # fmt: skip
 
 
 def read(array: Any) -> np.ndarray:

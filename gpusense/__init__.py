@@ -14,6 +14,7 @@ from gpusense._version import __version__
 
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
+    from gpusense.bound import BoundCall
     from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
     from gpusense.grid import OccupancyGrid
     from gpusense.landmarks import LandmarkMap
@@ -50,6 +51,7 @@ _HOME = {
     "BeamFit": "gpusense.learning.result",
     "BeamModel": "gpusense.models.beam",
     "BeamParameters": "gpusense.parameters",
+    "BoundCall": "gpusense.bound",
     "BumperModel": "gpusense.models.bumper",
     "BumperParameters": "gpusense.sensor_parameters",
     "CasterMethod": "gpusense.models.caster",
@@ -103,6 +105,7 @@ __all__ = [
     "BeamFit",
     "BeamModel",
     "BeamParameters",
+    "BoundCall",
     "BumperModel",
     "BumperParameters",
     "CasterMethod",

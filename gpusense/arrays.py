@@ -130,6 +130,25 @@ def adopt_poses(array: object, backend: Backend, name: str, several: bool = Fals
     return flat, count, found.dtype == wp.float32, found
 
 
+def adopt_readings(array: object, backend: Backend, beams: int) -> Buffer:
+    """(K,) ranges on the device as a flat buffer; what owns the memory is kept by it.
+
+    Raises:
+        TypeError: not float32 or float64, or not on the backend's device.
+        ValueError: another shape, or not C-contiguous.
+    """
+    import warp as wp
+
+    found = _adopt(array, backend, "ranges")
+    if tuple(found.shape) != (beams,):
+        raise ValueError(f"ranges: shape must be ({beams},), got {shape_text(found.shape)}")
+    if found.dtype not in (wp.float32, wp.float64):
+        raise TypeError(f"ranges: must hold float32 or float64, got {found.dtype.__name__}")
+    if not found.is_contiguous:
+        raise ValueError(f"ranges: must be C-contiguous on the device, got strides {found.strides}")
+    return found
+
+
 def blank(backend: Backend, count: int, real: np.dtype) -> Buffer:
     """A buffer for a result of exactly so many numbers, or none."""
     buffer = backend.empty(count, real)

@@ -2,7 +2,7 @@
 
 A kernel has three bodies (NumPy reference, OpenCL, Warp) with the same name and the same arguments; a test holds the
 three to this table. ``real`` stands for the precision of a model, float32 or float64; ``double`` is always float64, and
-``coordinate`` is float64, or float32 with POSES_FLOAT32.
+``coordinate`` is float64, or float32 with POSES_FLOAT32 (poses) or RANGES_FLOAT32 (readings).
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ FLAGS = {
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
     "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "RANGES_FLOAT32": "readings on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "END_POINTS": "readings on the device become end points of beams, not rays with ranges",
     "RANGE": "some feature has a range",
     "BEARING": "some feature has a bearing",
     "SIGNATURE": "some feature has a signature",
@@ -215,6 +217,16 @@ KERNELS: dict[str, Kernel] = {
         "out real4 pose [particles]", "out real4 pose_low [particles]", "out int verdict [2]", "double origin_x",
         "double origin_y", "double resolution", "double mount_x", "double mount_y", "double yaw_cos", "double yaw_sin",
         "int first_col", "int first_row", *_MAP, "int particles",
+    ),
+    "place_readings": _kernel(
+        "scan", "block", "coordinate ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
+        "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
+        "out real guard [blocks]", "out real fixed [1]", "int beams", "int each", "int places", "int chosen",
+        "int max_readings", "int possible", "double nearest", "double farthest", "double log_max", "double resolution",
+        "double top", "double guard_scale",
+    ),
+    "fill_fixed": _kernel(
+        "scan", "particle", "real fixed [1]", "out real parts [particles * rows]", "int particles", "int rows",
     ),
     "cast_ranges": _kernel(
         "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,

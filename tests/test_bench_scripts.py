@@ -178,7 +178,8 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
     report = run_script("small_calls.py", "--backend", needs(selection), "--size", "20", *arguments, output=output)
     names = [row["what"] for row in report["rows"]]
     assert {"field, 50 x 12, NumPy in and out", "beam model, 90 x 12, NumPy in and out"} <= set(names)
-    assert len(names) == 8 and all(row["differing_bits"] == 0 for row in report["rows"])
+    assert {"field, 50 x 12, bound, a wait each", "beam model, 90 x 12, bound, 20 calls a wait"} <= set(names)
+    assert len(names) == 16 and all(row["differing_bits"] == 0 for row in report["rows"])
     assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])
 
 

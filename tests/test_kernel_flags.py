@@ -41,6 +41,8 @@ TRACES = [
     ("place_poses", "CAREFUL", (), r"\bpose_low\[", r"array_store\(var_pose_low\b"),
     ("place_poses", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32>"),
     ("place_poses", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
+    ("place_readings", "RANGES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32> var_ranges"),
+    ("place_readings", "END_POINTS", (), r"\bguard_scale \*", r"array_store\(var_guard\b"),
     ("cast_ranges", "SECTORS_2", (), r"define SECTORS 2$", r"var_speed_y > var_speed_x"),
     ("cast_ranges", "SECTORS_4", (), r"\b2\.4142136\b", r"\b2\.41421"),
     ("cast_tiles", "ORDERED", (), r"\border\[", r"address\(var_order\b"),

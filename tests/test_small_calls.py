@@ -86,6 +86,105 @@ def test_shared_memory_that_is_not_to_be_had(two_ways):
         _Shared(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
 
 
+# ---- GPUs through OpenCL: copies that are gathered; a processor stands in for one
+
+
+@pytest.fixture
+def far(two_ways):
+    """A backend whose copies are gathered, as a GPU."""
+    device = two_ways[1]
+    assert device._gathers and not two_ways[0]._gathers
+    device.info = dataclasses.replace(device.info, kind="gpu", lanes=1)
+    return device
+
+
+def ungathered(device, monkeypatch, run):
+    """A result of copies that are commands of their own."""
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "_gathers", False)
+        return run()
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_gathered_copies_change_no_bit(kind, far, monkeypatch):
+    model = kind(GRID, SCANNER, backend=far)
+    for seed, count, readings in ((1, COUNT, BEAMS), (2, 40, 20), (3, 700, BEAMS), (1, COUNT, BEAMS)):
+        poses, ranges = cloud(seed, count), scan(seed, readings)
+        expected = ungathered(far, monkeypatch, lambda p=poses, z=ranges: model.log_likelihood(p, z))
+        assert differing(model.log_likelihood(poses, ranges), expected) == 0
+        expected = ungathered(far, monkeypatch, lambda p=poses, z=ranges: model.log_likelihood(p, z, per_beam=True))
+        found = model.log_likelihood(poses, ranges, per_beam=True)
+        assert differing(found[0], expected[0]) == 0 and differing(found[1], expected[1]) == 0
+
+
+@pytest.mark.parametrize("largest", [256 << 10, 1000, 0])
+@pytest.mark.parametrize("memory", [4 << 20, 6000])
+def test_scans_pieces_and_large_arrays_of_a_far_device(memory, largest, far, monkeypatch):
+    """Buffers serve one piece after the other, so that an order lost would show; what has no room is copied at once."""
+    from gpusense.backends import _opencl_copies
+
+    monkeypatch.setattr(_opencl_copies, "_MEMORY", memory)
+    monkeypatch.setattr(_opencl_copies, "_LARGEST", largest)
+    monkeypatch.setattr(scan_model, "CHUNK", 77)
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=far)
+    poses, scans = np.stack([cloud(1), cloud(2), cloud(3)]), np.stack([scan(1), scan(2), scan(3)])
+    expected = ungathered(far, monkeypatch, lambda: model.log_likelihood(poses, scans))
+    for _ in range(3):
+        assert differing(model.log_likelihood(poses, scans), expected) == 0
+    caster = gs.RayCaster(GRID, RANGE, backend=far)
+    expected = ungathered(far, monkeypatch, lambda: caster.cast(cloud(3), SCANNER.bearings))
+    assert differing(caster.cast(cloud(3), SCANNER.bearings), expected) == 0
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_call_of_a_far_device_is_one_write_and_one_read_that_waits(kind, far, monkeypatch):
+    import pyopencl as cl
+
+    model = kind(GRID, SCANNER, backend=far)
+    model.log_likelihood(cloud(1), scan(1))
+    copies, copy = [], cl.enqueue_copy
+
+    def counted(queue, to, source, **options):
+        copies.append(("read" if isinstance(to, np.ndarray) else "write", options["is_blocking"]))
+        return copy(queue, to, source, **options)
+
+    monkeypatch.setattr(cl, "enqueue_copy", counted)
+    model.log_likelihood(cloud(2), scan(2))
+    assert copies == [("write", False), ("read", True)]
+    # No event is kept, nor any array of the call.
+    (staging,) = far._stagings._free
+    assert far._copies == staging._events == staging._results == []
+
+
+def test_a_call_of_a_far_device_that_fails_leaves_nothing_behind(far, monkeypatch):
+    model = gs.BeamModel(GRID, SCANNER, backend=far)
+    expected = model.log_likelihood(cloud(1), scan(1))
+    out = np.full(COUNT, 7, np.float32)
+    with monkeypatch.context() as patch:
+        patch.setattr(scan_model, "finish", lambda *arguments: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            model.log_likelihood(cloud(2), scan(1), out=out)
+    assert far._stagings.own() is None
+    assert differing(model.log_likelihood(cloud(1), scan(1)), expected) == 0
+    assert (out == 7).all()
+
+
+def test_threads_of_a_far_device_have_copies_of_their_own(far):
+    models = [gs.LikelihoodFieldModel(GRID, SCANNER, backend=far) for _ in range(3)]
+    expected = [models[0].log_likelihood(cloud(i), scan(i)) for i in range(3)]
+    same: list[bool] = []
+
+    def work(i: int) -> None:
+        same.extend(differing(models[i].log_likelihood(cloud(i), scan(i)), expected[i]) == 0 for _ in range(20))
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(same) == 60 and all(same) and len(far._stagings._free) <= 3
+
+
 # ---- CUDA: launches and copies that are gathered, and graphs; Warp's processor stands in for a GPU
 
 
@@ -104,7 +203,7 @@ def gathering(needs, monkeypatch):
     monkeypatch.setattr(device, "_gathers", True)
     monkeypatch.setattr(device, "_graphs", Graphs(device._device))
     started, launch = [], wp.capture_launch
-    monkeypatch.setattr(wp, "capture_launch", lambda graph: started.append(launch(graph)))
+    monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
     return device, started
 
 

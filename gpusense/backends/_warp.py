@@ -11,7 +11,7 @@ import functools
 import os
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from gpusense._kernel_files import warp_module
 from gpusense.backends._numpy import _memory
 from gpusense.backends._warp_launch import SCALARS, Launch, LaunchStep, host_view
 from gpusense.backends._warp_pieces import shared
-from gpusense.backends._warp_queue import Graphs, Group, Queue
+from gpusense.backends._warp_queue import Graphs, Group, Queue, Recording, Repeated, Step
 from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import cache_folder
 from gpusense.signatures import KERNELS, Kernel
@@ -183,7 +183,7 @@ class WarpBackend(ProcessBound):
         return None if queue is None else (queue.started, len(queue.steps))
 
     def kept(self, mark: object) -> object | None:
-        """See Gathering.kept."""
+        """See Repeating.kept."""
         queue = self.gathering()
         assert queue is not None and isinstance(mark, tuple)
         started, first = mark
@@ -195,14 +195,27 @@ class WarpBackend(ProcessBound):
         return group
 
     def repeat(self, kept: object) -> None:
-        """See Gathering.repeat."""
+        """See Repeating.repeat."""
         queue = self.gathering()
         assert queue is not None and isinstance(kept, Group)
         queue.steps.append(kept)
 
     def address(self, buffer: wp.array) -> int:
-        """See Gathering.address."""
+        """See Repeating.address."""
         return int(buffer.ptr or 0)
+
+    def record(self, run: Callable[[], None]) -> Repeated:
+        """See Repeating.record."""
+        before, recording = self.gathering(), Recording()
+        self._thread.queue = recording
+        try:
+            run()
+        finally:
+            self._thread.queue = before
+        steps: list[Step] = [step.alone() for step in recording.steps if isinstance(step, LaunchStep)]
+        if recording.started or len(steps) < len(recording.steps):
+            raise RuntimeError("only launches can be recorded")
+        return Repeated(self._device, self._graphs, steps)
 
     def gathering(self) -> Queue | None:
         """What this thread gathers in, if it does."""

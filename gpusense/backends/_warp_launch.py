@@ -99,7 +99,8 @@ class LaunchStep:
 
 def slice_of(buffer: wp.array, begin: int, count: int) -> wp.array:
     """Numbers of a buffer, without a copy; the caller keeps it alive."""
-    start = buffer.ptr + begin * wp.types.type_size_in_bytes(buffer.dtype)
+    # An array of nothing has no address.
+    start = (buffer.ptr or 0) + begin * wp.types.type_size_in_bytes(buffer.dtype)
     return wp.array(ptr=start, dtype=buffer.dtype, shape=(count,), device=buffer.device)
 
 

@@ -135,6 +135,23 @@ class Queue:
         return found
 
 
+class Recording(Queue):
+    """Launches that are to be kept, and not to be started now."""
+
+    def __init__(self) -> None:
+        # Without the memory for copies, of which there are none.
+        self.steps: list[Step] = []
+        self.started = 0
+
+    def upload(self, array: np.ndarray, out: wp.array) -> bool:
+        """Refuse."""
+        return False
+
+    def download(self, buffer: wp.array, out: np.ndarray) -> bool:
+        """Refuse."""
+        return False
+
+
 class Graphs:
     """Graphs of what was done more than once."""
 
@@ -168,6 +185,13 @@ class Graphs:
                 return
         _start_each(steps, None)
 
+    def recorded(self, steps: list[Step]) -> Any:
+        """A graph of steps for whoever keeps it; None where there can be none now."""
+        if self.failed or len(steps) < 2:
+            return None
+        with self._lock:
+            return self._record(steps)
+
     def _room(self) -> bool:
         """Whether another graph may be kept."""
         if len(self._graphs) < _MOST_GRAPHS:
@@ -197,6 +221,59 @@ class Graphs:
             self.failed = True
             return None
         return graph
+
+
+class Repeated:
+    """Launches that are started again and again; see Replay. They are a graph as soon as there can be one."""
+
+    def __init__(self, device: wp.Device, graphs: Graphs, steps: list[Step]) -> None:
+        self._device, self._graphs, self._steps = device, graphs, steps
+        self._graph: Any = None
+        # Whether they were started, each on its own, which loads what a graph must not wait for.
+        self._begun = False
+        self._streams: dict[int, wp.Stream] = {}
+        # The streams on which they were started since the last wait; the processor has none.
+        self._used: set[wp.Stream | None] = set()
+        self._lock = threading.Lock()
+
+    def __call__(self, stream: Any = None) -> None:
+        """See Replay.__call__."""
+        if stream is None:
+            where = self._device.stream if self._device.is_cuda else None
+        else:
+            where = self._stream(stream)
+        # A graph must not be started by two threads at once.
+        with self._lock:
+            self._used.add(where)
+            graph = self._graph
+            if graph is None and self._begun:
+                graph = self._graph = self._graphs.recorded(self._steps)
+            if graph is None:
+                self._begun = True
+                _start_each(self._steps, where)
+            else:
+                wp.capture_launch(graph, where)
+
+    def wait(self) -> None:
+        """See Replay.wait."""
+        used, self._used = self._used, set()
+        for stream in used:
+            if stream is not None:
+                wp.synchronize_stream(stream)
+
+    def _stream(self, given: Any) -> wp.Stream:
+        """A stream of any library as Warp knows it."""
+        if isinstance(given, wp.Stream):
+            return given
+        address = given
+        for name in ("cuda_stream", "ptr"):
+            address = getattr(given, name, address)
+        if not isinstance(address, int) or not self._device.is_cuda:
+            raise TypeError(f"stream: must be a stream of {self._device}, got {given!r}")
+        found = self._streams.get(address)
+        if found is None:
+            found = self._streams[address] = wp.Stream(self._device, cuda_stream=address)
+        return found
 
 
 def _start_each(steps: list[Step], stream: wp.Stream | None) -> None:

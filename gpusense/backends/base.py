@@ -7,6 +7,7 @@ it; models only pass buffers on. Kernels are asked for by name and flags, and ar
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -70,6 +71,16 @@ class Launcher(Protocol):
         """Start one launch; buffers and scalars in the order of the signature table."""
 
 
+class Replay(Protocol):
+    """Launches that are started again and again, with the same memory and numbers."""
+
+    def __call__(self, stream: Any = None) -> None:
+        """Start them on a stream of the device, or on its current one."""
+
+    def wait(self) -> None:
+        """Wait until all that was started has ended."""
+
+
 class Gathering(Protocol):
     """What a backend may have besides, where to start things takes longer than small ones last."""
 
@@ -86,7 +97,11 @@ class Gathering(Protocol):
         """Start what still waits, and gather no more."""
 
     def mark(self) -> object | None:
-        """Where in what this thread gathers it is now; None where it does not."""
+        """Where in what this thread gathers it is now; None where it does not, or nothing could be repeated."""
+
+
+class Repeating(Gathering, Protocol):
+    """A backend that gathers and can repeat what it gathered."""
 
     def kept(self, mark: object) -> object | None:
         """The launches since a mark, to be repeated; None if there was anything else. It keeps no buffer alive."""
@@ -96,6 +111,9 @@ class Gathering(Protocol):
 
     def address(self, buffer: Buffer) -> int:
         """Where a buffer lies."""
+
+    def record(self, run: Callable[[], None]) -> Replay:
+        """The launches of ``run``, which starts nothing else, kept and not started. They keep no buffer alive."""
 
 
 class Backend(Protocol):

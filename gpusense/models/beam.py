@@ -13,8 +13,9 @@ from gpusense import _checks, casters
 from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
-from gpusense.cloud import LEAST_ORDERED, Cloud, all_within, ordered, tiles_of
+from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, tiles_of
 from gpusense.cones import cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
@@ -26,6 +27,7 @@ from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_lin
 from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
@@ -425,6 +427,30 @@ class BeamModel(ScanModel):
             return parts
 
         return launch
+
+    def _bound_scene(self) -> Scene:
+        # A range below range_max that is rounded to it is still a range, and no max reading to a table.
+        top = float(np.nextafter(self._real.type(self.scanner.range_max), self._real.type(0)))
+        vectors = self._vectors[:, None] if self._cones.rays == 1 else self._cone_vectors
+        return Scene(self._caster.map, vectors, top=top if self._cells else math.inf)
+
+    def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
+        normals, kinds = self._caster.normals(region, self._cones.flags), len(self._kinds)
+        flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
+        # Where no range is possible at all there are none, but the code must say something of them.
+        flags |= {"ALL_READINGS", "ORIGINS_OUTSIDE"} | (frozenset() if self._components else {"RAND", "SINGLE"})
+        world = (*self._cones.scalars, *self._caster.scalars, self._cells, self._cells / self.scanner.range_max)
+        world += (self._caster.limit, self.grid.resolution, self.scanner.range_max)
+
+        def score(placed: Placed, headings: frozenset[str], count: int, scan: PlacedScan, parts: Buffer) -> None:
+            tiles, spread = tiles_of(count, scan.places)
+            self._backend.compile("beam_tiles", frozenset(flags | headings))(
+                (tiles,), table, normals, placed.cell, placed.pose, self._none, scan.point, self._one_each,
+                scan.reading, self._terms_there, self._edges, self._sensor, self._none, parts, region.rows, region.cols,
+                count, scan.places, scan.places, kinds, *world, 1, count, spread, count,
+            )  # fmt: skip
+
+        return score
 
 
 def _check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:

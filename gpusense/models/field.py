@@ -11,7 +11,8 @@ from gpusense import _checks
 from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
-from gpusense.cloud import Cloud, all_within, spread_of
+from gpusense.bound import PlacedScan, Scene, Scorer
+from gpusense.cloud import Cloud, Placed, all_within, spread_of
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
@@ -22,6 +23,7 @@ from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_lin
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions
 from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
@@ -281,3 +283,21 @@ class LikelihoodFieldModel(ScanModel):
         padded = np.zeros((len(counts), blocks * BLOCK_TERMS))
         padded[np.arange(padded.shape[1]) < counts[:, None]] = lengths
         return padded.reshape(len(counts), blocks, BLOCK_TERMS).max(axis=2)
+
+    def _bound_scene(self) -> Scene:
+        careful = "CAREFUL" in self._flags
+        return Scene(self._map, self._vectors[:, None], guard_scale=self._guard, careful=careful)
+
+    def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
+        # Missing readings have no place in the map, so cells are not found by rounding alone.
+        blocks = self._backend.compile("field_blocks", self._flags | {"ALL_READINGS"})
+
+        def score(placed: Placed, headings: frozenset[str], count: int, scan: PlacedScan, parts: Buffer) -> None:
+            spread = spread_of(count, -(-scan.places // BLOCK_TERMS))
+            blocks(
+                ((-(-count // _GROUP) << spread) * _GROUP,), table, placed.cell, placed.pose, placed.low, scan.point,
+                scan.low, self._terms_there, scan.guard, self._none, parts, region.rows, region.cols, count,
+                scan.places, 1, count, spread, count,
+            )  # fmt: skip
+
+        return score

@@ -50,6 +50,8 @@ class ReachableMap:
         self._table: Buffer = None
         self.region: Region | None = None
         self.preparations = 0
+        # Grows whenever the map changes or the table is made anew.
+        self.version = 0
 
     def ensure(self, corners: Corners | None) -> tuple[Buffer, Region]:
         """The table and its window, made anew if poses within these corners can reach beyond it; None may be anywhere.
@@ -69,6 +71,7 @@ class ReachableMap:
                 raise TableMemoryError(*error.args) from error
             self.region = wanted
             self.preparations += 1
+            self.version += 1
         assert self.region is not None
         return self._table, self.region
 
@@ -86,6 +89,7 @@ class ReachableMap:
         patch = OccupancyGrid(cells, occupied_threshold=grid.occupied_threshold)  # type: ignore[arg-type]
         obstacles = patch.obstacles("occupied" if self._unknown == "occupied" else "free")
         self._grid, part = grid, Region(row, col, *patch.shape)
+        self.version += 1
         changed = region.box(part.cut(self.obstacles) != obstacles)
         if changed is None:
             return grid

@@ -13,6 +13,7 @@ from gpusense import _checks
 from gpusense import compat as compat_module
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
+from gpusense.bound import BoundCall, Scene, Scorer, bind
 from gpusense.cloud import Cloud, finish
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
@@ -258,6 +259,29 @@ class ScanModel(ABC):
             if not call.single:
                 self._workspace.start()
 
+    def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
+        """A call of ``log_likelihood`` with arrays that stay where they are, for filters that repeat it.
+
+        Every call reads what the arrays hold then, and writes ``out``. Where poses and ranges are on the model's device
+        (``warp:cuda``), a call is one start of a CUDA graph: it checks nothing, allocates nothing, copies nothing and
+        does not wait; ``check`` waits, and says whether a pose was not finite. Everywhere else it is the ordinary call,
+        so that the same program runs on every backend.
+
+        Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
+        repeat or, with a temperature below 1, no range depends on the pose: these agree to rounding.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
+            ranges: (K,) readings [m]; on the device float32 or float64 and C-contiguous.
+            out: (N,) where to write the log-likelihoods, as ``log_likelihood`` takes it.
+
+        Raises:
+            TypeError: not an array, one of numbers that cannot change, or on a device that the backend cannot read.
+            ValueError: a wrong shape.
+            MemoryError: the device cannot hold the map's table, or what a call needs.
+        """
+        return bind(self, poses, ranges, out)
+
     @abstractmethod
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
@@ -363,6 +387,19 @@ class ScanModel(ABC):
     @abstractmethod
     def _prepare_launch(self, scan: PreparedScan) -> Callable[[Cloud, tuple[int, int], Buffer, bool], Buffer]:
         """What starts to score poses begin to end - 1 of a cloud into a buffer, and returns that of (n, M) parts."""
+
+    @abstractmethod
+    def _bound_scene(self) -> Scene:
+        """What bound calls are made of."""
+
+    @abstractmethod
+    def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
+        """What starts to find what readings that are on the device add, with the table of the whole map."""
+
+    def _bound_chunk(self, readings: int) -> int:
+        """Particles of one launch of a bound call."""
+        kept = self._real.itemsize * self._kept_parts
+        return chunk_of(self._backend, max(readings, 1) * self._rays_each, kept)
 
     def _peer_note(self) -> str:
         return "" if self._peer is None else f" with the weights of {self.compat} (no likelihood)"

@@ -1,0 +1,279 @@
+"""Calls whose arrays stay where they are: bound once, repeated with one start and nothing looked at again.
+
+What a call of few particles takes beside its kernels is what the host does: checks, the scan's preparation, a start for
+each launch. Where poses and readings are on the device, all of that is done once: readings are classed and placed there
+by the kernel file ``scan``, and the launches become a CUDA graph (``Repeating.record``).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from gpusense import _checks, arrays
+from gpusense.backends.base import Buffer, Repeating
+from gpusense.cloud import Cloud, Placed, finish
+from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
+from gpusense.region import Region
+from gpusense.workspace import Workspace
+
+if TYPE_CHECKING:
+    from gpusense.models.reachable import ReachableMap
+    from gpusense.models.scan_model import ScanModel
+
+_INT = np.dtype(np.int32)
+
+
+class BoundCall(ABC):
+    """A call of ``log_likelihood`` with arrays that stay in their place; ``bind`` of a model makes it.
+
+    Attributes:
+        out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.
+        waits: Whether a call takes the ordinary way, and has ended when it returns.
+    """
+
+    out: Any
+    waits: bool
+
+    @abstractmethod
+    def __call__(self, stream: Any = None) -> Any:
+        """Score what the arrays hold now.
+
+        Args:
+            stream: A stream of the GPU on which to work: of PyTorch, CuPy or Warp, or its address. None for Warp's
+                current stream of the device. Only for calls that do not wait.
+
+        Returns:
+            ``out``; where ``waits`` is False, the device may yet be about to write it.
+
+        Raises:
+            TypeError: a stream that is none, or for a call that waits.
+            TypeError, ValueError: of a call that waits, what ``log_likelihood`` says of the arrays.
+        """
+
+    @abstractmethod
+    def check(self) -> None:
+        """Wait until all calls have ended.
+
+        Raises:
+            ValueError: a pose was not finite in some call since the last check; a call that waits says so itself.
+        """
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What bound calls of a model are made of.
+
+    Attributes:
+        map: The map's table.
+        vectors: (K, rays, 2) float64 cosines and sines of the rays of each beam.
+        top: Largest range below a max reading.
+        guard_scale: Bound of end points' rounding errors per cell of range.
+        careful: Whether poses are needed in two parts.
+    """
+
+    map: ReachableMap
+    vectors: np.ndarray
+    top: float = math.inf
+    guard_scale: float = 0.0
+    careful: bool = False
+
+
+@dataclass(frozen=True)
+class PlacedScan:
+    """Readings on the device, as the kernel ``place_readings`` leaves them.
+
+    Attributes:
+        places: Places of readings; those at the end may be missing (nan).
+        point: End points in cells, or the vectors of beams.
+        low: What rounding took from end points.
+        reading: Ranges, where points are vectors.
+        guard: Bounds for each block of end points.
+        fixed: What max readings without a place add.
+    """
+
+    places: int
+    point: Buffer
+    low: Buffer
+    reading: Buffer
+    guard: Buffer
+    fixed: Buffer
+
+
+# What starts to find what readings add: placed poses, the flags of their headings, their number, the scan, and parts.
+Scorer = Callable[[Placed, frozenset[str], int, PlacedScan, Buffer], None]
+
+
+def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
+    """See ``ScanModel.bind``."""
+    for name, given in (("poses", poses), ("ranges", ranges)):
+        if not (isinstance(given, np.ndarray) or hasattr(given, "__dlpack__") or arrays.on_device(given)):
+            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {_checks.show(given)}")
+        if type(given).__module__.startswith("jax"):
+            raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
+    there = arrays.on_device(poses) and arrays.on_device(ranges)
+    # Readings as other programs see them are made on the host.
+    return (_DeviceCall if there and model.compat is None else _HostCall)(model, poses, ranges, out)
+
+
+class _HostCall(BoundCall):
+    """The ordinary way."""
+
+    waits = True
+
+    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
+        backend, beams = model._backend, model.scanner.count
+        if arrays.on_device(poses):
+            count = arrays.adopt_poses(poses, backend, "poses")[1]
+        else:
+            count = _shape_of("poses", poses, ("N", 3))[0]
+        if arrays.on_device(ranges):
+            arrays.adopt_readings(ranges, backend, beams)
+        else:
+            _shape_of("ranges", ranges, (beams,))
+        arrays.check_out(out, (count,), model._real, poses, backend)
+        if out is None and arrays.on_device(poses):
+            out = arrays.result_for(poses, arrays.blank(backend, count, model._real))
+        elif out is None:
+            out = arrays.like(poses, np.empty(count, model._real))
+        self.out, self._model, self._given = out, model, (poses, ranges)
+
+    def __call__(self, stream: Any = None) -> Any:
+        """See BoundCall.__call__."""
+        if stream is not None:
+            raise TypeError(f"stream: must be None for a call that waits, got {_checks.show(stream)}")
+        return self._model.log_likelihood(*self._given, out=self.out)
+
+    def check(self) -> None:
+        """See BoundCall.check."""
+
+
+def _shape_of(name: str, given: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
+    """The shape of an array in host memory; its numbers are looked at by each call."""
+    found = np.shape(cast(Any, arrays.to_host(given, name)))
+    if len(found) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, found, strict=True)):
+        raise ValueError(f"{name}: shape must be {_checks.shape_text(shape)}, got {_checks.shape_text(found)}")
+    return found
+
+
+class _DeviceCall(BoundCall):
+    """One start of launches that were recorded."""
+
+    waits = False
+
+    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
+        backend, real = model._backend, model._real
+        self._model, self._backend, self._real = model, backend, real
+        self._cloud = Cloud(poses, backend)
+        count = self._cloud.count
+        found = arrays.adopt_readings(ranges, backend, model.scanner.count)
+        result = arrays.check_out(out, (count,), real, poses, backend)
+        self._result = arrays.blank(backend, count, real) if result is None else result
+        self.out = arrays.result_for(poses, self._result) if out is None else out
+        # What owns the memory of what is read and written.
+        self._given = (poses, ranges, found, self.out)
+        # Buffers of its own: other calls of the model may come between.
+        self._space = Workspace(backend)
+        self._none, self._no_terms = backend.upload(np.zeros(1, _INT)), backend.upload(np.zeros(1, real))
+        self._scene = model._bound_scene()
+        self._scan, self._place, self._fixed_rows = self._placing_of(found)
+        self._record()
+
+    def __call__(self, stream: Any = None) -> Any:
+        """See BoundCall.__call__."""
+        if self._scene.map.version != self._version:
+            # The map has changed, or its table is another one.
+            self._replay.wait()
+            self._record()
+        self._replay(stream)
+        return self.out
+
+    def check(self) -> None:
+        """See BoundCall.check."""
+        self._replay.wait()
+        finish(self._space, on_device=True)
+
+    def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Callable[[], None], int]:
+        """Where readings are placed, what starts that, and rows of parts for what those without a place add."""
+        model, backend, real, space = self._model, self._backend, self._real, self._space
+        z_max, scanner, end_points = model._z_max, model.scanner, model._end_points
+        beams = np.arange(scanner.count)
+        if model.beams is not None and not isinstance(model.beams, (int, np.integer)):
+            beams = beams[np.asarray(model.beams, np.intp)]
+        chosen = len(beams)
+        if isinstance(model.beams, (int, np.integer)):
+            chosen = min(int(model.beams), chosen)
+        places = chosen if model._specialize else len(beams)
+        dtype = np.dtype(ranges.dtype.__name__)
+        with np.errstate(over="ignore"):
+            nearest, farthest = dtype.type(scanner.range_min), dtype.type(scanner.range_max)
+        if scanner.range_min > 0:
+            # A reading of 0 is none, even where the limit is rounded to 0.
+            nearest = max(nearest, np.finfo(dtype).smallest_subnormal)
+        kind = MAX_PLACED if model._max_depends or not model._specialize else MAX_FIXED
+        kind = kind if z_max > 0 else MAX_LEFT_OUT
+        possible = not model._impossible()
+        vectors = self._scene.vectors[beams]
+        each, blocks = vectors.shape[1], -(-places // BLOCK_TERMS)
+        scan = PlacedScan(
+            places,
+            point=space.empty("point", 2 * places * each, real),
+            low=space.empty("point_low", 2 * places if end_points else 2, real),
+            reading=space.empty("reading", 1 if end_points else places, real),
+            guard=space.empty("guard", blocks if end_points else 1, real),
+            fixed=space.empty("fixed", 1, real),
+        )
+        flags = model._scene_flags() & {"FLOAT64", "ALL_READINGS"}
+        flags |= {"END_POINTS"} if end_points else set()
+        flags |= {"RANGES_FLOAT32"} if dtype == np.float32 else set()
+        arguments = (
+            ranges, backend.upload(beams.astype(_INT)), backend.upload(vectors), scan.point, scan.low, scan.reading,
+            scan.guard, scan.fixed, len(beams), each, places, chosen, kind, int(possible), float(nearest),
+            float(farthest), float(np.log(z_max)) if kind == MAX_FIXED else 0.0, model.grid.resolution,
+            self._scene.top, self._scene.guard_scale,
+        )  # fmt: skip
+
+        def place() -> None:
+            backend.compile("place_readings", frozenset(flags))((max(blocks, 1),), *arguments)
+
+        rows = 1 if end_points else BLOCK_TERMS
+        return scan, place, rows if kind == MAX_FIXED or not possible else 0
+
+    def _record(self) -> None:
+        """Make the table where there is none, and keep the launches of a call; nothing is started."""
+        model, scene, cloud = self._model, self._scene, self._cloud
+        with model._lock:
+            # Kept, since another call of the model may need another table.
+            self._table, region, _ = cloud.ensure(scene.map, 0, cloud.count)
+            score = model._bound_scorer(self._table, region)
+            self._version = scene.map.version
+            self._replay = cast(Repeating, self._backend).record(lambda: self._start(score, region))
+
+    def _start(self, score: Scorer, region: Region) -> None:
+        """All launches of a call."""
+        model, scan, backend, space, cloud = self._model, self._scan, self._backend, self._space, self._cloud
+        flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
+        each, block = (-(-scan.places // BLOCK_TERMS), 1) if model._end_points else (scan.places, BLOCK_TERMS)
+        fixed, chunk = self._fixed_rows, model._bound_chunk(scan.places)
+        frame = (region, model.grid, model.scanner.mount)
+        self._place()
+        for begin in range(0, cloud.count, chunk):
+            part = (begin, min(begin + chunk, cloud.count))
+            count = part[1] - begin
+            given = cloud.given(backend, space, part)
+            placed = cloud.place(backend, space, given, part, frame, self._real, careful=self._scene.careful)
+            parts = space.empty("parts", count * (fixed + each), self._real)
+            if fixed:
+                backend.compile("fill_fixed", flags)((count,), scan.fixed, parts, count, fixed)
+            if each:
+                score(placed, cloud.headings(), count, scan, backend.part(parts, count * fixed, count * each))
+            backend.compile("sum_parts", flags)(
+                (count,), parts, self._none, self._none, self._no_terms, backend.part(self._result, begin, count),
+                count, fixed + each, block, 1, count, 0.0, model.temperature, count,
+            )  # fmt: skip

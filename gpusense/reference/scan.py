@@ -1,0 +1,93 @@
+"""Readings that are on the device: which of them count and where they go, as ``gpusense.scan`` finds it on the host.
+
+Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
+is left at the end are missing readings (nan), which add nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.reference.error_free import BLOCK_TERMS
+
+# What max readings are: left out, in the constant, or evaluated like others.
+MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
+
+
+def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:
+    """Whether an even choice of informative readings has that of a rank: some i * informative // chosen is it."""
+    if chosen >= informative:
+        return np.ones(rank.shape, bool)
+    if chosen == 0:
+        return np.zeros(rank.shape, bool)
+    nearest = -(-rank * chosen // informative)
+    return nearest * informative // chosen == rank
+
+
+def place_readings(
+    flags: frozenset[str],
+    ranges: np.ndarray,
+    beam: np.ndarray,
+    vector: np.ndarray,
+    point: np.ndarray,
+    point_low: np.ndarray,
+    reading: np.ndarray,
+    guard: np.ndarray,
+    fixed: np.ndarray,
+    beams: int,
+    each: int,
+    places: int,
+    chosen: int,
+    max_readings: int,
+    possible: int,
+    nearest: float,
+    farthest: float,
+    log_max: float,
+    resolution: float,
+    top: float,
+    guard_scale: float,
+) -> None:
+    """Readings of some beams in their places.
+
+    A place gets its reading, at most ``top``, and as points the ``each`` vectors of its beam; with END_POINTS a point
+    is the reading times its vector, in cells, and what rounding took from it. A max reading is inf. ``guard`` is
+    guard_scale (longest + 2 cells) of a block of places. ``fixed`` is what max readings add that have no place; -inf
+    where a range is there and none is ``possible``.
+    """
+    z = ranges[beam[:beams]].astype(np.float64)
+    hit, far = (z >= nearest) & (z < farthest), z >= farthest
+    informative = hit | (far & (max_readings != MAX_LEFT_OUT))
+    rank = np.cumsum(informative) - 1
+    used = informative & is_chosen(rank, int(np.count_nonzero(informative)), chosen)
+    value = np.where(used & hit & bool(possible), z, np.nan)
+    value[used & far & (max_readings == MAX_PLACED)] = np.inf
+    column = np.arange(beams) if "ALL_READINGS" in flags else np.flatnonzero(~np.isnan(value))
+    count = len(column)
+    own = vector[: 2 * each * beams].reshape(beams, each, 2)[column]
+    if "END_POINTS" in flags:
+        cells = value[column] / resolution
+        length = np.where(np.isfinite(cells), cells, 0.0)
+        exact = own[:, 0] * length[:, None]
+        point[:count] = exact
+        point_low[:count] = exact - point[:count]
+        point[:count][~np.isfinite(cells)] = cells[~np.isfinite(cells), None]
+        point[count:places] = np.nan
+        point_low[count:places] = 0
+        for block, first in enumerate(range(0, places, BLOCK_TERMS)):
+            longest = np.max(length[first : first + BLOCK_TERMS], initial=0.0)
+            guard[block] = guard_scale * (longest + 2)
+    else:
+        point[: count * each] = own.reshape(-1, 2)
+        point[count * each : places * each] = (1, 0)
+        rounded = value[column].astype(reading.dtype)
+        reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, top))
+        reading[count:places] = np.nan
+    fixed[0] = np.count_nonzero(used & far) * log_max if max_readings == MAX_FIXED else 0.0
+    if not possible and (used & hit).any():
+        fixed[0] = -np.inf
+
+
+def fill_fixed(flags: frozenset[str], fixed: np.ndarray, parts: np.ndarray, particles: int, rows: int) -> None:
+    """What is fixed as the first of so many rows of parts, one of which is a number a particle; 0 in the others."""
+    first = parts[: rows * particles].reshape(rows, particles)
+    first[0], first[1:] = fixed[0], 0

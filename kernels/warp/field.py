@@ -131,6 +131,7 @@ def make(name, flags):
     CUBES = "CUBES" in flags
     PER_BEAM = "PER_BEAM" in flags
     QUICK = "QUICK" in flags
+    SCANS = "SCANS" in flags
     ZERO, HALF = real(0.0), real(0.5)
     # A constant for loops that Warp shall unroll.
     WHOLE_BLOCK = 16
@@ -176,6 +177,8 @@ def make(name, flags):
         point: wp.array(dtype=vec2),
         point_low: wp.array(dtype=vec2),
         terms: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
+        fixed_of: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         rows: wp.int32,
@@ -185,6 +188,8 @@ def make(name, flags):
         guard: real,
         fixed: real,
         temperature: real,
+        per_scan: wp.int32,
+        ahead: wp.int32,
     ):
         n = wp.tid()
         if n >= particles:
@@ -194,7 +199,15 @@ def make(name, flags):
         from_low = vec4()
         if CAREFUL:
             from_low = pose_low[n]
-        total = vec2(fixed, ZERO)
+        begin = int(0)
+        size = readings
+        lead = fixed
+        if SCANS:
+            scan = (n + ahead) // per_scan
+            begin = start[scan]
+            size = start[scan + 1] - begin
+            lead = fixed_of[scan]
+        total = vec2(lead, ZERO)
         block = real(0.0)
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
         k = int(0)
@@ -203,37 +216,38 @@ def make(name, flags):
             # the time; with points read as vec2, or a maximum in place of a count, it would not.
             lowered = from_pose - vec4(HALF, HALF, ZERO, ZERO)
             cells = block_cells()
-            while k < readings:
-                size = wp.min(readings - k, BLOCK_TERMS)
+            while k < size:
+                first = begin + k
+                width = wp.min(size - k, BLOCK_TERMS)
                 doubtful = int(0)
                 i = int(0)
-                while i < size:
-                    cell, off = rounded_cell(lowered, point_at(point, k + i))
+                while i < width:
+                    cell, off = rounded_cell(lowered, point_at(point, first + i))
                     doubtful += int(off > HALF - guard)
                     cells[i] = field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)
                     i += 1
                 if doubtful > 0:
                     i = int(0)
-                    while i < size:
-                        exact = end_point(from_pose, from_low, point[k + i], point_low[k + i], ZERO, guard)
+                    while i < width:
+                        exact = end_point(from_pose, from_low, point[first + i], point_low[first + i], ZERO, guard)
                         cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, rows, cols)
                         i += 1
                 block = ZERO
                 i = int(0)
-                while i < size:
+                while i < width:
                     term = table[cells[i]]
                     if PER_BEAM:
                         parts[n * readings + k + i] = term
                     block += term
                     i += 1
                 total = add_term(total, block)
-                k += size
+                k += width
         else:
-            while k < readings:
-                to = point[k]
+            while k < size:
+                to = point[begin + k]
                 to_low = vec2()
                 if CAREFUL:
-                    to_low = point_low[k]
+                    to_low = point_low[begin + k]
                 term = reading_value(table, origin, from_pose, from_low, to, to_low, terms, rows, cols, guard)
                 if PER_BEAM:
                     parts[n * readings + k] = term
@@ -252,7 +266,7 @@ def make(name, flags):
             log_p[n] = temperature * (total.x + total.y)
 
     # For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-    # parts[n * across + block * along]. Each block has its own guard.
+    # parts[n * across + block * along]. Each block has its own guard; of several scans each has as many as the longest.
     @kernel
     def field_blocks(
         table: wp.array(dtype=real),
@@ -263,6 +277,7 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2),
         terms: wp.array(dtype=real),
         guard: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
         parts: wp.array(dtype=real),
         rows: wp.int32,
         cols: wp.int32,
@@ -271,6 +286,7 @@ def make(name, flags):
         across: wp.int32,
         along: wp.int32,
         spread: wp.int32,
+        per_scan: wp.int32,
     ):
         item = wp.tid()
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
@@ -282,16 +298,24 @@ def make(name, flags):
         if CAREFUL:
             low = pose_at(pose_low, n)
         lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+        before = int(0)
+        size = readings
+        guards = int(0)
+        if SCANS:
+            scan = n // per_scan
+            before = start[scan]
+            size = start[scan + 1] - before
+            guards = scan * ((readings + BLOCK_TERMS - 1) // BLOCK_TERMS)
         block = (item // GROUP) & ((1 << spread) - 1)
-        while block * BLOCK_TERMS < readings:
-            begin = block * BLOCK_TERMS
-            end = wp.min(begin + BLOCK_TERMS, readings)
+        while block * BLOCK_TERMS < size:
+            begin = before + block * BLOCK_TERMS
+            end = wp.min(begin + BLOCK_TERMS, before + size)
             total = real(0.0)
-            own_guard = number_at(guard, block)
+            own_guard = number_at(guard, guards + block)
             if QUICK:
                 sure = HALF - own_guard
                 worst = real(0.0)
-                if begin + BLOCK_TERMS <= readings:
+                if begin + BLOCK_TERMS <= end:
                     for i in range(WHOLE_BLOCK):
                         cell, off = rounded_cell(lowered, point_at(point, begin + i))
                         worst = wp.max(worst, off)

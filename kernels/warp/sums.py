@@ -19,16 +19,19 @@ def make(name, flags):
     block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=real)
     ORDERED = "ORDERED" in flags
     CUBES = "CUBES" in flags
+    SCANS = "SCANS" in flags
     ZERO = real(0.0)
 
     # One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block
     # of them, 1 or BLOCK_TERMS, is added plainly, then its sum to a compensated total. BLOCK_TERMS numbers are read
     # before any is added, so that a work-item waits once for all of them; what lies beyond the last counts as 0, which
-    # changes no sum.
+    # changes no sum. Of several scans each has a count of its own.
     @kernel
     def sum_parts(
         parts: wp.array(dtype=real),
         order: wp.array(dtype=wp.int32),
+        counts: wp.array(dtype=wp.int32),
+        fixed_of: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         particles: wp.int32,
         count: wp.int32,
@@ -37,6 +40,7 @@ def make(name, flags):
         along: wp.int32,
         fixed: real,
         temperature: real,
+        per_scan: wp.int32,
     ):
         place = wp.tid()
         if place >= particles:
@@ -45,12 +49,17 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         part = place * across
-        total = vec2(fixed, ZERO)
+        own = count
+        lead = fixed
+        if SCANS:
+            own = counts[n // per_scan]
+            lead = fixed_of[n // per_scan]
+        total = vec2(lead, ZERO)
         first = int(0)
-        while first < count:
+        while first < own:
             term = block_terms()
             for i in range(BLOCK_TERMS):
-                if first + i < count:
+                if first + i < own:
                     term[i] = number_at(parts, part + (first + i) * along)
             if block == 1:
                 for i in range(BLOCK_TERMS):

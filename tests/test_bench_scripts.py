@@ -161,9 +161,20 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
     output = tmp_path / "small_calls"
     report = run_script("small_calls.py", "--backend", needs(selection), "--size", "20", *arguments, output=output)
     names = [row["what"] for row in report["rows"]]
-    assert {"field, 50 x 12, NumPy in and out", "beam model, 3 scans of 50 x 12 in 3 calls"} <= set(names)
-    assert len(names) == 12 and all(row["differing_bits"] == 0 for row in report["rows"])
+    assert {"field, 50 x 12, NumPy in and out", "beam model, 90 x 12, NumPy in and out"} <= set(names)
+    assert len(names) == 8 and all(row["differing_bits"] == 0 for row in report["rows"])
     assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])
+
+
+def test_several_scans_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--backend", "numpy", "--backend", needs("opencl"), "--particles", "30", "--beams", "12"]
+    small = ["--scans", "3", "--models", "2", "--size", "20", "--seconds", "0.01"]
+    report = run_script("several_scans.py", *arguments, *small, output=tmp_path / "several")
+    names = [row["what"] for row in report["rows"]]
+    assert len(names) == 8 and {"field, 3 scans of 30 x 12", "beam model, 2 models, 30 x 12"} <= set(names)
+    for row in report["rows"]:
+        assert row["differing_bits"] == 0 and row["queued_s"] > 0 and row["calls_s"] > 0
+        assert row["shared"] == ("together_s" in row) == ("scans" in row["what"])
 
 
 def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:

@@ -155,5 +155,5 @@ def test_bad_input(name):
 
 def test_models_of_two_devices(needs):
     other = gs.LikelihoodFieldModel(grid(1, 40), SCANNERS[0], backend=needs("opencl"))
-    with pytest.raises(ValueError, match="^models: must be of one device, got numpy and, at index 1, opencl:"):
+    with pytest.raises(ValueError, match=r"^models: must be of one device, got numpy and, at index 1, opencl:"):
         gs.log_likelihoods([ONE, other], POSES, SCAN)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gpusense.backends import Backend
 from gpusense.learning.pairs import Pairs
 from gpusense.learning.point import Point
-from gpusense.models.scan_model import log_weight, rounded_terms
+from gpusense.models.terms import log_weight, rounded_terms
 
 # Numbers in a row of sums; see kernels/opencl/learning.cl.
 _SUMS = {False: 14, True: 40}

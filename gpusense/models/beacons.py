@@ -13,7 +13,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
 from gpusense.models.point_model import Part, PointModel
-from gpusense.models.scan_model import log_weight
+from gpusense.models.terms import log_weight
 from gpusense.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.reference.beacons import BEACON, NORMAL, STUDENT_T, TERMS, TWO_NORMALS
 from gpusense.reference.relative import FARTHEST

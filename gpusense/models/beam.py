@@ -21,13 +21,8 @@ from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
-from gpusense.models.scan_model import (
-    HIGH_PEAK,
-    ScanModel,
-    log_weight,
-    rounded_terms,
-    sums_linearly,
-)
+from gpusense.models.scan_model import ScanModel
+from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS

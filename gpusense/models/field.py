@@ -17,13 +17,8 @@ from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.field_table import RING, FieldTable
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import (
-    HIGH_PEAK,
-    ScanModel,
-    log_weight,
-    rounded_terms,
-    sums_linearly,
-)
+from gpusense.models.scan_model import ScanModel
+from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions
 from gpusense.reference.error_free import BLOCK_TERMS

@@ -23,7 +23,8 @@ from gpusense.features import (
 from gpusense.frames import split
 from gpusense.landmarks import LandmarkMap, make_buckets
 from gpusense.lanes import widened
-from gpusense.models.scan_model import chunk_of, in_chunks, log_weight, real_dtype
+from gpusense.models.scan_model import chunk_of, in_chunks, real_dtype
+from gpusense.models.terms import log_weight
 from gpusense.parameters import LandmarkParameters
 from gpusense.plan import Omission, Plan, share
 from gpusense.reference.landmarks import ARCS

@@ -217,31 +217,31 @@ def make(name, flags):
             lowered = from_pose - vec4(HALF, HALF, ZERO, ZERO)
             cells = block_cells()
             while k < size:
-                some = wp.min(size - k, BLOCK_TERMS)
+                first = begin + k
+                width = wp.min(size - k, BLOCK_TERMS)
                 doubtful = int(0)
                 i = int(0)
-                while i < some:
-                    cell, off = rounded_cell(lowered, point_at(point, begin + k + i))
+                while i < width:
+                    cell, off = rounded_cell(lowered, point_at(point, first + i))
                     doubtful += int(off > HALF - guard)
                     cells[i] = field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)
                     i += 1
                 if doubtful > 0:
                     i = int(0)
-                    while i < some:
-                        at = begin + k + i
-                        exact = end_point(from_pose, from_low, point[at], point_low[at], ZERO, guard)
+                    while i < width:
+                        exact = end_point(from_pose, from_low, point[first + i], point_low[first + i], ZERO, guard)
                         cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, rows, cols)
                         i += 1
                 block = ZERO
                 i = int(0)
-                while i < some:
+                while i < width:
                     term = table[cells[i]]
                     if PER_BEAM:
                         parts[n * readings + k + i] = term
                     block += term
                     i += 1
                 total = add_term(total, block)
-                k += some
+                k += width
         else:
             while k < size:
                 to = point[begin + k]

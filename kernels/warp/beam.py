@@ -11,7 +11,7 @@ import warp as wp
 from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
 from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision
+from .prelude import kernel, precision, reader, writer
 from .ranges import caster_of
 from .tiles import tile_place, tile_ray, tile_step
 
@@ -41,6 +41,8 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     nearest_echo = echo.functions(flags).nearest_echo
     incidence_terms = echo.functions(flags).incidence_terms
+    cell_at, pose_at, ray_at = reader(wp.vec2i), reader(vec4), reader(vec2)
+    number_at, put = reader(real), writer(real)
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
@@ -119,8 +121,8 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        cell = pose_cell[n]
-        from_pose = pose[n]
+        cell = cell_at(pose_cell, n)
+        from_pose = pose_at(pose, n)
         before = int(0)
         size = rays
         readings_before = int(0)
@@ -147,7 +149,9 @@ def make(name, flags):
                 if INCIDENCE:
                     own = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
-                t = cast_ray(map_table, rows, cols, cell, from_pose, ray[before + r], limit, bins, slack, tolerance)
+                t = cast_ray(
+                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                )
             expected = expected_range(t, limit, resolution, range_max)
             begin = r
             end = r + 1
@@ -155,7 +159,8 @@ def make(name, flags):
                 begin = first[before + r] - readings_before
                 end = first[before + r + 1] - readings_before
             for k in range(begin, end):
-                term = reading_term(reading[readings_before + k], expected, own, sensor, cells, per_metre, range_max)
+                z = number_at(reading, readings_before + k)
+                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -218,8 +223,8 @@ def make(name, flags):
         n = place
         if ORDERED:
             n = order[place]
-        cell = pose_cell[n]
-        from_pose = pose[n]
+        cell = cell_at(pose_cell, n)
+        from_pose = pose_at(pose, n)
         before = int(0)
         size = rays
         readings_before = int(0)
@@ -242,7 +247,9 @@ def make(name, flags):
                 if INCIDENCE:
                     own = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
-                t = cast_ray(map_table, rows, cols, cell, from_pose, ray[before + r], limit, bins, slack, tolerance)
+                t = cast_ray(
+                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                )
             expected = expected_range(t, limit, resolution, range_max)
             k = r
             end = r + 1
@@ -250,8 +257,9 @@ def make(name, flags):
                 k = first[before + r] - readings_before
                 end = first[before + r + 1] - readings_before
             while k < end:
-                term = reading_term(reading[readings_before + k], expected, own, sensor, cells, per_metre, range_max)
-                parts[place * across + k * along] = term
+                z = number_at(reading, readings_before + k)
+                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
+                put(parts, place * across + k * along, term)
                 k += 1
             r += tile_step(spread)
 

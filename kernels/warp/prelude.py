@@ -26,6 +26,9 @@ def precision(flags):
     return SimpleNamespace(real=wp.float32, vec2=wp.vec2f, vec4=wp.vec4f)
 
 
+_C_TYPES = {wp.float32: "float", wp.float64: "double", wp.int32: "int", wp.uint16: "unsigned short"}
+
+
 @functools.cache
 def reader(dtype):
     """A function of (array, i) that reads numbers or vectors which the kernel does not write; i must not be negative.
@@ -36,7 +39,7 @@ def reader(dtype):
     """
     length = getattr(dtype, "_length_", 1)
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    one = {wp.float32: "float", wp.float64: "double", wp.int32: "int"}[scalar]
+    one = _C_TYPES[scalar]
     if length == 1:
         loads, whole, single = [], "__ldg(values.data + i)", "values.data[i]"
     else:
@@ -56,3 +59,13 @@ def reader(dtype):
     def read(values: wp.array(dtype=dtype), i: wp.int32) -> dtype: ...
 
     return read
+
+
+@functools.cache
+def writer(dtype):
+    """A function of (array, i, value) that writes a number, like ``reader``."""
+
+    @wp.func_native("values.data[i] = value;")
+    def write(values: wp.array(dtype=dtype), i: wp.int32, value: dtype): ...
+
+    return write

@@ -11,7 +11,7 @@ import warp as wp
 
 from . import ray as ray_file
 from . import rectangles as rectangles_file
-from .prelude import precision
+from .prelude import precision, reader
 
 ENTRY = wp.uint16
 
@@ -26,6 +26,7 @@ def functions(flags):
     crossed, as_bits, farther = geometry.crossed, geometry.as_bits, geometry.farther
     COUNT, FIRST = geometry.COUNT, geometry.FIRST
     padded = rectangles_file.functions(flags).padded
+    entry_at = reader(ENTRY)
     OCCUPIED = wp.uint32(rectangles_file.OCCUPIED)
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
@@ -76,7 +77,7 @@ def functions(flags):
         k_x = COUNT + real(start.k_x)
         k_y = COUNT + real(start.k_y)
         t = real(start.t)
-        sides = wp.uint32(map_table[wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))])
+        sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
         # A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
         while sides > OCCUPIED and t < limit:
             end_x = farther(k_x, sides & wp.uint32(255))
@@ -90,7 +91,7 @@ def functions(flags):
             aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x)
             k_x = wp.where(by_x, end_x, aside)
             k_y = wp.where(by_x, aside, end_y)
-            sides = wp.uint32(map_table[wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))])
+            sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
         if OUTSIDE_OCCUPIED:
             return wp.min(t, limit)
         else:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 import gpusense as gs
 from gpusense import selftest
 from gpusense.backends import get_backend
+from gpusense.replay import Recorder, replay
 from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, scan_tolerance
 from gpusense.worlds import cloud_around, cloud_uniform, simulate_scan
 
@@ -163,13 +164,13 @@ def test_models_on_120_million_cells(gigantic, opencl):
     poses = cloud_uniform(gigantic, 300, random)
     ranges = simulate_scan(gigantic, scanner, poses[0], gs.BeamParameters(), random)
     for make in (gs.BeamModel, gs.LikelihoodFieldModel):
-        recorder = selftest.Recorder(opencl)
+        recorder = Recorder(opencl)
         model = make(gigantic, scanner, backend=recorder)
         log_p, parts = model.log_likelihood(poses, ranges, per_beam=True)
         assert "far map" not in model.explain()
         assert np.argmax(log_p) == 0
         (launch,) = recorder.launches
-        true_log_p, true_parts = selftest.replay(launch)
+        true_log_p, true_parts = replay(launch)
         beam, scan = beam_tolerance("float32"), scan_tolerance("float32", scanner.count)
         assert beam.difference(launch.parts, true_parts) <= beam.value
         assert scan.difference(log_p, true_log_p) <= scan.value

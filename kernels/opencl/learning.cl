@@ -97,7 +97,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
 }
 
 #else
-// The same in lanes, a pair in each. Functions of vectors are PoCL's own: they cost a tenth of its scalar ones a number.
+// The same in lanes, a pair in each. Functions of vectors are PoCL's own, which cost far less a number than its scalar ones.
 lanes hit_mean(const lanes expected, global const real *terms) {
     const lanes mean = expected + terms[10], held = mean > terms[6] ? (lanes)terms[6] : mean;
     return held < 0 ? (lanes)0 : held;

@@ -94,7 +94,7 @@ def test_end_points_on_edges_do_not_breach(data_dir):
     """Without a mount beams along the axes end on the edges that the poses stand on."""
     grid = gs.read_map(data_dir / "wean_hall/wean_10cm.yaml")
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.025, count=161, range_max=20.0)
-    checks = selftest.run([get_backend("numpy")], selftest.scene_in(grid, scanner))
+    checks = selftest.run([get_backend("numpy")], selftest.scene_in(grid, scanner), sonar=False)
     assert [check for check in checks if not check.passed] == []
 
 
@@ -102,7 +102,8 @@ def test_end_points_on_edges_do_not_breach(data_dir):
 def test_backends_agree(data_dir, name):
     """Distances, squares, ranges to the bit, and both models in both precisions, with the truth and pairwise."""
     scene, backends = scene_of(data_dir, name)
-    checks = selftest.run(backends, scene)
+    # Two maps are enough for angles of incidence.
+    checks = selftest.run(backends, scene, sonar=name in (COMPARED[0], COMPARED[-1]))
     assert [check for check in checks if not check.passed] == []
     assert {"distance transform", "float32 beam model, beams"} <= {check.quantity for check in checks}
 

@@ -88,6 +88,8 @@ class Recorder:
             "sensor": {"SENSOR_TABLE"} & flags,
             "normals": {"INCIDENCE"} & flags,
             "map_table": {},
+            "start": {"SCANS"} & flags,
+            "fixed_of": {"SCANS"} & flags,
         }
         for argument, value in given.items():
             if argument.shape is None or not needed.get(argument.name, True):
@@ -178,7 +180,8 @@ def _replay_field(launch: Launch, values: dict[str, Any], shift: tuple[float, fl
     count, readings = values["particles"], values["readings"]
     parts = np.empty(count * readings)
     low = values.get("pose_low", np.zeros((count, 4))) + np.array([*shift, 0.0, 0.0])
-    given = {**values, "pose_low": low, "log_p": np.empty(count), "parts": parts}
+    alone = {"start": None, "fixed_of": None}
+    given = {**values, **alone, "pose_low": low, "log_p": np.empty(count), "parts": parts}
     flags = launch.flags | {"FLOAT64", "PER_BEAM", "CAREFUL"}
     field_kernels.score_field(flags, *(given[argument.name] for argument in KERNELS["score_field"].arguments))
     return parts.reshape(count, readings)

@@ -35,7 +35,7 @@ def opencl_declarations() -> dict[str, list[tuple[str, str]]]:
 
 def opencl_argument(declaration: str) -> tuple[str, str, bool, bool]:
     """Name, type, whether an array, whether written, of one C parameter."""
-    match = re.fullmatch(r"(global )?(const )?(\w+) (\*)?(\w+)", " ".join(declaration.split()))
+    match = re.fullmatch(r"(global )?(const )?(\w+) (\*)?(?:restrict )?(\w+)", " ".join(declaration.split()))
     assert match is not None, declaration
     space, constant, kind, pointer, name = match.groups()
     assert bool(space) == bool(pointer)

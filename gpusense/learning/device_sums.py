@@ -13,7 +13,7 @@ from gpusense.backends import Backend
 from gpusense.lanes import widened
 from gpusense.learning.pairs import Pairs
 from gpusense.learning.point import Point
-from gpusense.models.scan_model import log_weight, rounded_terms
+from gpusense.models.terms import log_weight, rounded_terms
 from gpusense.signatures import LANES
 
 # Numbers in a row of sums; see kernels/opencl/learning.cl.

@@ -21,13 +21,8 @@ from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
-from gpusense.models.scan_model import (
-    HIGH_PEAK,
-    ScanModel,
-    log_weight,
-    rounded_terms,
-    sums_linearly,
-)
+from gpusense.models.scan_model import ScanModel
+from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
@@ -363,31 +358,41 @@ class BeamModel(ScanModel):
             # A range below range_max that is rounded to it is still a range, and no max reading to the table.
             top = np.nextafter(real.type(self.scanner.range_max), real.type(0))
             values = np.where(np.isfinite(scan.readings), np.minimum(values, top), values)
-        ray, reading = space.upload_all("scan", (vectors.astype(real), values))
+        batch, rays, readings = scan.batch, scan.most_rays, scan.most_readings
         shared = scan.shared or not self._specialize
-        first = space.upload("first", scan.first) if scan.shared else self._one_each
-        rays, readings = len(scan.rays), len(scan.readings)
+        one_each = not shared if batch is not None else not scan.shared
+        first = self._one_each if one_each else space.upload("first", scan.first)
+        if batch is None:
+            ray, reading = space.upload_all("scan", (vectors.astype(real), values))
+            start, counts, fixed_of = self._none, self._none, self._terms_there
+        else:
+            ray, reading, fixed_of = space.upload_all("scan", (vectors.astype(real), values, self._fixed_of(batch)))
+            start, counts = space.upload_all("scans", (batch.start, batch.counts))
+        scans = 1 if batch is None else len(batch.counts)
         scalars = (scan.constant + self._lead, self.temperature)
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
             normals = self._caster.normals(region, self._cones.flags)
             mount, count = self.scanner.mount, part[1] - part[0]
+            per_scan = count // scans
             poses = cloud.given(backend, space, part)
             flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
             # A table has a row for max readings.
             evaluated = self._max_depends and self._discrete is None
             flags |= cloud.headings() | ({"ALL_READINGS"} if evaluated else set())
             flags |= {"SHARED_RAYS"} if shared else set()
+            flags |= {"SCANS"} if batch is not None else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
             gpu = backend.info.kind == "gpu" and not per_beam
             if gpu:
                 self._last_code = frozenset(flags)
-                sizes = (count, rays, readings, shared, inside)
+                sizes = (count, per_scan, batch is None, rays, readings, len(scan.rays), len(scan.readings))
                 if space.again(
-                    (poses, result, table, first, normals), cloud.code(), self._caster.map.preparations, sizes, scalars
-                ):
+                    (poses, result, table, first, normals), cloud.code(), self._caster.map.preparations, sizes, shared,
+                    inside, scalars,
+                ):  # fmt: skip
                     return None
             placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=False)
             world: tuple[Any, ...] = (region.rows, region.cols, count, rays, readings, len(self._kinds))
@@ -403,11 +408,12 @@ class BeamModel(ScanModel):
                 tiles, spread = tiles_of(count, rays)
                 backend.compile("beam_tiles", self._last_code)(
                     (tiles,), table, normals, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
-                    self._edges, self._sensor, parts, *world, 1, count, spread,
+                    self._edges, self._sensor, start, parts, *world, 1, count, spread, per_scan,
                 )  # fmt: skip
                 backend.compile("sum_parts", self._last_code)(
-                    (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
-                )
+                    (count,), parts, order, counts, fixed_of, result, count, readings, BLOCK_TERMS, 1, count,
+                    *scalars, per_scan,
+                )  # fmt: skip
                 space.keep()
                 return parts
             flags |= {"PER_BEAM"} if per_beam else set()
@@ -415,7 +421,7 @@ class BeamModel(ScanModel):
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             backend.compile("score_beams", flags)(
                 (count,), table, normals, placed.cell, placed.pose, ray, first, reading, self._terms_there, self._edges,
-                self._sensor, result, parts, *world, *scalars,
+                self._sensor, start, fixed_of, result, parts, *world, *scalars, per_scan, 0,
             )  # fmt: skip
             return parts
 

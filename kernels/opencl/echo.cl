@@ -33,11 +33,11 @@ real2 hit_normal(global const real2 *normals, const int rows, const int cols, co
         const real2 own = normal_at(normals, rows, cols, cell.x, cell.y);
         if (is_wall(own)) return own;
     }
-    const int col = cell.x + r.step_x * (int)crossed(t, r.speed_x, r.a_x, r.inv_x, 1);
-    const int before = cell.y + r.step_y * (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 0);
+    const int col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
+    const int before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
     const real2 found = normal_at(normals, rows, cols, col, before);
     if (is_wall(found)) return found;
-    return normal_at(normals, rows, cols, col, cell.y + r.step_y * (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 1));
+    return normal_at(normals, rows, cols, col, cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 1)));
 }
 
 // The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.

@@ -25,8 +25,8 @@ from gpusense.models.field import LikelihoodFieldModel
 from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.prepare import empty_rectangles
 from gpusense.reference.densities import log_mixture, naive_log_mixture
+from gpusense.replay import Launch, Recorder, replay
 from gpusense.scanner import Scanner
-from gpusense.selftest import Launch, Recorder, replay
 from gpusense.tolerances import TOLERANCES, beam_tolerance, per_scan
 from gpusense.weights import normalize_weights
 

@@ -215,6 +215,10 @@ def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, t
     assert [row["set"] for row in report["sets"]] == sets and str(data_dir) not in json.dumps(report)
     for row in report["sets"]:
         assert row["fit"]["converged"] and row["discrete"]["converged"] and row["held_out"][0]["name"] == "fitted"
+    logs = run_script("fit_real.py", *arguments, "--set", "intel", "--scans", "60", "--block", "5", "--incidence", "3",
+                      output=tmp_path / "logs")  # fmt: skip
+    own = logs["sets"][0]["incidence"]
+    assert len(own["fit"]["fits"]) == 3 and 0 < own["gain"] < 1 and own["gain_error"] < 0.2
     # Both sonars sit a little off the reference; the laser's is a set-up error of millimetres.
     bias = {row["set"]: row["fit"]["range_bias"] for row in report["sets"]}
     assert abs(bias["sonar1"] + 0.027) < 0.01 and abs(bias["sonar2"]) < 0.01 and 0 < bias["lidar_wall"] < 0.01

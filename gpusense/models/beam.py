@@ -16,7 +16,7 @@ from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
 from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, tiles_of
-from gpusense.cones import cones_of, require_exact
+from gpusense.cones import bins_of, cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
@@ -47,9 +47,9 @@ class BeamModel(ScanModel):
         parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, the table of a sensor of the
             scanner's range_max, of which every beam is one look-up, max readings too.
         incidence: Instead of ``parameters``, those for each range of angles of incidence: between a beam and the normal
-            of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has those of the first
-            range. Where ``z_max`` differs between them, max readings depend on the pose, and are impossible where it
-            is 0. Needs an exact caster.
+            of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has its ``no_surface``, or
+            those of the first range. Where ``z_max`` differs between them, max readings depend on the pose, and are
+            impossible where it is 0. Needs an exact caster.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
         caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
@@ -101,13 +101,14 @@ class BeamModel(ScanModel):
         self.incidence_parameters = incidence
         # The parameters of each bin of angles of incidence.
         self._kinds: tuple[BeamParameters, ...] = (own,)
+        cosines = np.zeros(1)
         if incidence is not None:
             if not isinstance(incidence, IncidenceParameters):
                 raise TypeError(f"incidence: must be IncidenceParameters, got {_checks.show(incidence)}")
             for name, value in (("parameters", parameters), ("sensor_table", sensor_table), ("compat", compat)):
                 if value is not None:
                     raise ValueError(f"{name}: must be None with incidence, got {_checks.show(value)}")
-            self._kinds = incidence.parameters
+            self._kinds, cosines = bins_of(incidence)
         compat_module.check_weights(own, compat)
         if peer is not None:
             caster = "bresenham" if caster is None else caster
@@ -134,8 +135,7 @@ class BeamModel(ScanModel):
         self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
         self._terms_there = self._backend.upload(self._terms)
-        edges = (0.0, math.pi / 2) if incidence is None else incidence.edges
-        self._edges = self._backend.upload(np.cos(edges[1:]).astype(self._real))
+        self._edges = self._backend.upload(cosines.astype(self._real))
         self._none = self._backend.upload(np.zeros(1, np.int32))
         # Where the readings of each ray begin while no rays are shared.
         self._one_each = self._backend.upload(np.arange(scanner.count + 1, dtype=np.int32))
@@ -267,7 +267,8 @@ class BeamModel(ScanModel):
         how = "" if caster.name == "exact" else f", ranges by {caster}"
         how += self._cones.words(self.scanner.critical_incidence)
         if self.incidence_parameters is not None:
-            how += f", parameters for {len(self._kinds)} ranges of the angle of incidence"
+            how += f", parameters for {len(self.incidence_parameters.parameters)} ranges of the angle of incidence"
+            how += " and for none" if self.incidence_parameters.no_surface is not None else ""
             how += " (max readings depend on it)" if self._max_depends else ""
         name = "beam model" if self._discrete is None else "discrete beam model"
         title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"

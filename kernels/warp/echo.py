@@ -32,10 +32,11 @@ def functions(flags):
     INCIDENCE = "INCIDENCE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     TO_THE_LIMIT = bool({"LOOKUP", "BRESENHAM"} & flags)
-    ZERO, ONE = real(0.0), real(1.0)
+    ZERO, ONE, TWO = real(0.0), real(1.0), real(2.0)
     NOWHERE = real(math.nan)
 
-    # Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 1 and 0 there.
+    # Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 2 and 0 there: more
+    # than any cosine, so that the first of the bins may be for such beams alone.
     @wp.struct
     class Echo:
         t: real
@@ -102,7 +103,7 @@ def functions(flags):
     ):
         echo = Echo()
         echo.t = limit
-        echo.cosine = ONE
+        echo.cosine = TWO
         for i in range(first, first + cone_rays):
             # Most casters need not look beyond what is found; those of tables and lines must.
             farthest = real(echo.t)

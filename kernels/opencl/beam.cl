@@ -227,4 +227,59 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         }
     }
 }
+
+// The same where every ray has one reading and there is one scan: a group's work-items pass what readings add on to each
+// other and add them up in blocks of BLOCK_TERMS, as other kernels do. A block's sum is at parts[place * across +
+// block * along].
+kernel void beam_blocks(global const entry *restrict map_table, global const real2 *restrict normals,
+                        global const int2 *restrict pose_cell, global const real4 *restrict pose,
+                        global const int *restrict order, global const real2 *restrict ray,
+                        global const real *restrict reading, global const real *restrict terms,
+                        global const real *restrict edges, global const real *restrict sensor,
+                        global real *restrict parts, const int rows, const int cols, const int particles,
+                        const int rays, const int kinds, const int cone_rays, const real critical, const int bins,
+                        const real slack, const real tolerance, const int cells, const real per_metre,
+                        const real limit, const real resolution, const real range_max, const int across,
+                        const int along, const int spread) {
+    local real added[BLOCK_TERMS * TILE_PARTICLES];
+    const int item = get_global_id(0), own = item % TILE, place = tile_place(item, spread);
+    const int first = tile_place(item - own, spread), last = particles - 1;
+    // Work-items without a particle keep the others company, since all of a group must meet.
+    int n = min(place, last);
+#if ORDERED
+    n = order[n];
+#endif
+    const int2 cell = pose_cell[n];
+    const real4 own_pose = pose[n];
+    for (int block = tile_group(item, spread); block * BLOCK_TERMS < rays; block += 1 << spread) {
+        for (int i = own % TILE_RAYS; i < BLOCK_TERMS; i += TILE_RAYS) {
+            const int r = block * BLOCK_TERMS + i;
+            real term = 0;
+            if (r < rays && place <= last) {
+#if ECHO
+                const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, own_pose, ray + r * cone_rays,
+                                               cone_rays, critical, limit, bins, slack, tolerance);
+                const real t = echo.t;
+#else
+                const real t = cast_ray(map_table, rows, cols, cell, own_pose, ray[r], limit, bins, slack, tolerance);
+#endif
+                const real expected = expected_range(t, limit, resolution, range_max);
+#if INCIDENCE
+                global const real *kind = incidence_terms(terms, edges, kinds, echo.cosine);
+#else
+                global const real *kind = terms;
+#endif
+                term = reading_term(reading[r], expected, kind, sensor, cells, per_metre, range_max);
+            }
+            added[i * TILE_PARTICLES + own / TILE_RAYS] = term;
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (own < TILE_PARTICLES && first + own <= last) {
+            real sum = 0;
+            for (int i = 0; i < BLOCK_TERMS; ++i) sum += added[i * TILE_PARTICLES + own];
+            parts[(first + own) * across + block * along] = sum;
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+}
 #endif

@@ -30,7 +30,7 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.commands._common import machine
-from gpusense.selftest import Recorder, replay
+from gpusense.replay import Recorder, replay
 from gpusense.tolerances import differing, per_scan
 from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 

@@ -22,7 +22,8 @@ does not. Standard errors of the held-out figures are those of blocks of neighbo
 of a sonar. Others' defaults are those of nav2_amcl and Beluga with their weights divided by their sums, in the book's
 normalised mixture. Where the fitted parameters make a held-out reading impossible, half a reading of each cause is
 added to them ("softened"). --discrete adds the discrete model with dependent causes, learned in steps of that width
-on the same half, and what it gains over the fitted mixture in the same steps.
+on the same half, and what it gains over the fitted mixture in the same steps. --incidence adds, for the logs of SICK
+lasers, parameters for so many bins of angles of incidence, and what they gain over the same parameters for all angles.
 """
 
 from __future__ import annotations
@@ -98,7 +99,9 @@ def log(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData
     folder = data / "carmen_logs"
     grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
     scans = logged_scans(folder / f"{name}-corrected.log.gz", every=2, offset=1, limit=arguments.scans or None)
-    return fitting.data_of_log(grid, scans, backend=arguments.backend, block=arguments.block).halves()
+    return fitting.data_of_log(
+        grid, scans, backend=arguments.backend, block=arguments.block, incidence=bool(arguments.incidence)
+    ).halves()
 
 
 def laser(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
@@ -172,7 +175,29 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
     }  # fmt: skip
     if arguments.discrete:
         report["discrete"] = discrete(half, rest, fit.parameters, bias, arguments.discrete)
+    if arguments.incidence and half.incidence is not None:
+        report["incidence"] = by_incidence(half, rest, fit.parameters, arguments.incidence, arguments.backend)
     return report
+
+
+def by_incidence(
+    half: RangeData, rest: RangeData, parameters: gs.BeamParameters, bins: int, backend: str
+) -> dict[str, Any]:
+    """Parameters by angle of incidence learned on one half, against those for all angles on the other."""
+    assert half.incidence is not None
+    fit = gs.fit_incidence_parameters(
+        half.ranges, half.expected, half.incidence, half.range_max, range_min=half.range_min, bins=bins, backend=backend
+    )
+    rest = rest.chosen(rest.kinds != gs.Reading.MISSING)
+    assert rest.incidence is not None and fit.parameters.no_surface is not None
+    place = np.digitize(rest.incidence, fit.parameters.edges[1:-1])
+    place[np.isnan(rest.incidence)] = bins
+    gain = -held_out.log_densities(parameters, rest)
+    for number, own in enumerate((*fit.parameters.parameters, fit.parameters.no_surface)):
+        gain[place == number] += held_out.log_densities(own, rest.chosen(place == number))
+    _, block = np.unique(rest.block, return_inverse=True)
+    mean, error = held_out.block_mean(gain, block)
+    return {"fit": fit.to_dict(), "gain": finite(mean), "gain_error": finite(error)}
 
 
 def discrete(
@@ -249,6 +274,16 @@ def to_markdown(reports: list[dict[str, Any]]) -> str:
             cells = [pair(own["causes"][name], own["standard_errors"][name]) for name in causes]
             gain = pair(own["gain"], own["gain_error"])
             lines.append(f"| {report['set']} | {own['bins']} | {' | '.join(cells)} | {gain} |")
+    if any("incidence" in report for report in reports):
+        lines += ["", "### Parameters by angle of incidence against the same for all, on the held-out readings", ""]
+        lines += ["| set | sigma_hit of the bins [m] | z_max of the bins | readings without a surface | gain [nats] |"]
+        lines.append("| --- " * 5 + "|")
+        for report in (report for report in reports if "incidence" in report):
+            own = report["incidence"]
+            each = own["fit"]["parameters"]["parameters"]
+            cells = [", ".join(f"{one[name]:.3g}" for one in each) for name in ("sigma_hit", "z_max")]
+            gain = pair(own["gain"], own["gain_error"])
+            lines.append(f"| {report['set']} | {' | '.join(cells)} | {own['fit']['no_surface_count']} | {gain} |")
     return "\n".join(lines)
 
 
@@ -260,6 +295,7 @@ def main() -> int:
     parser.add_argument("--scans", type=int, default=0, help="at most so many scans of a laser; 0: all")
     parser.add_argument("--block", type=int, default=10, help="neighbouring scans of a block")
     parser.add_argument("--discrete", type=float, help="also learn the discrete model, in steps of so many metres")
+    parser.add_argument("--incidence", type=int, help="also fit so many bins of angles of incidence, where known")
     parser.add_argument("--backend", default="auto")
     parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
     parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")

@@ -15,6 +15,8 @@ from gpusense.logs.mrclam import read_mrclam
 
 # The LEGO robot: metres per tick, distance of its wheels, and from where a cylinder is hit to its axis.
 _TICK, _TRACK, _AXIS = 0.000349, 0.150, 0.09
+# Noise that is added to the simulated robot's odometry: of each turn [rad], and of each way, as a share of it.
+_TURN, _WAY = 0.05, 0.1
 
 
 def run_of(data: Path, name: str) -> LandmarkRun:
@@ -113,26 +115,39 @@ def _lego(data: Path) -> LandmarkRun:
 
 
 def _freiburg(data: Path) -> LandmarkRun:
-    """Simulated; there is no true path, so logged poses are those of its nearly exact odometry."""
+    """Simulated; there is no true path, so logged poses are those of its nearly exact odometry.
+
+    A filter would have nothing to do with that: it gets the odometry with noise of a poor robot added.
+    """
     folder = data / "freiburg_course"
     world = np.loadtxt(folder / "world.dat")
     index = {int(row[0]): i for i, row in enumerate(world)}
-    poses, rows, below = [], [], 0
-    x = y = theta = 0.0
+    steps, rows, below = [], [], 0
     for line in (folder / "sensor_data.dat").read_text().splitlines():
         word, *numbers = line.split()
         if word == "ODOMETRY":
-            first, way, second = map(float, numbers)
-            theta += first
-            x, y, theta = x + way * math.cos(theta), y + way * math.sin(theta), theta + second
-            poses.append((x, y, theta))
+            steps.append([float(number) for number in numbers])
         elif float(numbers[1]) < 0:
             below += 1
         else:
-            rows.append((float(numbers[1]), float(numbers[2]), index[int(numbers[0])], len(poses) - 1))
-    table, track = np.array(rows), np.array(poses)
+            rows.append((float(numbers[1]), float(numbers[2]), index[int(numbers[0])], len(steps) - 1))
+    table, moves = np.array(rows), np.array(steps)
+    track = _path(moves)
+    noise = np.random.default_rng(0).normal(size=moves.shape)
+    poor = _path(
+        moves + noise * np.stack([np.full(len(moves), _TURN), _WAY * moves[:, 1], np.full(len(moves), _TURN)], axis=1)
+    )
     return LandmarkRun(
-        gs.LandmarkMap(world[:, 1:]), world[:, 0].astype(int), np.arange(len(track), dtype=float), track, track,
+        gs.LandmarkMap(world[:, 1:]), world[:, 0].astype(int), np.arange(len(track), dtype=float), poor, track,
         table[:, :2], table[:, 3].astype(int), table[:, 2].astype(int), float(math.ceil(table[:, 0].max())),
         2 * math.pi, {"ranges below 0": below},
     )  # fmt: skip
+
+
+def _path(moves: np.ndarray) -> np.ndarray:
+    """(S, 3) poses after (S, 3) first turns, ways and second turns, from the origin."""
+    heading = np.cumsum(moves[:, 0] + moves[:, 2])
+    along = heading - moves[:, 2]
+    return np.column_stack([
+        np.cumsum(moves[:, 1] * np.cos(along)), np.cumsum(moves[:, 1] * np.sin(along)), heading
+    ])  # fmt: skip

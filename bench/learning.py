@@ -1,12 +1,14 @@
-"""How fast the beam model's parameters are learned, and how well: rates, fifty scenes, ten starts, degenerate readings.
+"""How fast the beam model's parameters are learned, and how well: rates, fifty scenes, ten starts.
 
     python bench/learning.py --backend numpy --backend opencl --backend warp:cpu --output bench/results/learning_cpu
     python bench/learning.py --backend numpy --backend opencl --pairs 100000 --count 1000 --starts 2     # a quick look
 
-*Rates*: one EM iteration (pass over the pairs and M-step) on --pairs pairs of a typical scene, without the second
-derivatives and with them, the upload, and a whole fit from its own start, as the best and the median of several runs;
-beside them the NumPy reference on the same pairs (a part of them where it is slow, said so), whose sums each backend's
-must match: *error* is the largest difference of the fitted parameters, relative, in float64.
+*Rates*: one EM iteration (M-step and the passes over the pairs that it tries) on --pairs pairs of a typical scene,
+without the second derivatives and with them, the upload, and a whole fit from its own start, as the best and the
+median of several runs; one pass, and what of it are the kernel, waited for, and the copy of its rows, the rest being
+their sum on the host, and in brackets a pass without lanes where the device has some; beside them the NumPy reference
+on the same pairs (a part of them where it is slow, said so), whose sums each backend's must match: *error* is the
+largest difference of the fitted parameters, relative, in float64.
 
 *Scenes*: fifty scenes with known parameters, from mild to stiff. Parameters whose standard error is below 30 % of
 them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
@@ -20,7 +22,9 @@ or an end differs by more than 1e-4 nats.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +32,75 @@ import numpy as np
 from speed import best, command_line, machine, write_report
 
 import gpusense as gs
-from gpusense.backends import get_backend
+from gpusense.backends import Backend, get_backend
 from gpusense.learning.device_sums import DeviceSums
 from gpusense.learning.em import em_step
 from gpusense.learning.options import make_bounds, open_device
-from gpusense.learning.pairs import make_pairs
-from gpusense.learning.point import first_guess, random_start
+from gpusense.learning.pairs import Pairs, make_pairs
+from gpusense.learning.point import Point, first_guess, random_start
 from gpusense.learning.problem import NO_PRIOR, Problem
 from gpusense.learning.scenes import Scene, learning_scenes
 
 TYPICAL = Scene("typical", gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 0.5), 30.0, (0.02, 0.98))
 IDENTIFIED, FALLS, SHARE, NATS = 0.3, 1e-9, 0.95, 1e-4
+
+
+class Timed:
+    """A backend that passes everything on to another one, and notes how long kernels and copies back take.
+
+    Attributes:
+        info: That of the other one; without lanes where it is told so.
+        seconds: Of kernels and of downloads, since it was last emptied.
+    """
+
+    def __init__(self, backend: Backend, lanes: bool = True) -> None:
+        self._backend = backend
+        self.info = backend.info if lanes else dataclasses.replace(backend.info, lanes=1)
+        self.seconds = {"kernel": 0.0, "download": 0.0}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._backend, name)
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Any:
+        """See Backend.compile; launches are waited for."""
+        launch = self._backend.compile(kernel, flags)
+
+        def timed(size: tuple[int, ...], *arguments: Any) -> None:
+            self._backend.synchronize()
+            begin = time.perf_counter()
+            launch(size, *arguments)
+            self._backend.synchronize()
+            self.seconds["kernel"] += time.perf_counter() - begin
+
+        return timed
+
+    def download(self, buffer: Any, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download."""
+        begin = time.perf_counter()
+        found = self._backend.download(buffer, out, wait=wait)
+        self.seconds["download"] += time.perf_counter() - begin
+        return found
+
+
+def pass_parts(backend: Backend, real: np.dtype, pairs: Pairs, point: Point, repeats: int) -> dict[str, float]:
+    """Seconds of the quickest of some passes over the pairs, without second derivatives, and of its parts.
+
+    ``scalar_s`` is that of passes without lanes, in turns with the others, where the device asks for lanes.
+    """
+    ways = [Timed(backend)] + ([Timed(backend, lanes=False)] if backend.info.lanes > 1 else [])
+    devices = [DeviceSums(timed, real, pairs) for timed in ways]
+    found: list[list[dict[str, float]]] = [[] for _ in ways]
+    # The first pass compiles.
+    for number in range(max(repeats, 1) + 1):
+        for timed, device, seen in zip(ways, devices, found, strict=True):
+            timed.seconds = dict.fromkeys(timed.seconds, 0.0)
+            begin = time.perf_counter()
+            device.sums(point)
+            whole = time.perf_counter() - begin
+            if number:
+                seen.append({"pass_s": whole} | {f"{name}_s": value for name, value in timed.seconds.items()})
+    quickest = [min(seen, key=lambda one: one["pass_s"]) for seen in found]
+    return quickest[0] | ({"scalar_s": quickest[1]["pass_s"]} if len(ways) > 1 else {})
 
 
 def values(parameters: gs.BeamParameters) -> np.ndarray:
@@ -67,6 +129,7 @@ def rates(
     problem.value(value.point, second=True)
     plain = best(lambda: em_step(problem, value), arguments.repeats, arguments.seconds)
     second = best(lambda: em_step(problem, value, second=True), arguments.repeats, arguments.seconds)
+    parts = pass_parts(backend, real, pairs, value.point, arguments.repeats)
     fits: list[gs.BeamFit] = []
 
     def fit() -> None:
@@ -94,7 +157,7 @@ def rates(
     return {
         "backend": backend.info.selection, "device": backend.info.name, "precision": precision, "pairs": count,
         "hits": pairs.hits, "upload_s": uploaded[0], "iteration_s": plain[0], "iteration_median_s": plain[1],
-        "second_s": second[0], "pairs_per_s": pairs.hits / plain[0], "fit_s": whole[0],
+        "second_s": second[0], **parts, "pairs_per_s": pairs.hits / plain[0], "fit_s": whole[0],
         "iterations": fits[-1].iterations, "passes": fits[-1].passes, "error": error, "converged": fits[-1].converged,
     }  # fmt: skip
 
@@ -117,6 +180,7 @@ def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[
     off = (values(fit.parameters) - values(scene.parameters)) / error
     identified = np.isfinite(error) & (error < IDENTIFIED * values(fit.parameters))
     ends: dict[str, float] = {}
+    passes = {"em": [fit.passes]}
     if identified.all():
         rng = np.random.default_rng(arguments.seed + number)
         guess = first_guess(pairs, bounds)
@@ -125,31 +189,47 @@ def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[
             each = [
                 gs.fit_beam_parameters(z, expected, scene.range_max, method=method, initial=s, **run) for s in starts
             ]
+            passes[method] = [one.passes for one in each]
             ends[method] = max((abs(one.log_likelihood - fit.log_likelihood) for one in each), default=0.0)
     return {
         "scene": scene.name, "truth": scene.parameters.to_dict(), "found": fit.parameters.to_dict(),
         "identified": int(identified.sum()), "within": int((np.abs(off[identified]) <= 3).sum()),
         "worst": float(np.max(np.abs(off[identified]), initial=0.0)), "iterations": fit.iterations,
-        "passes": fit.passes, "converged": fit.converged, "fall": fall(fit.trace), "book_fall": fall(book.trace),
+        "passes": passes, "converged": fit.converged, "fall": fall(fit.trace), "book_fall": fall(book.trace),
         "book_falls": int((np.diff(book.trace) < -1e-9 * abs(book.trace[-1])).sum()),
         "book_behind": fit.log_likelihood - book.log_likelihood, "ends": ends,
     }  # fmt: skip
 
 
+def passes_text(scenes: list[dict[str, Any]]) -> str:
+    """Between which numbers of passes most fits of each method take: the quantiles of 5 and 95 %."""
+    found = {}
+    for method in ("em", "gradient", "hill_climb"):
+        counts = [count for scene in scenes for count in scene["passes"].get(method, [])]
+        if counts:
+            low, high = np.quantile(counts, (0.05, 0.95))
+            found[method] = f"{method} {low:.0f} to {high:.0f}"
+    return ", ".join(found.values())
+
+
 def to_markdown(rows: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> str:
     """Both tables."""
     lines = [
-        "| backend | precision | pairs | upload ms | EM iteration ms | with 2nd derivatives ms | 10^6 pairs/s "
-        "| x NumPy | fit s | passes | error |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| backend | precision | pairs | upload ms | EM iteration ms | with 2nd derivatives ms "
+        "| one pass (no lanes) ms | kernel, copy, sum ms | 10^6 pairs/s | x NumPy | fit s | passes | error |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     numpy = {row["precision"]: row["pairs_per_s"] for row in rows if row["backend"] == "numpy"}
     for r in rows:
         base = numpy.get(r["precision"])
         ratio = f"{r['pairs_per_s'] / base:.1f}" if base else "-"
+        scalar = f" ({1e3 * r['scalar_s']:.2f})" if "scalar_s" in r else ""
+        left = r["pass_s"] - r["kernel_s"] - r["download_s"]
         lines.append(
             f"| {r['backend']} ({r['device']}) | {r['precision']} | {r['pairs']} | {1e3 * r['upload_s']:.1f} "
-            f"| {1e3 * r['iteration_s']:.2f} | {1e3 * r['second_s']:.2f} | {r['pairs_per_s'] / 1e6:.1f} | {ratio} "
+            f"| {1e3 * r['iteration_s']:.2f} | {1e3 * r['second_s']:.2f} | {1e3 * r['pass_s']:.2f}{scalar} "
+            f"| {1e3 * r['kernel_s']:.2f}, {1e3 * r['download_s']:.2f}, {1e3 * left:.2f} "
+            f"| {r['pairs_per_s'] / 1e6:.1f} | {ratio} "
             f"| {r['fit_s']:.3f} | {r['passes']} | {r['error']:.1e} |"
         )
     lines += [
@@ -200,7 +280,8 @@ def main() -> int:
     described = ", ".join(f"{name} {value}" for name, value in host.items())
     text = (
         f"{to_markdown(rows, scenes)}\n\n{within} of {identified} identified parameters within 3 standard errors; "
-        f"exact EM falls by at most {fell:.1e} of the log-likelihood; other ways end within {off:.1e} nats.\n\n"
+        f"exact EM falls by at most {fell:.1e} of the log-likelihood; other ways end within {off:.1e} nats. "
+        f"Passes over the pairs of 9 fits in 10: {passes_text(scenes)}.\n\n"
         f"Machine: {described}. Command: `{command}`.\n"
     )
     print(text)

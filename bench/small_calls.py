@@ -3,11 +3,11 @@
     python bench/small_calls.py --backend opencl
     python bench/small_calls.py --backend warp:cuda:0 --output bench/results/small_calls_name
 
-Times are of whole calls of ``log_likelihood``: NumPy arrays in and out, poses and result on the device where it has
-arrays (Warp's CUDA), and many scans in one call against as many calls. Each is taken beside the plain way (copies by
-commands, each launch started on its own), in turns, so that their ratio holds on a busy machine; results of both must
-have the same bits. Bound calls (``bind``) are taken beside ``log_likelihood`` with the same arrays, with a wait after
-each call and after many: poses, readings and result are on the device where it has arrays, and in host memory
+Times are of whole calls of ``log_likelihood``: NumPy arrays in and out, and poses and result on the device where it has
+arrays (Warp's CUDA); for several scans in one call see ``several_scans.py``. Each is taken beside the plain way (copies
+by commands, each launch started on its own), in turns, so that their ratio holds on a busy machine; results of both
+must have the same bits. Bound calls (``bind``) are taken beside ``log_likelihood`` with the same arrays, with a wait
+after each call and after many: poses, readings and result are on the device where it has arrays, and in host memory
 elsewhere, where a bound call is the ordinary one. "Kernels" are the launches of an ordinary call, started one after the
 other with everything on the device.
 """
@@ -162,7 +162,6 @@ class Bench:
                     call_there = functools.partial(call, poses=there)
                     self.add(f"{size}, on the device{what}", call_there, call_there, kernels, calls)
                 self.bound(f"{size}, bound", model, poses, kernels)
-            self.several(name, model, next(iter(self.clouds.values())), kernels)
         graphs = getattr(self.device, "_graphs", None)
         if graphs is not None and self.device._gathers:
             refused = ", and the driver refused one" if graphs.failed else ""
@@ -197,22 +196,6 @@ class Bench:
                 kernels, max(calls // count, 3), contextlib.nullcontext, count,
             )  # fmt: skip
 
-    def several(self, name: str, model: Any, poses: np.ndarray, kernels: float) -> None:
-        """Many scans in one call, against as many calls, both the short way."""
-        count, clouds = len(self.scans), np.stack([poses] * len(self.scans))
-
-        def together(_: int) -> np.ndarray:
-            found: np.ndarray = model.log_likelihood(clouds, self.scans)
-            return found
-
-        def apart(_: int) -> np.ndarray:
-            return np.stack([model.log_likelihood(poses, scan) for scan in self.scans])
-
-        what = f"{name}, {count} scans of {len(poses)} x {self.scanner.count} in one call"
-        calls = max(self.arguments.calls // count, 3)
-        self.add(what, together, together, kernels * count, calls)
-        self.add(f"{what.removesuffix('one call')}{count} calls", apart, apart, kernels * count, calls)
-
 
 def read(array: Any) -> np.ndarray:
     """The bits of a result, wherever it is."""
@@ -241,7 +224,7 @@ def main() -> int:
     parser.add_argument("--backend", action="append", required=True, help="selection string; may be repeated")
     parser.add_argument("--particles", type=int, action="append", help="default: 2000 and 4000")
     parser.add_argument("--beams", type=int, default=60)
-    parser.add_argument("--scans", type=int, default=100, help="of the calls that take several")
+    parser.add_argument("--scans", type=int, default=100, help="that calls of other scans take in turn")
     parser.add_argument("--size", type=float, default=50.0, help="side of the built-in building in metres")
     parser.add_argument("--range-max", type=float, default=10.0)
     parser.add_argument("--calls", type=int, default=400)

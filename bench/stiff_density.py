@@ -154,7 +154,7 @@ def grid_table(backends: list[str]) -> None:
 
 def bilinear_table() -> None:
     """What rounding a position within a cell costs the interpolated field in float32, beside a cliff of distances."""
-    from gpusense.selftest import Recorder, replay
+    from gpusense.replay import Recorder, replay
     from gpusense.tolerances import beam_tolerance
 
     case = next(case for case in stiff.cases() if case.name.startswith("in walls"))

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from gpusense.models.caster import CasterMethod, RayCaster
     from gpusense.models.field import LikelihoodFieldModel
     from gpusense.models.landmark import LandmarkModel
+    from gpusense.models.several import log_likelihoods
     from gpusense.normals import surface_normals
     from gpusense.parameters import BeamParameters, IncidenceParameters, LandmarkParameters, LikelihoodFieldParameters
     from gpusense.positions.bearings import triangulate, triangulate_triangle
@@ -85,6 +86,7 @@ _HOME = {
     "fit_incidence_parameters": "gpusense.learning.incidence",
     "fit_landmark_parameters": "gpusense.learning.landmarks",
     "locate": "gpusense.positions.both",
+    "log_likelihoods": "gpusense.models.several",
     "normalize_weights": "gpusense.weights",
     "read_log": "gpusense.logs",
     "read_map": "gpusense.map_io",
@@ -139,6 +141,7 @@ __all__ = [
     "fit_incidence_parameters",
     "fit_landmark_parameters",
     "locate",
+    "log_likelihoods",
     "normalize_weights",
     "read_log",
     "read_map",

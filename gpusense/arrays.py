@@ -106,8 +106,10 @@ def _flat(address: int, count: int, dtype: Any, device: str) -> Buffer:
     return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
 
 
-def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int, bool, object]:
+def adopt_poses(array: object, backend: Backend, name: str, several: bool = False) -> tuple[Buffer, int, bool, object]:
     """(N, 3) poses on the device as a flat buffer, their number, whether they are float32, and what owns the memory.
+
+    Several scans have (S, N, 3) poses, S N altogether.
 
     Raises:
         TypeError: not float32 or float64, or not on the backend's device.
@@ -116,13 +118,14 @@ def adopt_poses(array: object, backend: Backend, name: str) -> tuple[Buffer, int
     import warp as wp
 
     found = _adopt(array, backend, name)
-    if found.ndim != 2 or found.shape[1] != 3:
-        raise ValueError(f"{name}: shape must be (N, 3), got {shape_text(found.shape)}")
+    wanted = ("S", "N", 3) if several else ("N", 3)
+    if found.ndim != len(wanted) or found.shape[-1] != 3:
+        raise ValueError(f"{name}: shape must be {shape_text(wanted)}, got {shape_text(found.shape)}")
     if found.dtype not in (wp.float32, wp.float64):
         raise TypeError(f"{name}: must hold float32 or float64, got {found.dtype.__name__}")
     if not found.is_contiguous:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {found.strides}")
-    count = found.shape[0]
+    count = found.size // 3
     flat = _flat(found.ptr, 3 * count, found.dtype, found.device.alias) if count else found.flatten()
     return flat, count, found.dtype == wp.float32, found
 

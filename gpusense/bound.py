@@ -180,7 +180,7 @@ class _DeviceCall(BoundCall):
         self._given = (poses, ranges, found, self.out)
         # Buffers of its own: other calls of the model may come between.
         self._space = Workspace(backend)
-        self._none = backend.upload(np.zeros(1, _INT))
+        self._none, self._no_terms = backend.upload(np.zeros(1, _INT)), backend.upload(np.zeros(1, real))
         self._scene = model._bound_scene()
         self._scan, self._place, self._fixed_rows = self._placing_of(found)
         self._record()
@@ -277,6 +277,6 @@ class _DeviceCall(BoundCall):
             if each:
                 score(placed, cloud.headings(), count, scan, backend.part(parts, count * fixed, count * each))
             backend.compile("sum_parts", flags)(
-                (count,), parts, self._none, backend.part(self._result, begin, count), count, fixed + each, block, 1,
-                count, 0.0, model.temperature,
+                (count,), parts, self._none, self._none, self._no_terms, backend.part(self._result, begin, count),
+                count, fixed + each, block, 1, count, 0.0, model.temperature, count,
             )  # fmt: skip

@@ -6,6 +6,7 @@ NumPy arrays are checked and bounded here; arrays that are on the device already
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,17 +48,18 @@ class Cloud:
         poses: Numbers, or an array on the device.
         backend: The device.
         name: What messages call them.
+        several: An array on the device is (S, N, 3), the poses of S scans one after the other.
 
     Raises:
         TypeError: not numbers, or an array that this device cannot read.
         ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
     """
 
-    def __init__(self, poses: object, backend: Backend, name: str = "poses") -> None:
+    def __init__(self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False) -> None:
         self.host: np.ndarray | None = None
         self.on_device = arrays.on_device(poses)
         if self.on_device:
-            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name)
+            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name, several)
             return
         given = arrays.to_host(poses, name)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
@@ -157,13 +159,31 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
     Raises:
         ValueError: a pose on the device that was placed in it was not finite.
     """
-    verdict = np.zeros(2, _INT)
-    if on_device:
-        space.download(space.empty("verdict", 2, _INT, zero=True), verdict)
-    space.wait()
-    if verdict[0]:
-        space.upload("verdict", np.zeros(2, _INT))
+    finish_all([(space, on_device)], name)
+
+
+def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") -> None:
+    """Wait for a call that used one workspace or several of a device to end.
+
+    Args:
+        spaces: Each workspace, and whether it had poses that are on the device.
+        name: What messages call the poses.
+
+    Raises:
+        ValueError: a pose on the device that was placed in it was not finite.
+    """
+    verdicts = np.zeros((len(spaces), 2), _INT)
+    for (space, on_device), verdict in zip(spaces, verdicts, strict=True):
+        if on_device:
+            space.download(space.empty("verdict", 2, _INT, zero=True), verdict)
+    for space, _ in spaces:
+        # All that a device has to do is done after the first.
         space.wait()
+    for (space, _), verdict in zip(spaces, verdicts, strict=True):
+        if verdict[0]:
+            space.upload("verdict", np.zeros(2, _INT))
+            space.wait()
+    if verdicts[:, 0].any():
         raise ValueError(f"{name}: must be finite, got a pose on the device that is not")
 
 

@@ -5,9 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from gpusense import _checks
 from gpusense.casters import Caster
+from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.scanner import Scanner
+
+# Between every cosine and what kernels have for one where nothing returns.
+_BEYOND = 1.5
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,14 @@ def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
     if incidence:
         require_exact("caster", method)
     return Cones(scanner.cone_rays, least, incidence)
+
+
+def bins_of(incidence: IncidenceParameters) -> tuple[tuple[BeamParameters, ...], np.ndarray]:
+    """The mixtures in the kernels' order, that of beams that hit nothing first, and the cosines that part them."""
+    cosines = np.cos(incidence.edges[1:])
+    if incidence.no_surface is None:
+        return incidence.parameters, cosines
+    return (incidence.no_surface, *incidence.parameters), np.append(_BEYOND, cosines)
 
 
 def require_exact(argument: str, method: Caster) -> None:

@@ -83,13 +83,8 @@ def full_circle(p: LandmarkParameters) -> bool:
     return p.field_of_view >= 2 * math.pi
 
 
-def check_features(features: object, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
-    """(F, 3) float64 features; NaN is what was not measured or is left out. Bearings are in [-pi, pi].
-
-    Raises:
-        TypeError: not numbers.
-        ValueError: another shape, or a value outside what the sensor can measure.
-    """
+def _read(features: object, p: LandmarkParameters) -> np.ndarray:
+    """(F, 3) float64 features; NaN is what was not measured or is left out. Finite bearings are in [-pi, pi]."""
     given = _checks.as_array("features", features)
     given = np.zeros((0, 2)) if given.shape == (0,) else _checks.array("features", given, finite=False)
     if given.ndim != 2 or given.shape[1] not in (2, 3):
@@ -99,28 +94,54 @@ def check_features(features: object, p: LandmarkParameters, span: tuple[float, f
     for column, sigma in enumerate((p.sigma_range, p.sigma_bearing, p.sigma_signature)):
         if sigma is None:
             full[:, column] = np.nan
-    _refuse(
-        full[:, 0], full[:, 0] < 0, full[:, 0] > p.range_max, f"range must be in [0, {p.range_max:.15g}] (range_max)"
-    )
-    _refuse(full[:, 1], np.isinf(full[:, 1]), np.False_, "bearing must be finite, or NaN where it was not measured")
-    full[:, 1] = wrapped(full[:, 1])
-    half = p.field_of_view / 2
-    if not full_circle(p):
-        _refuse(
-            full[:, 1],
-            np.abs(full[:, 1]) > half,
-            np.False_,
-            f"bearing must be in [-{half:.15g}, {half:.15g}] (field_of_view)",
-        )
-    rule = f"signature must be in [{span[0]:.15g}, {span[1]:.15g}] (signature_span)"
-    _refuse(full[:, 2], full[:, 2] < span[0], full[:, 2] > span[1], rule)
+    finite = np.isfinite(full[:, 1])
+    full[finite, 1] = wrapped(full[finite, 1])
     return full
 
 
-def _refuse(values: np.ndarray, low: np.ndarray, high: np.ndarray | np.bool, rule: str) -> None:
-    bad = np.flatnonzero(low | high)
-    if len(bad):
-        raise ValueError(f"features: {rule}, got {_checks.show(float(values[bad[0]]))} at index {bad[0]}")
+def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
+    """(F, 3) which parts are outside what the sensor can measure."""
+    half = math.inf if full_circle(p) else p.field_of_view / 2
+    low, high = np.array([0.0, -half, span[0]]), np.array([p.range_max, half, span[1]])
+    bad: np.ndarray = (full < low) | (full > high) | np.isinf(full)
+    return bad
+
+
+def possible_features(
+    features: object, p: LandmarkParameters, span: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) features, all NaN where the sensor cannot have measured a part of one, and (F,) which are so.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: another shape.
+    """
+    full = _read(features, p)
+    bad = np.asarray(_impossible(full, p, span).any(axis=1))
+    full[bad] = np.nan
+    return full, bad
+
+
+def check_features(features: object, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
+    """(F, 3) float64 features; NaN is what was not measured or is left out. Bearings are in [-pi, pi].
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: another shape, or a value outside what the sensor can measure.
+    """
+    full = _read(features, p)
+    half, rules = p.field_of_view / 2, [f"range must be in [0, {p.range_max:.15g}] (range_max)"]
+    if full_circle(p):
+        rules.append("bearing must be finite, or NaN where it was not measured")
+    else:
+        rules.append(f"bearing must be in [-{half:.15g}, {half:.15g}] (field_of_view)")
+    rules.append(f"signature must be in [{span[0]:.15g}, {span[1]:.15g}] (signature_span)")
+    bad = _impossible(full, p, span)
+    for column, rule in enumerate(rules):
+        at = np.flatnonzero(bad[:, column])
+        if len(at):
+            raise ValueError(f"features: {rule}, got {_checks.show(float(full[at[0], column]))} at index {at[0]}")
+    return full
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:

@@ -103,7 +103,9 @@ class IncidenceParameters:
     edges: tuple[float, ...]
     """(B + 1,) bounds of the bins, rising from 0 to pi / 2 [rad]."""
     parameters: tuple[BeamParameters, ...]
-    """(B,) the parameters of each bin; a beam that hits nothing has those of the first."""
+    """(B,) the parameters of each bin."""
+    no_surface: BeamParameters | None = None
+    """Those of beams that hit nothing, or nothing that returns; None for those of the first bin."""
 
     def __post_init__(self) -> None:
         edges = tuple(float(edge) for edge in _checks.array("edges", self.edges, ("B + 1",)))
@@ -117,12 +119,18 @@ class IncidenceParameters:
                 raise TypeError(f"parameters: must be BeamParameters, got {_checks.show(each)}")
         if len(parameters) != len(edges) - 1:
             raise ValueError(f"parameters: must be one for each of {len(edges) - 1} bins, got {len(parameters)}")
+        if self.no_surface is not None and not isinstance(self.no_surface, BeamParameters):
+            raise TypeError(f"no_surface: must be BeamParameters or None, got {_checks.show(self.no_surface)}")
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "parameters", parameters)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields by name, as plain numbers."""
-        return {"edges": list(self.edges), "parameters": [each.to_dict() for each in self.parameters]}
+        return {
+            "edges": list(self.edges),
+            "parameters": [each.to_dict() for each in self.parameters],
+            "no_surface": None if self.no_surface is None else self.no_surface.to_dict(),
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
@@ -134,9 +142,17 @@ class IncidenceParameters:
         """
         if not isinstance(values, Mapping):
             raise TypeError(f"values: must be a mapping, got {_checks.show(values)}")
-        if set(values) != {"edges", "parameters"}:
-            raise ValueError(f"{cls.__name__}: must have the fields edges and parameters, got {sorted(values)}")
-        return cls(values["edges"], tuple(BeamParameters.from_dict(each) for each in values["parameters"]))
+        if not {"edges", "parameters"} <= set(values) <= {"edges", "parameters", "no_surface"}:
+            rule = "must have the fields edges and parameters, and may have no_surface"
+            raise ValueError(f"{cls.__name__}: {rule}, got {sorted(values)}")
+        own, nothing = values["parameters"], values.get("no_surface")
+        if not isinstance(own, (list, tuple)):
+            raise TypeError(f"parameters: must be a list, got {_checks.show(own)}")
+        return cls(
+            values["edges"],
+            tuple(BeamParameters.from_dict(each) for each in own),
+            None if nothing is None else BeamParameters.from_dict(nothing),
+        )
 
 
 @dataclass(frozen=True)

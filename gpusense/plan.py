@@ -42,6 +42,11 @@ class Plan:
         return "\n".join(lines)
 
 
+ORDINARY_HEADINGS = Omission(
+    "reduction of huge headings", "no heading is beyond 2^20 rad", "192 bits of 2 / pi and 12 products per such heading"
+)
+
+
 def share(part: float, whole: float) -> str:
     """A part as a percentage of the whole."""
     return f"{100 * part / whole:.0f} %" if whole else "0 %"
@@ -96,10 +101,7 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
         least_ordered: Rays and particles from which a device puts the particles of a beam model in order; None for a
             device or a model that never does.
     """
-    found = []
-    if code and "HUGE_HEADINGS" not in code:
-        why = "no heading is beyond 2^20 rad"
-        found.append(Omission("reduction of huge headings", why, "192 bits of 2 / pi and 12 products per such heading"))
+    found = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
     if "QUICK" in code:
         found.append(
             Omission(

@@ -18,8 +18,23 @@ Beams = int | Sequence[int] | np.ndarray | None
 
 
 @dataclass(frozen=True)
+class Batch:
+    """Where each of S scans has its own among the readings of all.
+
+    Attributes:
+        start: (S + 1,) int32; rays of scan s are start[s] to start[s + 1] - 1.
+        counts: (S,) int32 readings that are evaluated of each scan.
+        constants: (S,) log-likelihoods of the readings that do not depend on the pose.
+    """
+
+    start: np.ndarray
+    counts: np.ndarray
+    constants: np.ndarray
+
+
+@dataclass(frozen=True)
 class PreparedScan:
-    """What a launch needs of a scan.
+    """What a launch needs of a scan, or of several one after the other.
 
     Attributes:
         columns: (M,) positions in the scan of the readings that are evaluated, in the order of their rays.
@@ -32,6 +47,8 @@ class PreparedScan:
         missing: Missing readings, left out.
         ignored_max: Max readings that say nothing because z_max = 0, left out.
         thinned: Informative readings left out by ``beams=``.
+        batch: Where several scans lie; the constant, the positions of max readings and the numbers of those left out
+            are then not filled in.
     """
 
     columns: np.ndarray
@@ -44,11 +61,22 @@ class PreparedScan:
     missing: int
     ignored_max: int
     thinned: int
+    batch: Batch | None = None
 
     @property
     def shared(self) -> bool:
         """Whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
+
+    @property
+    def most_readings(self) -> int:
+        """Readings of the scan, or of the one that has most."""
+        return len(self.readings) if self.batch is None else int(self.batch.counts.max(initial=0))
+
+    @property
+    def most_rays(self) -> int:
+        """Rays of the scan, or of the one that has most."""
+        return len(self.rays) if self.batch is None else int(np.diff(self.batch.start).max(initial=0))
 
 
 def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:
@@ -164,17 +192,23 @@ def _limits(range_min: float, range_max: float, dtype: np.dtype) -> tuple[np.flo
         return dtype.type(range_min), dtype.type(range_max)
 
 
-def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float) -> PreparedScan:
-    """``prepare_scan`` where all beams are used and none repeats another: what filters do at every step."""
+def hits_and_max(ranges: np.ndarray, scanner: Scanner) -> tuple[np.ndarray, np.ndarray]:
+    """Which readings of scans are ranges, and which are max readings."""
     nearest, farthest = _limits(scanner.range_min, scanner.range_max, ranges.dtype)
-    hit = ranges >= nearest
+    hit: np.ndarray = ranges >= nearest
     if nearest == 0 < scanner.range_min:
         hit &= ranges > 0
     hit &= ranges < farthest
+    return hit, ranges >= farthest
+
+
+def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float) -> PreparedScan:
+    """``prepare_scan`` where all beams are used and none repeats another: what filters do at every step."""
+    hit, is_far = hits_and_max(ranges, scanner)
     columns, count = hit.nonzero()[0], 0
     far = columns[:0]
     if len(columns) < len(ranges):
-        far = (ranges >= farthest).nonzero()[0]
+        far = is_far.nonzero()[0]
         count = len(far)
         ranges, vectors = ranges[columns], vectors[columns]
     return PreparedScan(

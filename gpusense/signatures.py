@@ -43,6 +43,7 @@ FLAGS = {
     "ORDERED": "particles come in an order in which neighbours have much the same position and heading",
     "QUICK": "nearest cells are found by rounding, and again with more digits only where that is in doubt",
     "INSIDE": "no end point of the cloud leaves the field's table",
+    "SCANS": "several scans are scored together, each with readings and particles of its own",
     "PER_BEAM": "the log-likelihood of each reading is wanted",
     "BILINEAR": "the field is interpolated",
     "LOG_TABLE": "the field's table holds log densities, not distances",
@@ -170,6 +171,10 @@ _FEATURE_RESULT = (
 _CONE = ("int cone_rays", "real critical")
 _ECHO = ("int kinds", *_CONE)
 _TERMS = ("real terms [10 * kinds]", "real edges [kinds]")
+# With SCANS: where the rays or end points of each scan begin, and its fixed terms; its particles, and those of the
+# launch that come before these.
+_SCANS = ("int start [scans + 1]", "real fixed_of [scans]")
+_OF_SCANS = ("int per_scan", "int ahead")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 
 KERNELS: dict[str, Kernel] = {
@@ -229,9 +234,9 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_beams": _kernel(
         "beam", "particle", *_CAST, *_NORMALS, *_POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
-        *_TERMS, "real sensor [(cells + 1) * (cells + 1)]", *_RESULT, *_MAP, "int particles", "int rays",
+        *_TERMS, "real sensor [(cells + 1) * (cells + 1)]", *_SCANS, *_RESULT, *_MAP, "int particles", "int rays",
         "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
-        wide_group=16,
+        *_OF_SCANS, wide_group=16,
     ),
     "cast_tiles": _kernel(
         "ranges", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]",
@@ -240,16 +245,18 @@ KERNELS: dict[str, Kernel] = {
     "beam_tiles": _kernel(
         "beam", "item", *_CAST, *_NORMALS, *_POSES, "int order [particles]", _CONES, "int first [rays + 1]",
         "real reading [readings]", *_TERMS, "real sensor [(cells + 1) * (cells + 1)]",
-        "out real parts [particles * readings]", *_MAP, "int particles", "int rays", "int readings", *_ECHO, *_CASTER,
-        "int cells", "real per_metre", *_RANGE, "int across", "int along", "int spread",
+        "int start [scans + 1]", "out real parts [particles * readings]", *_MAP, "int particles", "int rays",
+        "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "int across", "int along",
+        "int spread", "int per_scan",
     ),
     "cast_echoes": _kernel(
         "echo", "ray particle", *_CAST, *_NORMALS, *_POSES, _CONES, "out real ranges [particles * rays]",
         "out real incidence [particles * rays]", *_MAP, "int particles", "int rays", *_CONE, *_CASTER, *_RANGE,
     ),
     "sum_parts": _kernel(
-        "sums", "particle", "real parts [particles * count]", "int order [particles]", "out real log_p [particles]",
-        "int particles", "int count", "int block", "int across", "int along", "real fixed", "real temperature",
+        "sums", "particle", "real parts [particles * count]", "int order [particles]", "int counts [scans]",
+        "real fixed_of [scans]", "out real log_p [particles]", "int particles", "int count", "int block", "int across",
+        "int along", "real fixed", "real temperature", "int per_scan",
     ),
     "order_bounds": _kernel(
         "order", "bin", *_POSES, "out int bounds [7]", "out int bins [32768]", "int particles",
@@ -275,8 +282,8 @@ KERNELS: dict[str, Kernel] = {
     "field_blocks": _kernel(
         "field", "item", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "real guard [readings]",
-        "out real parts [particles * readings]", *_MAP, "int particles", "int readings", "int across", "int along",
-        "int spread",
+        "int start [scans + 1]", "out real parts [particles * readings]", *_MAP, "int particles", "int readings",
+        "int across", "int along", "int spread", "int per_scan",
     ),
     "e_step": _kernel(
         "learning", "block", *_PAIRS, "real terms [12]", "out real sums [blocks * width]", "int blocks", "int readings",
@@ -288,8 +295,8 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_field": _kernel(
         "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_RESULT, *_MAP, "int particles",
-        "int readings", "real guard", "real fixed", "real temperature", wide=True,
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_SCANS, *_RESULT, *_MAP,
+        "int particles", "int readings", "real guard", "real fixed", "real temperature", *_OF_SCANS, wide=True,
     ),
     "score_features": _kernel(
         "landmark_score", "particle", *_LANDMARKS, "int start [rows * cols + 1]", *_PLACED, *_FEATURES,
@@ -318,20 +325,21 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_position": _kernel(
         "absolute", "particle", "real4 place [particles]", "real terms [9]", "out real log_p [particles]",
-        "int particles",
+        "int particles", "real temperature",
     ),
     "score_heading": _kernel(
         "absolute", "particle", "real2 residual [particles]", "real terms [12]", "out real log_p [particles]",
-        "int particles", "int kind",
+        "int particles", "int kind", "real temperature",
     ),
     "score_beacons": _kernel(
         "beacons", "particle", "real4 place [particles]", "real beacon [6 * beacons]", "real terms [13]",
         "real series [count]", "out real log_p [particles]", "int particles", "int beacons", "int count", "int kind",
+        "real temperature",
     ),
     "score_contact": _kernel(
         "contact", "particle", "int table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
         "real2 point [points]", "real2 point_low [points]", "int start [segments + 1]", "int pressed [segments]",
         "real terms [10]", "out real log_p [particles]", "int rows", "int cols", "int particles", "int segments",
-        "real guard",
+        "real guard", "real temperature",
     ),
 }  # fmt: skip

@@ -25,8 +25,8 @@ from gpusense.models.field import LikelihoodFieldModel
 from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.prepare import empty_rectangles
 from gpusense.reference.densities import log_mixture, naive_log_mixture
+from gpusense.replay import Launch, Recorder, replay
 from gpusense.scanner import Scanner
-from gpusense.selftest import Launch, Recorder, replay
 from gpusense.tolerances import TOLERANCES, beam_tolerance, per_scan
 from gpusense.weights import normalize_weights
 
@@ -122,11 +122,12 @@ def density_grid(backend: str | Backend, precision: str) -> Densities:
             decay, at = 5 / rate if rate > 1 / RANGE_MAX else 0.9 * RANGE_MAX, float(expected[4])
             bends = [0.0, 0.3 * RANGE_MAX, decay, at - 1.5 * sigma, at + 6 * sigma, at + 30 * sigma]
             z = np.clip(np.concatenate([expected, bends]), 0, RANGE_MAX - ulp).astype(real)
-            parts, first = device.empty(count * len(z), real), np.array([0, len(z)], np.int32)
+            parts = device.empty(count * len(z), real)
+            first_there = device.upload(np.array([0, len(z)], np.int32))
             device.compile("score_beams", flags | model._components)(
-                (count,), rectangles, none, cells, pose, ray, device.upload(first), device.upload(z),
-                device.upload(model._terms), none, none, device.empty(count, real), parts, *world, len(z), *laser,
-                *exact, 0, 0.0, *limits, 0.0, 1.0,
+                (count,), rectangles, none, cells, pose, ray, first_there, device.upload(z),
+                device.upload(model._terms), none, none, first_there, none, device.empty(count, real), parts, *world,
+                len(z), *laser, *exact, 0, 0.0, *limits, 0.0, 1.0, 1, 0,
             )  # fmt: skip
             found = device.download(parts, np.empty(count * len(z), real))
             own = np.repeat(np.array([list(p.to_dict().values())], real).T, found.size, axis=1)

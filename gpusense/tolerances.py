@@ -3,7 +3,7 @@
 A float32 result is never held against the float64 result of the same call: they round their inputs differently, and a
 ray that grazes a corner may then end at another wall. Ray casting is judged by bits across devices; a likelihood is
 judged against the float64 reference kernel *on the float32 launch's own rounded inputs and expected ranges* (see
-``gpusense.selftest.replay``). Two devices that each keep a bound against that truth lie at most twice the bound apart.
+``gpusense.replay.replay``). Two devices that each keep a bound against that truth lie at most twice the bound apart.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Tolerance:
         if self.unit == "relative":
             return size
         scale = _EPS if self.unit.startswith("eps") else 1.0
-        return scale * (1 + size) if "|log p" in self.unit else np.ones_like(size)
+        return scale * (1 + size if "|log p" in self.unit else np.ones_like(size))
 
 
 _ALL = (

@@ -19,6 +19,8 @@ PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
 UNREACHABLE = (1 << 31) - 1
 SECTORS = (1, 2, 4)
+# Particles of each scan and those before a launch, which are not read where there is one scan.
+ONE_SCAN = (1, 0)
 
 
 def run(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.backends import get_backend
+from gpusense.backends import Backend, get_backend
 from gpusense.learning.device_sums import DeviceSums
 from gpusense.learning.options import make_bounds
 from gpusense.learning.pairs import make_pairs
@@ -30,7 +30,7 @@ def problem_of(
     z: np.ndarray,
     expected: np.ndarray,
     *,
-    backend: str = "numpy",
+    backend: str | Backend = "numpy",
     real: type = np.float64,
     prior: Prior = NO_PRIOR,
     fit_bias: bool = True,

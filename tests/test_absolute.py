@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import runpy
 from pathlib import Path
+from typing import Any
 
 import absolute_oracle as oracle
 import numpy as np
@@ -37,9 +38,9 @@ def poses_around(grid: gs.OccupancyGrid, count: int = 60, seed: int = 1) -> np.n
     return poses
 
 
-def models(backend: str, precision: str = "float32") -> dict[str, tuple[object, tuple[object, ...]]]:
+def models(backend: str, precision: str = "float32", **options: float) -> dict[str, tuple[Any, tuple[Any, ...]]]:
     """One model of each sensor and what it measures."""
-    own = dict(backend=backend, precision=precision)
+    own: dict[str, Any] = dict(backend=backend, precision=precision, **options)
     return {
         "position": (gs.PositionModel(gs.PositionParameters(sigma=1.0, mount=(0.1, 0.2)), **own), ((5e6, -1.0),)),
         "heading": (gs.HeadingModel(gs.HeadingParameters(sigma=0.3), **own), (2.0,)),

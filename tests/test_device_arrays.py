@@ -124,6 +124,38 @@ def test_batches_on_the_device(kind, device):
     assert differing(found.numpy(), expected) == 0 and differing(parts, expected_parts) == 0
 
 
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
+def test_scans_that_share_launches_on_the_device(kind, real, device, copies):
+    model = kind(GRID, SCANNER, backend=device)
+    several = np.stack([POSES + 0.1 * i for i in range(5)]).astype(real)
+    scans = np.stack([SCAN, SCAN[::-1], np.full(BEAMS, np.nan), np.roll(SCAN, 3), np.where(SCAN < 2, np.inf, SCAN)])
+    expected = np.stack([model.log_likelihood(own, scan) for own, scan in zip(several, scans, strict=True)])
+    out = to_device(np.zeros((5, COUNT), np.float32))
+    for given in (to_device(several), Array(to_device(several))):
+        copies.clear()
+        found = model.log_likelihood(given, scans)
+        assert type(found) is type(given) and model._together == 2
+        assert differing((found.held if isinstance(found, Array) else found).numpy(), expected) == 0
+        # Poses stay there; the scan without readings is filled in.
+        assert all(size <= 5 * 16 * BEAMS for way, size in copies) and ("up", 24 * COUNT) not in copies
+        assert [size for way, size in copies if way == "down"] == [8]
+        assert model.log_likelihood(given, scans, out=out) is out and differing(out.numpy(), expected) == 0
+    for scan, place in ((2, 5), (3, 7), (4, COUNT - 1)):
+        bad = several.copy()
+        bad[scan, place, 1] = np.nan
+        with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device that is not"):
+            model.log_likelihood(to_device(bad), scans)
+        assert differing(model.log_likelihood(to_device(several), scans).numpy(), expected) == 0
+    for wrong in (several[:4], several[..., :2], several[0]):
+        with pytest.raises(ValueError, match=r"^poses: shape must be \(5, N, 3\), got \("):
+            model.log_likelihood(to_device(np.ascontiguousarray(wrong)), scans)
+    with pytest.raises(TypeError, match="poses: must hold float32 or float64, got int32"):
+        model.log_likelihood(to_device(np.zeros((5, 4, 3), np.int32)), scans)
+    with pytest.raises(ValueError, match="poses: must be C-contiguous on the device, got strides"):
+        model.log_likelihood(to_device(several)[:, ::2], scans)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_in_pieces_on_the_device(method, device, monkeypatch):
     call, _ = call_of(method, device)

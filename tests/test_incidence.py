@@ -327,7 +327,9 @@ def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.nda
     assert not np.isclose(np.nan_to_num(angle)[..., None], parameters.edges[1:-1], rtol=0, atol=2e-6).any()
     real = np.dtype(model.precision)
     found = np.zeros(expected.shape)
-    for i, p in enumerate(parameters.parameters):
+    if parameters.no_surface is not None:
+        which = np.where(np.isnan(angle), len(parameters.parameters), which)
+    for i, p in enumerate((*parameters.parameters, parameters.no_surface or P())):
         read = np.broadcast_to(z.astype(real).astype(float), found.shape)
         with np.errstate(all="ignore"):
             each = log_mixture(np.nan_to_num(read, posinf=0.0), expected, range_max=RANGE, **p.to_dict())
@@ -336,11 +338,14 @@ def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.nda
     return found
 
 
-def test_every_beam_has_the_parameters_of_its_angle(backend):
+@pytest.mark.parametrize("no_surface", [None, P(0.05, 0.05, 0.8, 0.1, 0.3, 0.2)])
+def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
     _, poses, _ = place()
     z = a_scan()
+    incidence = gs.IncidenceParameters(EDGES, KINDS, no_surface)
     for precision in ("float32",) if backend.startswith("warp") else ("float32", "float64"):
-        model = model_of(backend, precision=precision, temperature=0.5)
+        model = model_of(backend, precision=precision, temperature=0.5, incidence=incidence)
+        assert np.isnan(model.incidence(poses)).any() and (", parameters for 3 ranges" in model.explain())
         truth = brute_force(model, poses, z)
         log_p, parts = model.log_likelihood(poses, z, per_beam=True)
         # The truth's terms are not rounded to the model's precision, nor its readings.
@@ -348,6 +353,7 @@ def test_every_beam_has_the_parameters_of_its_angle(backend):
         assert (np.abs(log_p - 0.5 * truth.sum(axis=1)) <= 3 * per_scan(truth, precision)).all()
         assert differing(model.log_likelihood(poses, z), log_p) == 0
         assert (np.ptp(parts[:, 4]) > 1) and (parts[:, [2, 9]] == 0).all()
+        assert (" and for none" in model.explain()) == (no_surface is not None)
 
 
 @on_every_backend(

@@ -58,6 +58,19 @@ TRACES = [
         r"\(row \+ FIELD_RING\)",
         r"table_cell_\d+\([^{;]*\{[^}]*wp::mul\(",
     ),
+    ("place_relative", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32> var_poses"),
+    ("place_relative", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
+    ("wrap_headings", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
+    ("score_position", "RAND", (), r"= either\(found, terms\[8\]", r"either_\d+\("),
+    ("score_heading", "RAND", (), r"= either\(found, terms\[RANDOM\]", r"either_\d+\("),
+    ("score_beacons", "RAND", (), r"\beither\(found, terms\[RANDOM\]", r"(?:either_\d+\([\s\S]*){4}"),
+    ("score_contact", "CAREFUL", (), r"\bpose_low\[n\]", r"address\(var_pose_low\b"),
+    ("score_contact", "FLOAT64", (), r"\btypedef double real\b", r"vec_t<2, wp::float64> var_point,"),
+    ("score_beams", "SCANS", ("RAND", "LINEAR"), r"\bstart\[", r"address\(var_start\b"),
+    ("beam_tiles", "SCANS", ("RAND", "LINEAR"), r"\bstart\[", r"address\(var_start\b"),
+    ("score_field", "SCANS", ("LOG_TABLE",), r"\bstart\[", r"address\(var_start\b"),
+    ("field_blocks", "SCANS", ("LOG_TABLE",), r"\bstart\[", r"address\(var_start\b"),
+    ("sum_parts", "SCANS", (), r"\bcounts\[", r"address\(var_counts\b"),
     ("score_features", "RANGE", (), r"\brange_mass\(", r"range_mass_\d+\("),
     ("score_features", "BEARING", (), r"\bangle_pair\(", r"angle_pair_\d+\("),
     ("score_features", "SIGNATURE", (), r"\bSIGNATURE_AT\]", r"pair_product_\d+\("),
@@ -115,8 +128,8 @@ def warp_code(kernel: str, flags: frozenset[str]) -> str:
         return without_comments(source.read_text(encoding="utf-8"))
 
 
-def cuda_operations(kernel: str, flags: frozenset[str], folder: Path) -> set[str]:
-    """The floating-point operations that round, of the code that Warp makes of a kernel for a CUDA device."""
+def cuda_code(kernel: str, flags: frozenset[str], folder: Path) -> str:
+    """The PTX that Warp makes of a kernel for a CUDA device."""
     import warp as wp
 
     architectures = wp.get_cuda_supported_archs()
@@ -126,7 +139,16 @@ def cuda_operations(kernel: str, flags: frozenset[str], folder: Path) -> set[str
     arch = min(architectures, key=lambda number: abs(number - 90))
     wp.compile_aot_module(made.module, arch=arch, module_dir=folder, use_ptx=True)
     (code,) = folder.glob("*.ptx")
-    return set(re.findall(r"\b(?:fma|mad|mul|add|sub|div|rcp)\.\S*f(?:32|64)\b", code.read_text(encoding="utf-8")))
+    return code.read_text(encoding="utf-8")
+
+
+def cuda_operations(kernel: str, flags: frozenset[str], folder: Path) -> set[str]:
+    """The floating-point operations that round, of the code that Warp makes of a kernel for a CUDA device."""
+    return cuda_operations_of(cuda_code(kernel, flags, folder))
+
+
+def cuda_operations_of(code: str) -> set[str]:
+    return set(re.findall(r"\b(?:fma|mad|mul|add|sub|div|rcp)\.\S*f(?:32|64)\b", code))
 
 
 @pytest.mark.parametrize("kernel", ["cast_ranges", "cast_tiles"])
@@ -147,6 +169,22 @@ def test_cuda_code_places_poses_by_rounded_operations(
     needs("warp")
     operations = cuda_operations("place_poses", scene_flags(precision, "CAREFUL", "HUGE_HEADINGS"), tmp_path)
     assert {"div.rn.f64"} <= operations <= {f"{name}.rn.f64" for name in ("mul", "add", "sub", "div")}
+
+
+def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(
+    needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    flags = frozenset({"LOG_TABLE", "CAREFUL", "QUICK", "INSIDE"})
+    code = cuda_code("field_blocks", flags, tmp_path)
+    operations = cuda_operations_of(code)
+    assert operations <= {f"{name}.rn.f32" for name in ("mul", "add", "sub")}
+    blocks = re.split(r"^\$L\w+:|\bbra\b.*", code.partition(".entry")[2], flags=re.MULTILINE)
+    whole = max(blocks, key=len)
+    loads = re.findall(r"\bld\.global\S*", whole)
+    # 16 readings, a point of two numbers and a cell each, by their addresses: no strides, no checks of signs.
+    assert sorted(loads) == ["ld.global.nc.f32"] * 16 + ["ld.global.nc.v2.f32"] * 16
+    assert not re.search(r"\bmul\.lo\.s64\b|\bshr\.s32\b", whole)
 
 
 @pytest.mark.parametrize("kernel", [*KERNELS])

@@ -11,6 +11,7 @@ from kernel_scenes import (
     GRIDS,
     LASER,
     LIMIT,
+    ONE_SCAN,
     RESOLUTION,
     adversarial_poses,
     assert_near,
@@ -105,8 +106,9 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     parts = np.full((count, readings), np.nan, real)
     found = run(
         device, "score_beams", flags, (count,), planes_of(occupied), nothing(real, 2), cell, pose, ray, first, reading,
-        terms, nothing(real), nothing(real), np.empty(count, real), parts, *occupied.shape, count, len(ray), readings,
-        *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
+        terms, nothing(real), nothing(real), first, nothing(real), np.empty(count, real), parts, *occupied.shape, count,
+        len(ray), readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
+        *ONE_SCAN,
     )  # fmt: skip
 
     # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
@@ -127,8 +129,9 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     count, none = len(pose), np.zeros(0, real)
     found = run(
         device, "score_beams", frozenset(flags), (count,), planes_of(occupied), nothing(real, 2), cell, pose,
-        np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, np.empty(count, real), none,
-        *occupied.shape, count, 0, 0, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, -1.5, 1.0,
+        np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, np.zeros(1, np.int32), none,
+        np.empty(count, real), none, *occupied.shape, count, 0, 0, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION,
+        LIMIT * RESOLUTION, -1.5, 1.0, *ONE_SCAN,
     )  # fmt: skip
     assert (found["log_p"] == -1.5).all()
 
@@ -185,6 +188,8 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
         "point": point,
         "point_low": point_low,
         "terms": with_low_parts(terms, real),
+        "start": np.zeros(1, np.int32),
+        "fixed_of": np.zeros(1, real),
         "log_p": np.empty(count, real),
         "parts": np.full((count, len(end)), np.nan, real),
     }
@@ -197,14 +202,16 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
     finite = scene["point"][np.isfinite(scene["point"])]
     guard = 8 * np.finfo(real).eps * (np.abs(finite).max(initial=0.0) + 2)
     return on_both(
-        device, "score_field", flags, (count,), *scene.values(), rows - 4, cols - 4, count, readings, guard, *fixed
-    )
+        device, "score_field", flags, (count,), *scene.values(), rows - 4, cols - 4, count, readings, guard, *fixed,
+        *ONE_SCAN,
+    )  # fmt: skip
 
 
 # As models have them: float32 is careful, float64 needs no second look.
 FIELD_SCENES = [
     *((name, names, np.float32) for name in FIELDS for names in (("CAREFUL",), ("ALL_READINGS", "CAREFUL"))),
     *((name, names, np.float64) for name in FIELDS for names in ((), ("ALL_READINGS",))),
+    ("log table", ("CAREFUL", "QUICK"), np.float32),
 ]
 
 
@@ -221,6 +228,18 @@ def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real
     assert_near(found["parts"], truth, 2 * per_beam(truth, real))
     total = temperature * (truth.sum(axis=1) + fixed)
     assert_near(found["log_p"], total, 2 * per_scan(truth, real, fixed=fixed, temperature=temperature))
+
+
+def test_quick_cells_change_no_bit(device: Backend) -> None:
+    whole = field_scene("log table", np.float32, all_readings=False)
+    count = len(whole["pose"])
+    for readings in (1, 16, 17, whole["parts"].shape[1]):
+        scene = whole | {name: whole[name][:readings] for name in ("point", "point_low")}
+        scene["parts"] = np.full((count, readings), np.nan, np.float32)
+        plain = scene_flags(np.float32, *FIELDS["log table"], "CAREFUL")
+        _, expected = score_field(device, plain, scene, -2.5, 0.75)
+        _, found = score_field(device, plain | {"QUICK"}, scene, -2.5, 0.75)
+        assert differing(found["log_p"], expected["log_p"]) == 0
 
 
 def test_an_impossible_end_point_makes_the_scan_impossible(device: Backend) -> None:

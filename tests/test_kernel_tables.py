@@ -25,7 +25,7 @@ from kernel_scenes import (
 
 from gpusense.backends import Backend, get_backend
 from gpusense.prepare import empty_rectangles, packed
-from gpusense.reference.rectangles import slope
+from gpusense.reference.rectangles import OCCUPIED, slope
 from gpusense.region import Region
 
 # ---- distances
@@ -119,18 +119,19 @@ def score(planes: np.ndarray) -> np.ndarray:
 
 
 def check_empty(occupied: np.ndarray, planes: np.ndarray) -> None:
-    """Every rectangle is free and inside the grid; nothing but the ring and obstacles have none."""
+    """Every rectangle is free and inside the grid; nothing but the ring and obstacles, which have a mark, have none."""
     rows, cols = occupied.shape
     assert planes[..., [0, -1], :].max() == planes[..., [0, -1]].max() == 0
     width, height = sides_of(planes)
-    np.testing.assert_array_equal(width == 0, np.broadcast_to(occupied, width.shape))
-    np.testing.assert_array_equal(height == 0, width == 0)
+    assert width.min() > 0
+    np.testing.assert_array_equal(height == 0, np.broadcast_to(occupied, height.shape))
+    np.testing.assert_array_equal(planes[..., 1:-1, 1:-1] == OCCUPIED, height == 0)
     before = blocked_before(occupied)
     row, col = np.indices(occupied.shape)
     for quadrant in range(4):
         top = row - height[quadrant] + 1 if quadrant & 2 else np.broadcast_to(row, height[quadrant].shape)
         left = col - width[quadrant] + 1 if quadrant & 1 else np.broadcast_to(col, width[quadrant].shape)
-        free = width[quadrant] > 0
+        free = height[quadrant] > 0
         top, left = top[free], left[free]
         bottom, right = top + height[quadrant][free], left + width[quadrant][free]
         assert top.min(initial=0) >= 0 and left.min(initial=0) >= 0

@@ -12,6 +12,7 @@ from kernel_scenes import (
     GRIDS,
     LASER,
     LIMIT,
+    ONE_SCAN,
     PRECISIONS,
     RESOLUTION,
     SECTORS,
@@ -39,6 +40,8 @@ RAYS = (1, 3, 4, 5, 53)
 WAYS = ("particles", "readings", "gaps")
 OCCUPIED = GRIDS["rooms"]
 RANGE = LIMIT * RESOLUTION
+# Where scans begin, which is not read where there is one.
+NOWHERE = np.zeros(1, np.int32)
 
 
 def items(count: int, spread: int, group: int = TILE_PARTICLES, each: int = TILE) -> tuple[int]:
@@ -150,8 +153,9 @@ def beam_tiles(
     readings, order = len(reading), an_order(count)
     expected, found = on_both(
         device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
-        ray, first, reading, terms, nothing(real), nothing(real), room_for(count, readings, way, real), *OCCUPIED.shape,
-        count, rays, readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE, *strides(count, readings, way), spread,
+        ray, first, reading, terms, nothing(real), nothing(real), first, room_for(count, readings, way, real),
+        *OCCUPIED.shape, count, rays, readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE,
+        *strides(count, readings, way), spread, 1,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -194,7 +198,8 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
             parts[:: 3 * each] = -np.inf
         reference, found = on_both(
             device, "sum_parts", scene_flags(real, *names), (count,), parts, an_order(count),
-            np.full(count, 77, real), count, each, block, *strides(count, each, way), 1.25, 0.75,
+            np.zeros(1, np.int32), np.zeros(1, real), np.full(count, 77, real), count, each, block,
+            *strides(count, each, way), 1.25, 0.75, 1,
         )  # fmt: skip
         if "CUBES" in names:
             eps = np.finfo(real).eps
@@ -209,8 +214,6 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 
 
 # ---- the likelihood field
-
-BLOCKED = [*FIELD_SCENES, ("log table", ("CAREFUL", "QUICK"), np.float32)]
 
 
 def guards_of(point: np.ndarray) -> np.ndarray:
@@ -234,8 +237,8 @@ def field_blocks(
     given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
     sizes = (rows - 4, cols - 4, count, readings)
     reference, found = on_both(
-        device, "field_blocks", flags, items(count, spread, 64, 64), *given, guards,
-        room_for(count, blocks, way, real), *sizes, *strides(count, blocks, way), spread,
+        device, "field_blocks", flags, items(count, spread, 64, 64), *given, guards, NOWHERE,
+        room_for(count, blocks, way, real), *sizes, *strides(count, blocks, way), spread, 1,
     )  # fmt: skip
     untouched = np.count_nonzero(reference["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -243,13 +246,14 @@ def field_blocks(
     parts = np.empty((count, readings), real)
     log_p = np.empty(count, real)
     numpy = get_backend("numpy")
-    parts = run(numpy, "score_field", flags, (count,), *given, log_p, parts, *sizes, guards.max(), 0.0, 1.0)["parts"]
+    alone = (NOWHERE, np.zeros(1, real), log_p, parts, *sizes, guards.max(), 0.0, 1.0, *ONE_SCAN)
+    parts = run(numpy, "score_field", flags, (count,), *given, *alone)["parts"]
     bound = 2 * per_beam(parts, real) + 16 * np.finfo(real).eps * np.abs(np.where(np.isfinite(parts), parts, 0))
     bound = np.stack([bound[:, i : i + BLOCK_TERMS].sum(axis=1) for i in range(0, readings, BLOCK_TERMS)], axis=1)
     return parts_at(found["parts"], count, blocks, way), parts_at(reference["parts"], count, blocks, way), bound
 
 
-@pytest.mark.parametrize(("name", "names", "real"), BLOCKED)
+@pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     found, expected, bound = field_blocks(device, name, real, names, 1, "particles", 77, 150)
     if name == "log table":
@@ -281,7 +285,7 @@ def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
         flags = scene_flags(np.float32, *FIELDS["log table"], *names)
         both = on_both(
             device, "field_blocks", flags, items(count, 0, 64, 64), *given, guards_of(high),
-            np.empty(count * blocks, np.float32), rows, cols, count, readings, 1, count, 0,
+            NOWHERE, np.empty(count * blocks, np.float32), rows, cols, count, readings, 1, count, 0, 1,
         )  # fmt: skip
         found += [one["parts"] for one in both]
     assert all(differing(one, found[0]) == 0 for one in found)

@@ -51,7 +51,7 @@ def scored(name: str, backend: str, precision: str, how: str) -> tuple[np.ndarra
     """(N,) log p of a scene and (N, F) parts of it."""
     if how == "known":
         model, poses, features = scenes.model(name, backend, precision=precision)
-        return model.log_likelihood(poses, features, KNOWN), model._score(poses, features, KNOWN, each=True)[2]
+        return model.log_likelihood(poses, features, KNOWN), model._evaluate(poses, features, KNOWN, each=True)[2]
     model, poses, features = scenes.model(name, backend, precision=precision, association=how)
     return model.log_likelihood(poses, features), model.associate(poses, features)[1]
 
@@ -145,7 +145,7 @@ def test_the_mixture_integrates_to_1(name, place):
             grid = np.full((len(axes[axis][0]), 3), NAN)
             grid[:, axis] = axes[axis][0]
             grid[:, 1] = np.where(np.isnan(grid[:, 1]), NAN, np.clip(grid[:, 1], -half, half))
-            _, _, parts = model._score(pose, grid, np.full(len(grid), j), each=True)
+            _, _, parts = model._evaluate(pose, grid, np.full(len(grid), j), each=True)
             assert abs(np.exp(parts[0]) @ axes[axis][1] - 1) < 1e-11
 
 

@@ -140,6 +140,22 @@ def test_other_ways_reach_the_optimum_from_ten_starts(method: str, scenes: tuple
             assert (np.abs(values(fit) - values(best)) < 1e-3 * errors(best)).all(), (scene.name, start)
 
 
+def test_hill_climbing_leaves_a_ridge_that_no_coordinate_climbs(needs) -> None:
+    backend = needs("opencl")
+    scene = learning_scenes(50)[21]
+    z, expected = scene.draw(2000, np.random.default_rng(21))
+    start = gs.BeamParameters(0.214, 0.107, 0.554, 0.125, scene.range_max, 0.131)
+    best = gs.fit_beam_parameters(z, expected, scene.range_max, backend=backend)
+    fit = gs.fit_beam_parameters(z, expected, scene.range_max, method="hill_climb", initial=start, backend=backend)
+    assert fit.converged and abs(fit.log_likelihood - best.log_likelihood) < 1e-6
+    # Cut short, it does not claim to have arrived.
+    fit = gs.fit_beam_parameters(
+        z, expected, scene.range_max, method="hill_climb", initial=start, max_iterations=8, backend=backend
+    )
+    assert fit.log_likelihood < best.log_likelihood - 100
+    assert not fit.converged and "no convergence within 8 iterations" in fit.status
+
+
 def test_the_genetic_search_needs_no_good_start(needs) -> None:
     backend = needs("opencl")
     z, expected = draw(TYPICAL, 200, 3)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+
 import mpmath as mp
 import numpy as np
 import pytest
 from kernel_scenes import PRECISIONS
 from learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
+from gpusense.backends import get_backend
 from gpusense.learning.point import BIAS, Point
 from gpusense.learning.problem import Prior
 from gpusense.reference.densities import log_mixture
@@ -90,6 +94,14 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
     assert np.abs((value.hessian - hessian) / scaled).max() < 1e-11 * (1 + np.abs(hessian / scaled).max())
 
 
+def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
+    """Whether sums are those of the reference, within the tolerance."""
+    # Terms of either sign: their magnitudes are at most some 30 times those of r u^2.
+    scale = np.maximum(np.abs(truth), np.abs(truth[7]))[: len(found)]
+    tolerance = TOLERANCES[f"{np.dtype(precision).name} sums to learn from"]
+    return bool((np.abs(found - truth[: len(found)]) <= tolerance.value * scale).all())
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_sums_are_alike_on_every_backend(precision: type, backend: str) -> None:
     z, expected = draw(TYPICAL, 3001, 3)
@@ -98,10 +110,34 @@ def test_sums_are_alike_on_every_backend(precision: type, backend: str) -> None:
     found = problem_of(z, expected, backend=backend, real=precision).device.sums(
         at, information=precision is np.float64
     )
-    # Terms of either sign: their magnitudes are at most some 30 times those of r u^2.
-    scale = np.maximum(np.abs(truth), np.abs(truth[7]))[: len(found)]
-    tolerance = TOLERANCES[f"{np.dtype(precision).name} sums to learn from"]
-    assert (np.abs(found - truth[: len(found)]) <= tolerance.value * scale).all()
+    assert alike(found, truth, precision)
+
+
+@pytest.mark.parametrize("lanes", [1, 16])
+def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str]) -> None:
+    opencl = get_backend(needs("opencl"))
+    # Nothing near, range_max ahead, both ends and what is just before them beside ordinary pairs; not a multiple of 16.
+    z, expected = draw(TYPICAL, 1003, 8, low=0, high=1)
+    expected[:40:4], expected[1:40:4], z[2:40:4] = 0, RANGE_MAX, 0
+    z[3:40:4] = expected[3:40:4]
+    none = point(0.0, 0.7, 0.1, 0.2, sigma=0.3, rate=2.0)
+    impossible = point(0.0, 0.9, 0.1, 0.0, sigma=0.3, rate=2.0)
+    before = opencl.info
+    try:
+        opencl.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
+        for precision in PRECISIONS:
+            # Both begin with the same rounded pairs.
+            pairs = z.astype(precision), expected.astype(precision)
+            # Squares of u at sigma = 0.01 carry the rounding of sigma to float32, beyond the tolerance.
+            known = [at for name, at in POINTS.items() if precision is np.float64 or name != "steep"]
+            for at in (*known, none):
+                truth = problem_of(*pairs).device.sums(at, information=True)
+                found = problem_of(*pairs, backend=opencl, real=precision).device.sums(at, information=True)
+                assert alike(found, truth, precision)
+            nothing = problem_of(*pairs, backend=opencl, real=precision).device.sums(impossible)
+            assert nothing[0] == -np.inf and np.isfinite(nothing[1:]).all()
+    finally:
+        opencl.info = before
 
 
 def test_log_likelihood_and_responsibilities_are_those_of_the_densities(backend: str) -> None:

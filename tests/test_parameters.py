@@ -73,6 +73,9 @@ def test_parameters_for_each_angle_of_incidence():
     assert TWO.edges == (0.0, 0.6, np.pi / 2)
     assert IncidenceParameters.from_dict(json.loads(json.dumps(TWO.to_dict()))) == TWO
     assert len({TWO, IncidenceParameters(TWO.edges, TWO.parameters)}) == 1
+    three = IncidenceParameters(TWO.edges, TWO.parameters, BeamParameters(sigma_hit=0.4))
+    assert IncidenceParameters.from_dict(json.loads(json.dumps(three.to_dict()))) == three != TWO
+    assert IncidenceParameters.from_dict({"edges": TWO.edges, "parameters": TWO.to_dict()["parameters"]}) == TWO
 
 
 @pytest.mark.parametrize(
@@ -84,17 +87,22 @@ def test_parameters_for_each_angle_of_incidence():
         ((0, np.nan, np.pi / 2), TWO.parameters, ValueError, "edges: every value must be finite"),
         (TWO.edges, TWO.parameters[:1], ValueError, "parameters: must be one for each of 2 bins, got 1"),
         (TWO.edges, (BeamParameters(), 3), TypeError, "parameters: must be BeamParameters, got 3"),
+        (TWO.edges, TWO.parameters, TypeError, "no_surface: must be BeamParameters or None, got 3"),
     ],
 )
 def test_bad_parameters_for_angles_of_incidence(edges, parameters, error, message):
     with pytest.raises(error) as raised:
-        IncidenceParameters(edges, parameters)
+        IncidenceParameters(edges, parameters, 3 if "no_surface" in message else None)
     assert str(raised.value).startswith(message)
 
 
-@pytest.mark.parametrize("values", [3, {"edges": [0, 1]}, {**TWO.to_dict(), "more": 1}])
+@pytest.mark.parametrize(
+    "values", [3, {"edges": [0, 1]}, {**TWO.to_dict(), "more": 1}, {"edges": [0, 1], "no_surface": None}]
+)
 def test_bad_dictionaries_of_them(values):
-    with pytest.raises((TypeError, ValueError), match=r"must (be a mapping|have the fields edges and parameters), got"):
+    with pytest.raises(
+        (TypeError, ValueError), match=r"must (be a mapping|have the fields edges and parameters.*), got"
+    ):
         IncidenceParameters.from_dict(values)
 
 

@@ -182,7 +182,7 @@ def test_another_ranking_is_noticed(capsys, recorded, monkeypatch):
 
     def wrong(flags, *arguments):
         score_beams(flags, *arguments)
-        log_p = arguments[10]
+        log_p = arguments[12]
         log_p[: len(log_p) // 2] += 1
 
     monkeypatch.setattr(beam, "score_beams", wrong)

@@ -14,9 +14,12 @@ from gpusense import cloud, selftest, stiff
 from gpusense.backends import get_backend
 from gpusense.backends._numpy import NumpyBackend
 from gpusense.cli import main
-from gpusense.reference import beam, distance, mixture, order, ranges, sums
+from gpusense.reference import beam, distance, echo, mixture, order, ranges, sums
+from gpusense.replay import Recorder, replay
 from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
 
+INCIDENCE = gs.IncidenceParameters((0, 0.4, 1.0, math.pi / 2), (gs.BeamParameters(),) * 2 + (
+    gs.BeamParameters(0.2, 0.1, 0.5, 0.2),))  # fmt: skip
 EPS = float(np.finfo(np.float32).eps)
 
 
@@ -94,6 +97,7 @@ def test_differences_notice_signs_nan_and_infinities():
     for found, truth in ((np.nan, 0), (0, np.nan), (-np.inf, 0), (0, -np.inf), (np.inf, -np.inf)):
         assert beams.difference([found], [truth]) == np.inf
     assert beams.difference([3 + 4 * EPS], [3.0]) == pytest.approx(1)
+    assert TOLERANCES["float32 angles of incidence"].difference([3 * EPS], [0.0]) == pytest.approx(3)
     assert TOLERANCES["float64 ranges"].difference([2.0 + 2e-12], [2.0]) == pytest.approx(1e-12, rel=1e-3)
     assert scan_tolerance("float32", 10).difference([1.5], [1.0]) == 0.5
     assert TOLERANCES["float32 ranges"].difference([np.float32(1)], [np.nextafter(np.float32(1), np.float32(2))]) == 1
@@ -128,15 +132,19 @@ def test_scene_has_what_is_awkward(scene):
         (gs.BeamModel, gs.BeamParameters(z_hit=0.9, z_short=0.1, z_max=0.0, z_rand=0.0)),
         (gs.LikelihoodFieldModel, gs.LikelihoodFieldParameters(z_hit=0.85, z_max=0.05)),
         (gs.LikelihoodFieldModel, gs.LikelihoodFieldParameters(interpolation="bilinear")),
+        (gs.BeamModel, INCIDENCE),
     ],
 )
 def test_replay_agrees_with_numpy(scene, make, parameters, precision, temperature, specialize):
-    recorder = selftest.Recorder(get_backend("numpy"))
-    model = make(scene.grid, scene.scanner, parameters, backend=recorder, precision=precision,
-                 temperature=temperature, specialize=specialize)  # fmt: skip
+    recorder = Recorder(get_backend("numpy"))
+    scanner, own = scene.scanner, {"parameters": parameters}
+    if parameters is INCIDENCE:
+        scanner, own = selftest.sonar_of(scanner), {"incidence": parameters}
+    model = make(scene.grid, scanner, **own, backend=recorder, precision=precision, temperature=temperature,
+                 specialize=specialize)  # fmt: skip
     log_p, parts = model.log_likelihood(scene.poses[::3], scene.ranges, per_beam=True)
     (launch,) = recorder.launches
-    true_log_p, true_parts = selftest.replay(launch)
+    true_log_p, true_parts = replay(launch)
     assert (launch.values["log_p"] == log_p).all()
     np.testing.assert_array_equal(np.sort(launch.parts, axis=1)[:, :5], np.sort(parts, axis=1)[:, :5])
     assert beam_tolerance(precision).difference(launch.parts, true_parts) <= beam_tolerance(precision).value
@@ -154,19 +162,19 @@ def test_an_end_point_on_an_edge_may_go_to_either_cell_but_no_other_one(precisio
     row, col = np.divmod(np.arange(30 * 30), 30)
     corners = (grid.cell_centers(row + 1, col + 1) + grid.cell_centers(row, col)) / 2
     poses = np.column_stack([corners, np.zeros(900)])
-    recorder = selftest.Recorder(get_backend("numpy"))
+    recorder = Recorder(get_backend("numpy"))
     model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0, math.pi / 2], 5.0), backend=recorder, precision=precision)
     model.log_likelihood(poses, [0.3, 0.5], per_beam=True)
     (launch,) = recorder.launches
-    assert differing(selftest.replay(launch)[1].astype(launch.parts.dtype), launch.parts) == 0
+    assert differing(replay(launch)[1].astype(launch.parts.dtype), launch.parts) == 0
     elsewhere = launch.parts.copy()
     elsewhere[5] -= 1
-    assert np.count_nonzero(selftest.replay(launch, elsewhere)[1].astype(launch.parts.dtype) != elsewhere) == 2
+    assert np.count_nonzero(replay(launch, elsewhere)[1].astype(launch.parts.dtype) != elsewhere) == 2
 
 
 def test_replay_casts_on_the_device_that_scored(scene):
     for selection in ("numpy", *others()):
-        recorder = selftest.Recorder(get_backend(selection))
+        recorder = Recorder(get_backend(selection))
         model = gs.BeamModel(scene.grid, scene.scanner, backend=recorder)
         model.log_likelihood(scene.poses[:50], scene.ranges, per_beam=True)
         columns = np.flatnonzero(gs.classify(scene.ranges, scene.scanner) == gs.Reading.HIT)
@@ -194,6 +202,7 @@ def test_json_lists_every_comparison(capsys):
     assert [backend["selection"] for backend in document["backends"]] == ["numpy"]
     quantities = {check["quantity"] for check in document["checks"]}
     assert {"distance transform", "float32 beam model, scans", "field, nearest, look-ups"} <= quantities
+    assert "float64 sonar by incidence, beams" in quantities
     assert all(check["tolerance"]["reason"] for check in document["checks"])
 
 
@@ -210,13 +219,13 @@ def add_to_squares(*arguments):
 
 def add_to_scan(*arguments):
     score_beams(*arguments)
-    arguments[11][3] += 0.01
+    arguments[13][3] += 0.01
 
 
 def add_to_beam(*arguments):
     score_beams(*arguments)
     if "PER_BEAM" in arguments[0]:
-        arguments[12][7] += np.float32(1e-4)
+        arguments[14][7] += np.float32(1e-4)
 
 
 def densities_of_another_mixture(flags, z, expected, terms):
@@ -227,9 +236,20 @@ def densities_of_another_mixture(flags, z, expected, terms):
 def add_without_parts(flags, *arguments):
     score_beams(flags, *arguments)
     if "PER_BEAM" not in flags:
-        arguments[10][:] = np.nextafter(arguments[10], np.inf)
+        arguments[12][:] = np.nextafter(arguments[12], np.inf)
 
 
+def parameters_of_another_angle(terms, edges, kinds, cosine):
+    return incidence_terms(terms, edges, kinds, np.where(cosine < 0.6, 1, cosine))
+
+
+def turn_an_angle(*arguments):
+    cast_echoes(*arguments)
+    if "INCIDENCE" in arguments[0]:
+        arguments[7][21] += 1e-3
+
+
+incidence_terms, cast_echoes = echo.incidence_terms, echo.cast_echoes
 reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
@@ -243,11 +263,13 @@ score_beams, log_density = beam.score_beams, mixture.log_density
         (beam, "score_beams", add_to_beam, "float32 beam model, beams"),
         (beam, "log_density", densities_of_another_mixture, "float32 beam model, beams"),
         (beam, "score_beams", add_without_parts, "float32 beam model, scans alone"),
+        (beam, "incidence_terms", parameters_of_another_angle, "float64 sonar by incidence, beams"),
+        (echo, "cast_echoes", turn_an_angle, "float32 angles of incidence"),
     ],
 )
 def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantity):
     monkeypatch.setattr(module, name, broken)
-    partner = others()[0] if name == "cast_ranges" else "numpy"
+    partner = others()[0] if name in ("cast_ranges", "cast_echoes") else "numpy"
     code, out, _ = run(capsys, "--backend", "numpy", "--backend", partner, "--json")
     document = json.loads(out)
     assert code == 1
@@ -270,9 +292,10 @@ def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
     if module is not None:
         right = getattr(module, kernel)
 
-        def wrong(flags, first, second, third, *rest):
-            right(flags, first, second, third, *rest)
-            third[0] = third[1] if kernel == "order_fill" else third[0] + 1
+        def wrong(flags, *arguments):
+            right(flags, *arguments)
+            written = arguments[2] if kernel == "order_fill" else arguments[4]
+            written[0] = written[1] if kernel == "order_fill" else written[0] + 1
 
         monkeypatch.setattr(module, kernel, wrong)
     whole = selftest.built_in_scene()

@@ -291,6 +291,55 @@ def test_scans_and_pieces_are_gathered_in_their_order(gathering, monkeypatch):
     assert started
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_scans_that_share_launches_are_gathered(kind, gathering, monkeypatch):
+    """Calls of other scans, and of one scan with as many particles and readings, are not taken for one another."""
+    device, started = gathering
+    model = kind(GRID, SCANNER, backend=device, temperature=0.5)
+    poses = np.stack([cloud(1, 100), cloud(2, 100), cloud(3, 100)])
+    calls = [
+        (poses, np.stack([scan(4), scan(5), scan(6)])),
+        (poses[::-1].copy(), np.stack([scan(7), scan(8), scan(9)])),
+        (poses, np.stack([scan(4, 20), scan(5, 9), scan(6)])),
+        (poses, np.stack([scan(4), scan(5, 9), scan(6, 20)])),
+        (poses.reshape(1, 300, 3), scan(4)[None]),
+        (poses.reshape(300, 3), scan(4)),
+        (poses[:2], np.stack([scan(4), scan(5)])),
+        (poses[:, :66], np.stack([scan(4), scan(5), scan(6, 0)])),
+    ]
+    expected = plainly(device, monkeypatch, lambda: [model.log_likelihood(*call) for call in calls])
+    for _ in range(3):
+        for call, wanted in zip(calls, expected, strict=True):
+            assert differing(model.log_likelihood(*call), wanted) == 0
+    assert len(started) >= len(calls)
+
+
+@pytest.mark.parametrize("count", [COUNT, 0])
+def test_several_models_are_gathered(count, gathering, monkeypatch):
+    device, started = gathering
+    models = [kind(GRID, SCANNER, backend=device) for kind in (*MODELS, gs.LikelihoodFieldModel)]
+    models.append(models[0])
+    poses, z = [cloud(s, count) for s in range(4)], [scan(s) for s in range(4)]
+    expected = plainly(
+        device, monkeypatch, lambda: [m.log_likelihood(*one) for m, *one in zip(models, poses, z, strict=True)]
+    )
+    there = [to_device(own) for own in poses]
+    for given in (poses, poses, poses, there, there, [poses[0], *there[1:]]):
+        found = gs.log_likelihoods(models, given, z)
+        assert all(
+            differing(one if isinstance(one, np.ndarray) else one.numpy(), wanted) == 0
+            for one, wanted in zip(found, expected, strict=True)
+        )
+    assert started or not count
+    if count:
+        bad = cloud(2)
+        bad[5, 2] = np.inf
+        with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
+            gs.log_likelihoods(models, [there[0], there[1], to_device(bad), there[3]], z)
+        # It is told once, and of no other model.
+        assert differing(gs.log_likelihoods(models, there, z)[2].numpy(), expected[2]) == 0
+
+
 def test_arrays_that_are_too_large_are_copied_at_once(gathering, monkeypatch):
     from gpusense.backends import _warp_queue
 

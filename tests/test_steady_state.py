@@ -181,3 +181,34 @@ def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     readings = scan_uploads(device, 4, 2 * BEAMS, 2 * BEAMS, *([BLOCKS] if gpu else []))
     assert sorted(watch.up) == sorted([24 * 128, 24 * 128, 24 * 100, *readings])
     assert watch.down == [4 * 128, 4 * 128, 4 * 100]
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+@pytest.mark.parametrize("what", ["beam", "field"])
+def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):
+    device, scans = as_gpu(gpu), 4
+    watch = Watch(device, monkeypatch)
+    model = (gs.BeamModel if what == "beam" else gs.LikelihoodFieldModel)(GRID, SCANNER, backend=device)
+
+    def call(count: int, seed: int) -> np.ndarray:
+        # Each scan has as many readings as another of any call, but another time.
+        z = np.stack([scan(seed + s) for s in range(scans)])
+        for s in range(scans):
+            z[s, BEAMS - (seed + s) % scans :] = np.nan
+        found: np.ndarray = model.log_likelihood(np.stack([poses(count, seed + s) for s in range(scans)]), z)
+        assert model._together == scans
+        return found
+
+    first = call(COUNT, 1)
+    total = scans * BEAMS - sum(range(scans))
+    # What the sums begin with, and where scans begin and how much each has.
+    counts = (2 * total, total, scans) if what == "beam" else (2 * total, 2 * total, scans)
+    counts = (*counts[:2], scans * BLOCKS, scans) if what == "field" and gpu else counts
+    readings = [*scan_uploads(device, 4, *counts), *scan_uploads(device, 4, scans + 1, scans)]
+    for count, seed in ((COUNT, 2), (COUNT, 3), (COUNT - 100, 4), (COUNT, 1)):
+        watch.clear()
+        found = call(count, seed)
+        assert watch.allocated == [] and watch.compiled == []
+        assert sorted(watch.up) == sorted([24 * count * scans, *readings])
+        assert watch.down == [4 * count * scans]
+    assert differing(found, first) == 0

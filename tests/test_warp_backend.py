@@ -150,8 +150,9 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
     launch = backend.compile("score_field", flags)
     assert isinstance(launch, _warp_pieces._Pieces)
-    inputs = [backend.upload(array) for array in arrays]
-    scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5)
+    nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)
+    inputs = [backend.upload(array) for array in (*arrays, *nowhere)]
+    scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5, 1, 0)
     real = np.dtype(np.float32)
 
     def run(target: Callable[..., None], count: int = particles) -> tuple[np.ndarray, np.ndarray]:

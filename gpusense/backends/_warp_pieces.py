@@ -69,6 +69,8 @@ class _Pieces:
         self._name = _shared_axis(row) or ""
         self._axis = row.launch.index(self._name)
         self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
+        # Which scan a particle belongs to follows from its number in the whole launch.
+        self._ahead = next((i for i, argument in enumerate(row.arguments) if argument.name == "ahead"), None)
         self._work = [
             i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
         ]
@@ -128,6 +130,8 @@ class _Pieces:
         """The arguments of a launch of some particles."""
         cut = list(arguments)
         cut[self._count] = count
+        if self._ahead is not None:
+            cut[self._ahead] += begin
         for i, each in rows:
             cut[i] = slice_of(arguments[i], begin * each, count * each)
         return cut

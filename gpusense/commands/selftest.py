@@ -19,10 +19,11 @@ HELP = "Check that the backends present agree with the float64 truth and with on
 BREACH = 1
 
 _EPILOG = """\
-On a made-up building, every backend present computes distance transforms, expected ranges and log-likelihoods in both
-precisions. 'truth' is the float64 reference on the backend's own rounded inputs and expected ranges; 'SciPy' is its
-distance transform; 'specialize=False' is the same model with nothing left out; 'float64' is the same backend's other
-precision. The tolerances and their reasons are in gpusense.tolerances, and in the JSON document.
+On a made-up building, every backend present computes distance transforms, expected ranges, angles of incidence and
+log-likelihoods of a laser and of a ring of sonars, in both precisions. 'truth' is the float64 reference on the
+backend's own rounded inputs and expected ranges; 'SciPy' is its distance transform; 'specialize=False' is the same
+model with nothing left out; 'float64' is the same backend's other precision. The tolerances and their reasons are in
+gpusense.tolerances, and in the JSON document.
 
 Exit codes: 0 every difference is allowed, 1 one is not, 2 bad input or an absent device.
 

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.backends import Backend
+from gpusense.lanes import widened
 from gpusense.learning.pairs import Pairs
 from gpusense.learning.point import Point
-from gpusense.models.scan_model import log_weight, rounded_terms
+from gpusense.models.terms import log_weight, rounded_terms
+from gpusense.signatures import LANES
 
 # Numbers in a row of sums; see kernels/opencl/learning.cl.
 _SUMS = {False: 14, True: 40}
@@ -71,6 +73,8 @@ class DeviceSums:
     def _upload(self, reading: NDArray[np.floating], expected: NDArray[np.floating], gpu: bool) -> _Chunk:
         count = len(reading)
         length = max(_SHORTEST, -(-count // _BLOCKS["gpu" if gpu else "cpu"]))
+        # A processor's lanes take pairs that lie side by side, and are always full.
+        length += 0 if gpu else -length % LANES
         blocks = -(-count // length)
         filled = np.full((2, blocks * length), np.nan, self.real)
         filled[0, :count], filled[1, :count] = reading, expected
@@ -102,7 +106,7 @@ class DeviceSums:
         if not self._chunks:
             return total
         backend = self._backend
-        launch = backend.compile("e_step", flags)
+        launch = backend.compile("e_step", widened(backend.info, "e_step", flags))
         terms = backend.upload(self.terms(point))
         for chunk in self._chunks:
             launch((chunk.blocks,), chunk.reading, chunk.expected, terms, self._rows, *chunk.layout, width)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -38,26 +38,33 @@ class IncidenceFit:
         fits: (B,) the fit of each bin. Their traces are of log-likelihood and log prior; their standard errors take the
             pseudo-readings for readings.
         counts: (B,) readings of each bin, hits and max readings.
-        no_surface: Hits and max readings whose beam hits no surface, left out.
-        strength: Pseudo-readings that each bin was given from the pooled fit.
+        no_surface: The fit of beams that hit no surface, of the same kind; None where there was nothing to fit it to,
+            neither readings nor pseudo-readings.
+        no_surface_count: Their hits and max readings.
+        strength: Pseudo-readings that each of these fits was given from the pooled fit.
     """
 
     parameters: IncidenceParameters
     pooled: BeamFit
     fits: tuple[BeamFit, ...]
     counts: tuple[int, ...]
-    no_surface: int
+    no_surface: BeamFit | None
+    no_surface_count: int
     strength: float
 
     @property
     def converged(self) -> bool:
         """Whether every fit did."""
-        return self.pooled.converged and all(fit.converged for fit in self.fits)
+        return self.pooled.converged and all(fit.converged for fit in self._all_fits)
 
     @property
     def log_likelihood(self) -> float:
-        """Of all readings with a surface, each with its bin's parameters."""
-        return math.fsum(fit.log_likelihood for fit in self.fits)
+        """Of all readings, each with its own parameters: what a model with ``parameters`` gives to them."""
+        return math.fsum(fit.log_likelihood for fit in self._all_fits)
+
+    @property
+    def _all_fits(self) -> tuple[BeamFit, ...]:
+        return self.fits if self.no_surface is None else (*self.fits, self.no_surface)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain numbers, lists and strings."""
@@ -66,7 +73,8 @@ class IncidenceFit:
             "pooled": self.pooled.to_dict(),
             "fits": [fit.to_dict() for fit in self.fits],
             "counts": list(self.counts),
-            "no_surface": self.no_surface,
+            "no_surface": None if self.no_surface is None else self.no_surface.to_dict(),
+            "no_surface_count": self.no_surface_count,
             "strength": self.strength,
         }
 
@@ -75,11 +83,15 @@ class IncidenceFit:
         lines = [f"{'incidence [deg]':16}{'readings':>10}" + "".join(f"{name:>14}" for name in names)]
         edges = np.degrees(self.parameters.edges)
         bins = [f"{low:.0f} to {high:.0f}" for low, high in pairwise(edges)]
-        rows = zip(["all", *bins], [sum(self.counts), *self.counts], [self.pooled, *self.fits], strict=True)
+        rows = list(zip(["all", *bins], [sum(self.counts), *self.counts], [self.pooled, *self.fits], strict=True))
+        if self.no_surface is not None:
+            rows.append(("no surface", self.no_surface_count, self.no_surface))
         for name, count, fit in rows:
             numbers = "".join(f"{value:14.5g}" for value in fit.parameters.to_dict().values())
             lines.append(f"{name:16}{count:10}{numbers}{'' if fit.converged else '  ' + fit.status}")
-        lines.append(f"{self.no_surface} readings of beams that hit no surface left out; prior of {self.strength:g}")
+        lines.append(
+            f"'all' are those with a surface; a prior of {self.strength:g} pseudo-readings like them in each row"
+        )
         return "\n".join(lines)
 
 
@@ -115,8 +127,8 @@ def fit_incidence_parameters(
     A number of bins means bins of equal width. What changes with the angle, lost echoes and long tails, changes fastest
     near grazing incidence, where readings are few; bins of equal count would put that into one.
 
-    Readings of beams that hit no surface are left out. A model gives such beams the first bin's parameters, but for
-    them "no return" is what is expected, and counting it would teach that walls seen head-on are often missed.
+    Beams that hit no surface have parameters of their own, fitted in the same way: "no return" is what is expected of
+    them, and counting it for a bin of angles would teach that walls are often missed.
 
     Args:
         ranges: Readings z of any shape [m].
@@ -124,7 +136,8 @@ def fit_incidence_parameters(
         incidence: Angles of incidence of the same shape, in [0, pi / 2] [rad]; NaN where the beam hits no surface.
         range_max: Readings of at least this are "no return" [m].
         bins: Number of bins of equal width, or (B + 1,) their edges, rising from 0 to pi / 2 [rad].
-        strength: Pseudo-readings of each bin, >= 0; 0 fits every bin by itself.
+        strength: Pseudo-readings of each bin, >= 0; 0 fits every bin by itself. Without them, and without a reading of
+            a beam that hits no surface, such beams keep the first bin's parameters.
         method: See :func:`fit_beam_parameters`, as for all that follows; not ``"em-book"``, which knows no prior.
         range_min: Readings below this are missing [m].
         initial: Where the pooled fit begins.
@@ -183,14 +196,17 @@ def fit_incidence_parameters(
                 f"{high:.3g} degrees"
             )
         fits.append(fit_pairs(DeviceSums(*opened, own), own, bounds, middle, options, prior))
-    return IncidenceFit(
-        IncidenceParameters(tuple(edges.tolist()), tuple(fit.parameters for fit in fits)),
-        pooled,
-        tuple(fits),
-        tuple(counts),
-        int(np.count_nonzero(used & ~surface)),
-        strength,
+    own = pairs.subset(~surface)
+    nothing, count = None, own.hits + own.max_readings
+    if count or strength > 0:
+        # Such beams may need a cause that surfaces do without.
+        weights = 0.5 * (middle.weights + first_guess(own, bounds).weights) if count else middle.weights
+        start = replace(middle, weights=weights)
+        nothing = fit_pairs(DeviceSums(*opened, own), own, bounds, start, options, prior)
+    parameters = IncidenceParameters(
+        tuple(edges.tolist()), tuple(fit.parameters for fit in fits), None if nothing is None else nothing.parameters
     )
+    return IncidenceFit(parameters, pooled, tuple(fits), tuple(counts), nothing, count, strength)
 
 
 def _angles(incidence: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArray[np.float64]:

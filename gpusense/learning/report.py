@@ -31,7 +31,8 @@ def report(problem: Problem, climb: Climb, options: Options) -> BeamFit:
         notes.append("did not converge")
     count = int((value.point.weights > 0).sum()) - 1 + int(value.point.weights[HIT] > 0)
     if problem.readings < count:
-        notes.append(f"{problem.readings} readings cannot tell {count} parameters")
+        readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
+        notes.append(f"{readings} cannot tell {count} parameters")
     for name, error in own.items():
         if error == math.inf:
             held[name] = "the readings do not tell it"

@@ -13,6 +13,8 @@ from gpusense.learning.problem import Problem, Value
 
 # A weight is between e^-25 and e^25 times the one that follows from the others.
 _WIDEST = 25.0
+# So often hill climbing turns its directions where it is stuck.
+_TURNS = 5
 
 
 class _Coordinates:
@@ -131,7 +133,8 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
     """Powell's method (1964) without derivatives, within bounds, begun anew until that gains nothing.
 
     Its line searches keep their grip in the long, narrow valleys of this likelihood, where a simplex (Nelder and Mead)
-    collapses; it also takes bounds.
+    collapses; it also takes bounds. It begins along the coordinates. Where all of these lead down but the end is no
+    optimum, as the derivatives there tell, it begins anew along others, which are turned at random.
     """
     from scipy.optimize import minimize
 
@@ -139,6 +142,8 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
     coordinates = search.coordinates
     if not len(coordinates.places):
         return Climb(search.best, search.trace, True)
+    rng = np.random.default_rng(0)
+    directions, turns = np.eye(len(coordinates.places)), 0
     while len(search.trace) <= max_iterations:
         before = search.best.objective
         minimize(
@@ -147,11 +152,21 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
             method="Powell",
             bounds=coordinates.limits,
             callback=search.end_iteration,
-            options={"maxiter": max_iterations + 1 - len(search.trace), "xtol": 1e-4, "ftol": 1e-13},
+            options={
+                "maxiter": max_iterations + 1 - len(search.trace),
+                "xtol": 1e-4,
+                "ftol": 1e-13,
+                "direc": directions,
+            },
         )
         if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):
-            search.best = without_needless(problem, search.best)
-            return Climb(search.best, search.trace, True)
+            left = search.left()
+            if left <= max(1e3 * tolerance, problem.noise(search.best)):
+                return Climb(search.best, search.trace, True)
+            if turns == _TURNS:
+                return Climb(search.best, search.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
+            turns += 1
+            directions = np.linalg.qr(rng.normal(size=directions.shape))[0]
     return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
 
 

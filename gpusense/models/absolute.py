@@ -12,10 +12,11 @@ from gpusense import _checks, arrays
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
-from gpusense.models.point_model import Part, PointModel
-from gpusense.models.scan_model import log_weight
+from gpusense.models.point_model import MISSING, Part, PointModel, rand_omission, relative_omissions
+from gpusense.models.terms import log_weight
 from gpusense.pairs import DIGITS, PI, exact, log_of, total, two_parts
-from gpusense.reference.absolute import NEARBY, SERIES, VON_MISES, WAVES
+from gpusense.plan import Omission
+from gpusense.reference.absolute import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.reference.relative import wrapped_difference
 from gpusense.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 
@@ -32,6 +33,7 @@ class PositionModel(PointModel):
         parameters: Covariance, weights, region and where the antenna is.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
+        temperature: In (0, 1]: multiplies log p, for errors that are not independent from fix to fix.
 
     Raises:
         TypeError: an argument is of the wrong kind.
@@ -39,11 +41,16 @@ class PositionModel(PointModel):
     """
 
     def __init__(
-        self, parameters: PositionParameters, *, backend: str | Backend = "auto", precision: str = "float32"
+        self,
+        parameters: PositionParameters,
+        *,
+        backend: str | Backend = "auto",
+        precision: str = "float32",
+        temperature: float = 1.0,
     ) -> None:
         if not isinstance(parameters, PositionParameters):
             raise TypeError(f"parameters: must be PositionParameters, got {_checks.show(parameters)}")
-        super().__init__(backend, precision)
+        super().__init__(backend, precision, temperature)
         self.parameters = parameters
         p = parameters
         own = p.covariance
@@ -60,7 +67,7 @@ class PositionModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            fix: (2,) measured x and y of the antenna [m]; NaN in either is a missing fix, which says nothing: 0.
+            fix: (2,) measured x and y of the antenna [m]. One that is not finite is missing and says nothing: 0.
             covariance: None, or the (2, 2) covariance matrix of this fix in the world [m^2].
             out: Where to write the result, in the memory where the poses are.
 
@@ -69,29 +76,34 @@ class PositionModel(PointModel):
 
         Raises:
             TypeError: an argument does not hold real numbers.
-            ValueError: a wrong shape, a value that is not finite, or no covariance at all.
+            ValueError: a wrong shape, a pose that is not finite, or no covariance at all.
         """
         given = arrays.copied_to_host(fix, self._backend, "fix")
         x, y = (float(value) for value in _checks.array("fix", given, (2,), finite=False))
-        if math.isinf(x) or math.isinf(y):
-            raise ValueError(f"fix: every value must be finite or nan, got {_checks.show([x, y])}")
         hit = self._hit
         if covariance is not None:
             c = check_covariance("covariance", covariance)
             hit = self._gaussian("covariance", (exact(c[0][0]), exact(c[0][1]), exact(c[1][1])))
         if hit is None:
             raise ValueError("covariance: must be given where the parameters have none, got None")
-        if math.isnan(x) or math.isnan(y):
-            return cast(np.ndarray, self._score(poses, out, 1, None))
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
         terms = self._terms(hit, x, y)
+        impossible = bool(np.isneginf(terms[-1]))
+        flags = self._flags if impossible else self._flags | {"RAND"}
+        left_out = [rand_omission("the fix is outside the region")] if impossible and self.parameters.z_rand else []
 
         def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
             place = self._relative(cloud, part, "place_relative", (x, y, *self.parameters.mount))
-            numbers = self._workspace.upload("terms", terms)
-            count = part[1] - part[0]
-            self._backend.compile("score_position", self._flags)((count,), place, numbers, result, count)
+            numbers, count = self._workspace.upload("terms", terms), part[1] - part[0]
+            self._launch("score_position", flags, cloud, count, place, numbers, result, count)
 
-        return cast(np.ndarray, self._score(poses, out, 1, launch))
+        return cast(np.ndarray, self._score(poses, out, launch, left_out))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        p = self.parameters
+        found = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        return "position fix", found + relative_omissions(p.mount, self.precision)
 
     def _terms(self, hit: list[np.floating], x: float, y: float) -> np.ndarray:
         region, random = self.parameters.region, -math.inf
@@ -125,6 +137,7 @@ class HeadingModel(PointModel):
         parameters: Kind, deviation or concentration, weights and offset.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of headings of many turns.
+        temperature: In (0, 1]: multiplies log p, for errors that are not independent from reading to reading.
 
     Raises:
         TypeError: an argument is of the wrong kind.
@@ -137,12 +150,14 @@ class HeadingModel(PointModel):
         *,
         backend: str | Backend = "auto",
         precision: str = "float32",
+        temperature: float = 1.0,
     ) -> None:
         self.parameters = HeadingParameters() if parameters is None else parameters
         if not isinstance(self.parameters, HeadingParameters):
             raise TypeError(f"parameters: must be HeadingParameters, got {_checks.show(parameters)}")
-        super().__init__(backend, precision)
+        super().__init__(backend, precision, temperature)
         self._kind, terms = self._mixture()
+        self._flags |= {"RAND"} if self.parameters.z_rand else set()
         self._terms_there = self._backend.upload(terms)
 
     def log_likelihood(self, poses: object, heading: object, *, out: Any = None) -> np.ndarray:
@@ -150,7 +165,8 @@ class HeadingModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            heading: What the sensor reads [rad], any number of turns; NaN is a missing reading, which says nothing: 0.
+            heading: What the sensor reads [rad], any number of turns. One that is not finite is missing and says
+                nothing: 0.
             out: Where to write the result, in the memory where the poses are.
 
         Returns:
@@ -158,14 +174,12 @@ class HeadingModel(PointModel):
 
         Raises:
             TypeError: an argument does not hold real numbers.
-            ValueError: a wrong shape, or a value that is not finite.
+            ValueError: a wrong shape, or a pose that is not finite.
         """
         given = arrays.copied_to_host(heading, self._backend, "heading")
         reading = float(_checks.array("heading", given, (), finite=False))
-        if math.isinf(reading):
-            raise ValueError(f"heading: must be finite or nan, got {reading}")
-        if math.isnan(reading):
-            return cast(np.ndarray, self._score(poses, out, 1, None))
+        if not math.isfinite(reading):
+            return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
         zero = np.zeros(1)
         turned = wrapped_difference(np.array([self.parameters.offset]), (zero, zero))
         high, low = wrapped_difference(np.array([reading]), turned)
@@ -174,11 +188,20 @@ class HeadingModel(PointModel):
         def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
             residual = self._relative(cloud, part, "wrap_headings", target)
             count = part[1] - part[0]
-            self._backend.compile("score_heading", self._flags)(
-                (count,), residual, self._terms_there, result, count, self._kind
-            )
+            numbers = residual, self._terms_there
+            self._launch("score_heading", self._flags, cloud, count, *numbers, result, count, self._kind)
 
-        return cast(np.ndarray, self._score(poses, out, 1, launch))
+        return cast(np.ndarray, self._score(poses, out, launch, []))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        p = self.parameters
+        found = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        # How far from half a turn all other turns are below exp(-40) of the nearest one.
+        near = NEGLIGIBLE * p.sigma**2 / (2 * math.pi)
+        if self._kind == NEARBY and near < math.pi:
+            why = f"residuals of less than pi - {near:.2g} rad need the nearest turn only"
+            found.append(Omission("other turns", why, f"{2 * WRAPS} exp and 1 log for each such particle"))
+        return f"heading, {p.kind}", found
 
     def _mixture(self) -> tuple[int, np.ndarray]:
         """The kind of density, and the numbers of the kernel file ``absolute``."""

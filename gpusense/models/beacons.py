@@ -12,9 +12,10 @@ from gpusense import _checks, arrays
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
-from gpusense.models.point_model import Part, PointModel
-from gpusense.models.scan_model import log_weight
+from gpusense.models.point_model import Part, PointModel, rand_omission, relative_omissions
+from gpusense.models.terms import log_weight
 from gpusense.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.plan import Omission, share
 from gpusense.reference.beacons import BEACON, NORMAL, STUDENT_T, TERMS, TWO_NORMALS
 from gpusense.reference.relative import FARTHEST
 from gpusense.sensor_parameters import BeaconParameters
@@ -32,6 +33,7 @@ class BeaconModel(PointModel):
         parameters: Density, bias, weights and where the antenna is.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
+        temperature: In (0, 1]: multiplies the sum over ranges. 1 is the plain product of densities.
 
     Raises:
         TypeError: an argument is of the wrong kind.
@@ -45,6 +47,7 @@ class BeaconModel(PointModel):
         *,
         backend: str | Backend = "auto",
         precision: str = "float32",
+        temperature: float = 1.0,
     ) -> None:
         self.parameters = BeaconParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BeaconParameters):
@@ -53,7 +56,8 @@ class BeaconModel(PointModel):
         # An empty list has no columns.
         self.xy = _checks.array("xy", given.reshape(0, 2) if given.shape == (0,) else given, ("M", 2)).copy()
         self.xy.flags.writeable = False
-        super().__init__(backend, precision)
+        super().__init__(backend, precision, temperature)
+        self._flags |= {"RAND"} if self.parameters.z_rand else set()
         # Poses and beacons are placed relative to the middle of the beacons.
         middle = (self.xy.min(axis=0) / 2 + self.xy.max(axis=0) / 2) if len(self.xy) else np.zeros(2)
         self._origin = float(middle[0]), float(middle[1])
@@ -69,7 +73,8 @@ class BeaconModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            ranges: (F,) ranges from 0 to range_max [m], of all M beacons or of those in ``ids``; NaN is missing.
+            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and what is not between 0 and
+                range_max, is missing: it says nothing.
             ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.
             out: Where to write the result, in the memory where the poses are.
 
@@ -78,26 +83,30 @@ class BeaconModel(PointModel):
 
         Raises:
             TypeError: an argument does not hold real numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, a range outside [0, range_max], an index that is no
-                beacon's.
+            ValueError: a wrong shape, a pose that is not finite, an index that is no beacon's.
         """
-        beacon = self._prepare(ranges, ids)
+        beacon, left_out = self._prepare(ranges, ids)
         count = len(beacon)
         if count == 0:
-            return cast(np.ndarray, self._score(poses, out, 1, None))
+            return cast(np.ndarray, self._score(poses, out, None, left_out))
 
         def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
             place = self._relative(cloud, part, "place_relative", (*self._origin, *self.parameters.mount))
             numbers, particles = self._workspace.upload("beacon", beacon), part[1] - part[0]
-            self._backend.compile("score_beacons", self._flags)(
-                (particles,), place, numbers, self._terms_there, self._series_there, result, particles, count,
-                self._count, self._kind,
+            self._launch(
+                "score_beacons", self._flags, cloud, particles, place, numbers, self._terms_there, self._series_there,
+                result, particles, count, self._count, self._kind,
             )  # fmt: skip
 
-        return cast(np.ndarray, self._score(poses, out, count, launch))
+        return cast(np.ndarray, self._score(poses, out, launch, left_out, items=count))
 
-    def _prepare(self, ranges: object, ids: object) -> np.ndarray:
-        """(F, BEACON) numbers of the ranges that are there."""
+    def _describe(self) -> tuple[str, list[Omission]]:
+        p = self.parameters
+        found = [] if p.z_rand else [rand_omission("z_rand = 0", " and range")]
+        return f"ranges to beacons, {p.kind}", found + relative_omissions(p.mount, self.precision)
+
+    def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
+        """(F, BEACON) numbers of the ranges that count, and which do not."""
         p, known = self.parameters, len(self.xy)
         given = arrays.copied_to_host(ranges, self._backend, "ranges")
         if ids is None:
@@ -112,18 +121,23 @@ class BeaconModel(PointModel):
             if outside.any():
                 at = int(np.argmax(outside))
                 raise ValueError(f"ids: indices must be in [0, {known}), got {index[at]} at index {at}")
-        there = ~np.isnan(z)
-        outside = there & ~((z >= 0) & (z <= p.range_max))
-        if outside.any():
-            at = int(np.argmax(outside))
-            raise ValueError(f"ranges: must be in [0, {p.range_max:g}] or nan, got {z[at]} at index {at}")
+        missing, there = np.isnan(z), (z >= 0) & (z <= p.range_max)
+        left_out = []
+        reasons = (
+            ("missing ranges", missing, "are nan"),
+            ("impossible ranges", ~(missing | there), f"are not in [0, {p.range_max:g}] m"),
+        )
+        for what, which, why in reasons:
+            if number := int(np.count_nonzero(which)):
+                why = f"{number} of {len(z)} {why}"
+                left_out.append(Omission(what, why, f"{share(number, len(z))} of the ranges"))
         rows = []
         with localcontext(prec=DIGITS):
             for (x, y), reading in zip(self.xy[index[there]], z[there], strict=True):
                 numbers = (exact(float(x)) - exact(self._origin[0]), exact(float(y)) - exact(self._origin[1]),
                            exact(float(reading)) - exact(p.bias))  # fmt: skip
                 rows.append(two_parts(numbers, self._real))
-        return np.array(rows, self._real).reshape(-1, BEACON)
+        return np.array(rows, self._real).reshape(-1, BEACON), left_out
 
     def _mixture(self) -> tuple[int, np.ndarray, np.ndarray]:
         """The kind of density, and the numbers and the series of the kernel file ``beacons``."""

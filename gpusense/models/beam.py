@@ -16,19 +16,14 @@ from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
 from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, tiles_of
-from gpusense.cones import cones_of, require_exact
+from gpusense.cones import bins_of, cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.caster import MapCaster
-from gpusense.models.scan_model import (
-    HIGH_PEAK,
-    ScanModel,
-    log_weight,
-    rounded_terms,
-    sums_linearly,
-)
+from gpusense.models.scan_model import ScanModel
+from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
@@ -52,9 +47,9 @@ class BeamModel(ScanModel):
         parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, the table of a sensor of the
             scanner's range_max, of which every beam is one look-up, max readings too.
         incidence: Instead of ``parameters``, those for each range of angles of incidence: between a beam and the normal
-            of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has those of the first
-            range. Where ``z_max`` differs between them, max readings depend on the pose, and are impossible where it
-            is 0. Needs an exact caster.
+            of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has its ``no_surface``, or
+            those of the first range. Where ``z_max`` differs between them, max readings depend on the pose, and are
+            impossible where it is 0. Needs an exact caster.
         backend: Where it runs; see ``gpusense.devices()``.
         precision: ``"float32"`` or ``"float64"``.
         caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
@@ -106,13 +101,14 @@ class BeamModel(ScanModel):
         self.incidence_parameters = incidence
         # The parameters of each bin of angles of incidence.
         self._kinds: tuple[BeamParameters, ...] = (own,)
+        cosines = np.zeros(1)
         if incidence is not None:
             if not isinstance(incidence, IncidenceParameters):
                 raise TypeError(f"incidence: must be IncidenceParameters, got {_checks.show(incidence)}")
             for name, value in (("parameters", parameters), ("sensor_table", sensor_table), ("compat", compat)):
                 if value is not None:
                     raise ValueError(f"{name}: must be None with incidence, got {_checks.show(value)}")
-            self._kinds = incidence.parameters
+            self._kinds, cosines = bins_of(incidence)
         compat_module.check_weights(own, compat)
         if peer is not None:
             caster = "bresenham" if caster is None else caster
@@ -139,8 +135,7 @@ class BeamModel(ScanModel):
         self.sensor_table = sensor_table
         self._components, self._terms = self._mixture()
         self._terms_there = self._backend.upload(self._terms)
-        edges = (0.0, math.pi / 2) if incidence is None else incidence.edges
-        self._edges = self._backend.upload(np.cos(edges[1:]).astype(self._real))
+        self._edges = self._backend.upload(cosines.astype(self._real))
         self._none = self._backend.upload(np.zeros(1, np.int32))
         # Where the readings of each ray begin while no rays are shared.
         self._one_each = self._backend.upload(np.arange(scanner.count + 1, dtype=np.int32))
@@ -272,7 +267,8 @@ class BeamModel(ScanModel):
         how = "" if caster.name == "exact" else f", ranges by {caster}"
         how += self._cones.words(self.scanner.critical_incidence)
         if self.incidence_parameters is not None:
-            how += f", parameters for {len(self._kinds)} ranges of the angle of incidence"
+            how += f", parameters for {len(self.incidence_parameters.parameters)} ranges of the angle of incidence"
+            how += " and for none" if self.incidence_parameters.no_surface is not None else ""
             how += " (max readings depend on it)" if self._max_depends else ""
         name = "beam model" if self._discrete is None else "discrete beam model"
         title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
@@ -364,31 +360,41 @@ class BeamModel(ScanModel):
             # A range below range_max that is rounded to it is still a range, and no max reading to the table.
             top = np.nextafter(real.type(self.scanner.range_max), real.type(0))
             values = np.where(np.isfinite(scan.readings), np.minimum(values, top), values)
-        ray, reading = space.upload_all("scan", (vectors.astype(real), values))
+        batch, rays, readings = scan.batch, scan.most_rays, scan.most_readings
         shared = scan.shared or not self._specialize
-        first = space.upload("first", scan.first) if scan.shared else self._one_each
-        rays, readings = len(scan.rays), len(scan.readings)
+        one_each = not shared if batch is not None else not scan.shared
+        first = self._one_each if one_each else space.upload("first", scan.first)
+        if batch is None:
+            ray, reading = space.upload_all("scan", (vectors.astype(real), values))
+            start, counts, fixed_of = self._none, self._none, self._terms_there
+        else:
+            ray, reading, fixed_of = space.upload_all("scan", (vectors.astype(real), values, self._fixed_of(batch)))
+            start, counts = space.upload_all("scans", (batch.start, batch.counts))
+        scans = 1 if batch is None else len(batch.counts)
         scalars = (scan.constant + self._lead, self.temperature)
 
         def launch(cloud: Cloud, part: tuple[int, int], result: Buffer, per_beam: bool) -> Buffer:
             table, region, corners = cloud.ensure(self._caster.map, *part)
             normals = self._caster.normals(region, self._cones.flags)
             mount, count = self.scanner.mount, part[1] - part[0]
+            per_scan = count // scans
             poses = cloud.given(backend, space, part)
             flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
             # A table has a row for max readings.
             evaluated = self._max_depends and self._discrete is None
             flags |= cloud.headings() | ({"ALL_READINGS"} if evaluated else set())
             flags |= {"SHARED_RAYS"} if shared else set()
+            flags |= {"SCANS"} if batch is not None else set()
             inside = self._specialize and all_within(corners, self.grid, mount, region, 0)
             flags |= set() if inside else {"ORIGINS_OUTSIDE"}
             gpu = backend.info.kind == "gpu" and not per_beam
             if gpu:
                 self._last_code = frozenset(flags)
-                sizes = (count, rays, readings, shared, inside)
+                sizes = (count, per_scan, batch is None, rays, readings, len(scan.rays), len(scan.readings))
                 if space.again(
-                    (poses, result, table, first, normals), cloud.code(), self._caster.map.preparations, sizes, scalars
-                ):
+                    (poses, result, table, first, normals), cloud.code(), self._caster.map.preparations, sizes, shared,
+                    inside, scalars,
+                ):  # fmt: skip
                     return None
             placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=False)
             world: tuple[Any, ...] = (region.rows, region.cols, count, rays, readings, len(self._kinds))
@@ -404,11 +410,12 @@ class BeamModel(ScanModel):
                 tiles, spread = tiles_of(count, rays)
                 backend.compile("beam_tiles", self._last_code)(
                     (tiles,), table, normals, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
-                    self._edges, self._sensor, parts, *world, 1, count, spread,
+                    self._edges, self._sensor, start, parts, *world, 1, count, spread, per_scan,
                 )  # fmt: skip
                 backend.compile("sum_parts", self._last_code)(
-                    (count,), parts, order, result, count, readings, BLOCK_TERMS, 1, count, *scalars
-                )
+                    (count,), parts, order, counts, fixed_of, result, count, readings, BLOCK_TERMS, 1, count,
+                    *scalars, per_scan,
+                )  # fmt: skip
                 space.keep()
                 return parts
             flags |= {"PER_BEAM"} if per_beam else set()
@@ -416,7 +423,7 @@ class BeamModel(ScanModel):
             parts = space.empty("parts", count * readings if per_beam else 1, real)
             backend.compile("score_beams", flags)(
                 (count,), table, normals, placed.cell, placed.pose, ray, first, reading, self._terms_there, self._edges,
-                self._sensor, result, parts, *world, *scalars,
+                self._sensor, start, fixed_of, result, parts, *world, *scalars, per_scan, 0,
             )  # fmt: skip
             return parts
 
@@ -440,8 +447,8 @@ class BeamModel(ScanModel):
             tiles, spread = tiles_of(count, scan.places)
             self._backend.compile("beam_tiles", frozenset(flags | headings))(
                 (tiles,), table, normals, placed.cell, placed.pose, self._none, scan.point, self._one_each,
-                scan.reading, self._terms_there, self._edges, self._sensor, parts, region.rows, region.cols, count,
-                scan.places, scan.places, kinds, *world, 1, count, spread,
+                scan.reading, self._terms_there, self._edges, self._sensor, self._none, parts, region.rows, region.cols,
+                count, scan.places, scan.places, kinds, *world, 1, count, spread, count,
             )  # fmt: skip
 
         return score

@@ -16,6 +16,7 @@ from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.models.point_model import Part, PointModel
 from gpusense.pairs import DIGITS, exact, two_parts
+from gpusense.plan import Omission, share
 from gpusense.prepare import squared_distances
 from gpusense.reference.end_point import FIELD_RING
 from gpusense.region import LONGEST_SIDE, Region
@@ -48,6 +49,7 @@ class BumperModel(PointModel):
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        temperature: In (0, 1]: multiplies the sum over segments. 1 is the plain product of probabilities.
 
     Raises:
         TypeError: an argument is of the wrong kind.
@@ -65,6 +67,7 @@ class BumperModel(PointModel):
         precision: str = "float32",
         unknown: str = "free",
         outside: str = "free",
+        temperature: float = 1.0,
     ) -> None:
         if not isinstance(grid, OccupancyGrid):
             raise TypeError(f"grid: must be an OccupancyGrid, got {_checks.show(grid)}")
@@ -72,51 +75,54 @@ class BumperModel(PointModel):
         self.parameters = BumperParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BumperParameters):
             raise TypeError(f"parameters: must be BumperParameters, got {_checks.show(parameters)}")
-        unknown = _checks.choice("unknown", unknown, ("free", "occupied"))
-        outside = _checks.choice("outside", outside, ("free", "occupied"))
-        super().__init__(backend, precision)
+        self.unknown = _checks.choice("unknown", unknown, ("free", "occupied"))
+        self.outside = _checks.choice("outside", outside, ("free", "occupied"))
+        super().__init__(backend, precision, temperature)
         self._check_scale("sigma", self.parameters.sigma)
         side = grid.resolution
-        radius, self._points, self._start = sample_outline(outline, segments, side / 2)
+        self._radius, self._points, self._start = sample_outline(outline, segments, side / 2)
         self.segments = len(self._start) - 1
-        extent = radius + float(np.hypot(*self._points.T).max())
+        extent = self._radius + float(np.hypot(*self._points.T).max())
         margin = math.ceil(extent / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
         rows, cols = (size + 2 * margin for size in grid.shape)
         if max(rows, cols) + 2 * FIELD_RING > LONGEST_SIDE:
             rule = f"must have at most {LONGEST_SIDE - 2 * FIELD_RING} rows and columns with room for the outline"
             raise ValueError(f"grid: {rule}, got {rows} x {cols}")
         obstacles = np.pad(
-            grid.obstacles("occupied" if unknown == "occupied" else "free"),
+            grid.obstacles("occupied" if self.unknown == "occupied" else "free"),
             margin + FIELD_RING,
-            constant_values=outside == "occupied",
+            constant_values=self.outside == "occupied",
         )
         self._table = squared_distances(self._backend, obstacles)
         self._region = Region(-margin, -margin, rows, cols)
         self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
         high, low = split(self._points / side, self._real)
         self._given = [self._backend.upload(each) for each in (high, low)]
-        self._terms_there = self._backend.upload(self._terms(radius))
+        self._terms_there = self._backend.upload(self._terms(self._radius))
 
     def log_likelihood(self, poses: object, pressed: object, *, out: Any = None) -> np.ndarray:
         """log p(pressed | x, m) for each particle, natural logarithm.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            pressed: True or False, or (B,) of them where there are segments; NaN or None is a missing reading, which
-                says nothing: 0.
+            pressed: True or False (1 or 0 do as well), or (B,) of them where there are segments; NaN or None is a
+                missing reading, which says nothing: 0.
             out: Where to write the result, in the memory where the poses are.
 
         Returns:
             (N,) logarithms of probabilities in the model's precision.
 
         Raises:
-            TypeError: ``pressed`` is neither bool nor nan, or poses do not hold real numbers.
+            TypeError: ``pressed`` is none of these, or poses do not hold real numbers.
             ValueError: a wrong shape, or a pose that is not finite.
         """
         states = self._states(pressed)
-        there = states >= 0
+        there, left_out = states >= 0, []
+        if missing := int(np.count_nonzero(~there)):
+            why = f"{missing} of {self.segments} are nan or None"
+            left_out = [Omission("missing readings", why, f"{share(missing, self.segments)} of the segments")]
         if not there.any():
-            return cast(np.ndarray, self._score(poses, out, 1, None))
+            return cast(np.ndarray, self._score(poses, out, None, left_out))
         sizes = np.diff(self._start)
         kept = np.repeat(there, sizes)
         points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._given
@@ -129,13 +135,26 @@ class BumperModel(PointModel):
             given, count = cloud.given(self._backend, space, part), part[1] - part[0]
             frame = (region, self.grid, (0.0, 0.0, 0.0))
             placed = cloud.place(self._backend, space, given, part, frame, self._real, careful="CAREFUL" in flags)
-            self._backend.compile("score_contact", flags)(
-                (count,), self._table, placed.cell, placed.pose, placed.low, *points, space.upload("start", start),
-                space.upload("pressed", own), self._terms_there, result, region.rows, region.cols, count, len(own),
-                self._guard,
+            self._launch(
+                "score_contact", flags, cloud, count, self._table, placed.cell, placed.pose, placed.low, *points,
+                space.upload("start", start), space.upload("pressed", own), self._terms_there, result, region.rows,
+                region.cols, count, len(own), self._guard,
             )  # fmt: skip
 
-        return cast(np.ndarray, self._score(poses, out, int(kept.sum()), launch))
+        return cast(np.ndarray, self._score(poses, out, launch, left_out, items=int(kept.sum())))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        found = []
+        if len(self._points) == 1:
+            spared = max(round(4 * math.pi * self._radius / self.grid.resolution) - 1, 0)
+            why = "one look-up at a circle's centre gives the distance of all of it"
+            found.append(Omission("points of the outline", why, f"about {spared} look-ups per particle"))
+        why = f"unknown cells are {self.unknown} by one rule, applied once to the map"
+        found.append(Omission("unknown branch", why, "a test per look-up"))
+        if self.precision == "float32":
+            why = "positions are split into cell and fraction in float64"
+            found.append(Omission("float64", why, "half the bytes and wide units"))
+        return "bumper", found
 
     def _select(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         high, low = split(self._points[kept] / self.grid.resolution, self._real)
@@ -144,9 +163,10 @@ class BumperModel(PointModel):
     def _states(self, pressed: object) -> np.ndarray:
         """(B,) 1 where pressed, 0 where not, -1 where missing."""
         given = arrays.copied_to_host(pressed, self._backend, "pressed")
-        one = given is None or isinstance(given, (bool, float, np.bool, np.floating))
+        one = given is None or isinstance(given, (bool, int, float, np.bool, np.number))
         if not one and not isinstance(given, (list, tuple, np.ndarray)):
-            raise TypeError(f"pressed: must be True, False or nan, or a sequence of these, got {_checks.show(pressed)}")
+            rule = "must be True, False or nan, or a sequence of these"
+            raise TypeError(f"pressed: {rule}, got {_checks.show(pressed)}")
         if isinstance(given, np.ndarray) and given.ndim > 1:
             raise ValueError(f"pressed: shape must be ({self.segments},), got {_checks.shape_text(given.shape)}")
         many = [given] if one else list(np.atleast_1d(np.asarray(given, object)))
@@ -154,7 +174,7 @@ class BumperModel(PointModel):
         for value in many:
             if value is None or (isinstance(value, (float, np.floating)) and math.isnan(value)):
                 states.append(-1)
-            elif isinstance(value, (bool, np.bool)):
+            elif isinstance(value, (bool, int, float, np.bool, np.number)) and value in (0, 1):
                 states.append(int(value))
             else:
                 raise TypeError(f"pressed: every value must be True, False or nan, got {_checks.show(value)}")

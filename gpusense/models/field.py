@@ -18,13 +18,8 @@ from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.models.field_table import RING, FieldTable
 from gpusense.models.reachable import ReachableMap
-from gpusense.models.scan_model import (
-    HIGH_PEAK,
-    ScanModel,
-    log_weight,
-    rounded_terms,
-    sums_linearly,
-)
+from gpusense.models.scan_model import ScanModel
+from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions
 from gpusense.reference.error_free import BLOCK_TERMS
@@ -32,11 +27,13 @@ from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
-# The table's ring, and the work-group of ``field_blocks``: the kernel file ``field`` has the same numbers.
+# The table's ring, and the particles of a work-group of ``field_blocks`` or of vectors: the kernel files ``field`` and
+# ``field_lanes`` have the same numbers.
 _RING = 2
 _GROUP = 64
 # In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.
 _GUARD = 3.25
+_NO_FLAGS, _SCANS = frozenset[str](), frozenset({"SCANS"})
 
 
 class LikelihoodFieldModel(ScanModel):
@@ -211,15 +208,23 @@ class LikelihoodFieldModel(ScanModel):
         longest = float(np.maximum.reduce(lengths))
         # What products of rounded factors and their sums can be off: 3.12 eps of the longest reading, and 1.5 eps.
         guard = self._guard * (longest + 2)
+        readings, batch = scan.most_readings, scan.batch
+        blocks = -(-readings // BLOCK_TERMS)
+        numbers, start, counts = [high, low], self._none, self._none
         if backend.info.kind == "gpu":
-            longest_each = np.maximum.reduceat(lengths, self._firsts[: -(-len(cells) // BLOCK_TERMS)])
-            guard_each = (self._guard * (longest_each + 2)).astype(real)
-            point, point_low, guards = space.upload_all("points", (high, low, guard_each))
+            longest_each = self._longest_each(lengths, scan, blocks)
+            numbers.append((self._guard * (longest_each + 2)).astype(real))
+        if batch is None:
+            given, fixed_of = space.upload_all("points", numbers), self._terms_there
         else:
-            point, point_low = space.upload_all("points", (high, low))
-        readings = len(scan.readings)
+            *given, fixed_of = space.upload_all("points", [*numbers, self._fixed_of(batch)])
+            of_blocks = -(-batch.counts // BLOCK_TERMS)
+            start, counts = space.upload_all("scans", (batch.start, of_blocks.astype(np.int32)))
+        point, point_low, guards = given if len(given) == 3 else (*given, None)
+        scans = 1 if batch is None else len(batch.counts)
 
         careful = "CAREFUL" in self._flags
+        quick = careful and self._log_table and self._specialize
         scalars = (scan.constant + self._lead, self.temperature)
         reach = longest + 2
 
@@ -228,39 +233,56 @@ class LikelihoodFieldModel(ScanModel):
             mount, count = self.scanner.mount, part[1] - part[0]
             poses = cloud.given(backend, space, part)
             flags, gpu = self._flags, backend.info.kind == "gpu" and not per_beam
+            per_scan, several = count // scans, _NO_FLAGS if batch is None else _SCANS
             if gpu:
-                if careful and self._log_table and self._specialize:
+                if quick:
                     inside = all_within(corners, self.grid, mount, region, reach, _RING)
                     flags = self._inside if inside else self._quick
+                flags |= several
                 self._last_code = flags | cloud.headings()
-                if space.again(
-                    (poses, result, table), cloud.code(), flags, self._map.preparations, count, readings, scalars
-                ):
+                sizes = (count, readings, len(scan.readings), per_scan)
+                if space.again((poses, result, table), cloud.code(), flags, self._map.preparations, sizes, scalars):
                     return None
             placed = cloud.place(backend, space, poses, part, (region, self.grid, mount), real, careful=careful)
             given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
             if gpu:
-                blocks = -(-readings // BLOCK_TERMS)
                 parts = space.empty("parts", count * blocks, real)
                 spread = spread_of(count, blocks)
                 backend.compile("field_blocks", flags)(
-                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, guards, parts, region.rows, region.cols,
-                    count, readings, 1, count, spread,
+                    ((-(-count // _GROUP) << spread) * _GROUP,), *given, guards, start, parts, region.rows,
+                    region.cols, count, readings, 1, count, spread, per_scan,
                 )  # fmt: skip
                 backend.compile("sum_parts", flags)(
-                    (count,), parts, self._none, result, count, blocks, 1, 1, count, *scalars
-                )
+                    (count,), parts, self._none, counts, fixed_of, result, count, blocks, 1, 1, count, *scalars,
+                    per_scan,
+                )  # fmt: skip
                 space.keep()
                 return parts
-            flags |= cloud.headings() | ({"PER_BEAM"} if per_beam else set())
-            flags = self._last_code = widened(backend.info, "score_field", flags)
+            flags |= several | cloud.headings() | ({"PER_BEAM"} if per_beam else set())
+            flags = widened(backend.info, "score_field", flags)
+            # Warp's compiler for processors makes vectors of loops over readings, others of work-items, or lanes do.
+            if quick and (backend.info.backend, backend.info.kind) == ("warp", "cpu"):
+                flags |= {"QUICK"}
+            self._last_code = flags
             parts = space.empty("parts", count * readings if per_beam else 1, real)
+            # Vectors of particles hold those of one scan.
+            size = scans * -(-per_scan // _GROUP) * _GROUP if "WIDE" in flags else count
             backend.compile("score_field", flags)(
-                (count,), *given, result, parts, region.rows, region.cols, count, readings, guard, *scalars
-            )
+                (size,), *given, start, fixed_of, result, parts, region.rows, region.cols, count, readings, guard,
+                *scalars, per_scan, 0,
+            )  # fmt: skip
             return parts
 
         return launch
+
+    def _longest_each(self, lengths: np.ndarray, scan: PreparedScan, blocks: int) -> np.ndarray:
+        """The longest reading of each block, in cells; of several scans each has as many blocks as the longest."""
+        if scan.batch is None:
+            return np.maximum.reduceat(lengths, self._firsts[:blocks])
+        counts = scan.batch.counts
+        padded = np.zeros((len(counts), blocks * BLOCK_TERMS))
+        padded[np.arange(padded.shape[1]) < counts[:, None]] = lengths
+        return padded.reshape(len(counts), blocks, BLOCK_TERMS).max(axis=2)
 
     def _bound_scene(self) -> Scene:
         careful = "CAREFUL" in self._flags
@@ -274,8 +296,8 @@ class LikelihoodFieldModel(ScanModel):
             spread = spread_of(count, -(-scan.places // BLOCK_TERMS))
             blocks(
                 ((-(-count // _GROUP) << spread) * _GROUP,), table, placed.cell, placed.pose, placed.low, scan.point,
-                scan.low, self._terms_there, scan.guard, parts, region.rows, region.cols, count, scan.places, 1, count,
-                spread,
+                scan.low, self._terms_there, scan.guard, self._none, parts, region.rows, region.cols, count,
+                scan.places, 1, count, spread, count,
             )  # fmt: skip
 
         return score

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
-from gpusense.models.scan_model import log_weight
+from gpusense.models.terms import log_weight
 from gpusense.parameters import LikelihoodFieldParameters
 from gpusense.prepare import check_size, squared_distances
 from gpusense.region import Region

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import math
-import threading
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends import Backend, BackendInfo, get_backend
+from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud, Placed
 from gpusense.features import (
     PreparedFeatures,
     check_correspondence,
-    check_features,
     describe,
     full_circle,
+    possible_features,
     prepare_features,
-    signature_mass,
 )
-from gpusense.frames import split
 from gpusense.landmarks import LandmarkMap, make_buckets
 from gpusense.lanes import widened
-from gpusense.models.scan_model import chunk_of, in_chunks, log_weight, real_dtype
+from gpusense.models.landmark_plan import feature_omissions, looked_at, parameter_omissions
+from gpusense.models.landmark_tables import upload_tables
+from gpusense.models.point_model import Part, PointModel
+from gpusense.models.terms import log_weight
 from gpusense.parameters import LandmarkParameters
-from gpusense.plan import Omission, Plan, share
-from gpusense.reference.landmarks import ARCS
+from gpusense.plan import Omission
 from gpusense.region import Region
-from gpusense.workspace import Workspace
 
 # Limits of the joint association: 2^features sets, and every landmark is tried with each of them.
 JOINT_FEATURES = 8
@@ -38,7 +38,23 @@ _INT = np.dtype(np.int32)
 _PER_READING = 8
 
 
-class LandmarkModel:
+@dataclass(frozen=True)
+class _Call:
+    """What all particles of a call share: features that are evaluated, and for known ones the landmarks' places."""
+
+    prepared: PreparedFeatures
+    places: np.ndarray
+    fixed: float
+    flags: frozenset[str]
+    joint: bool
+
+    @property
+    def count(self) -> int:
+        """Features that are evaluated."""
+        return len(self.prepared.columns)
+
+
+class LandmarkModel(PointModel):
     """log p(f | x, m) of the features that a sensor finds, by the landmarks that they may be.
 
     Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; what p(f | j) and p_uniform are stands in
@@ -98,38 +114,28 @@ class LandmarkModel:
         self.negative = negative
         x, y, yaw = (float(value) for value in _checks.array("mount", mount, (3,)))
         self.mount = (x, y, yaw)
-        self.temperature = _checks.real("temperature", temperature, above=0, high=1)
+        super().__init__(backend, precision, temperature)
         self._specialize = specialize
-        self._backend = get_backend(backend)
-        self._real = real_dtype(precision, self._backend)
-        self._workspace = Workspace(self._backend)
-        # Threads may share a model: its buffers serve one call at a time.
-        self._lock = threading.Lock()
         self._sensor = describe(p, landmarks)
         tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
         if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
             raise ValueError(f"parameters: deviations must fit {self._real.name}, got {p}")
         self._buckets = make_buckets(landmarks)
-        self._tables = self._upload()
-        self._last: tuple[frozenset[str], PreparedFeatures, int] | None = None
+        self._tables = upload_tables(self._backend, self._real, landmarks, self._buckets, p, self._sensor)
 
-    @property
-    def device(self) -> BackendInfo:
-        """The device the model is compiled for."""
-        return self._backend.info
-
-    @property
-    def precision(self) -> str:
-        """``"float32"`` or ``"float64"``."""
-        return self._real.name
-
-    def log_likelihood(self, poses: object, features: object, correspondence: object = None) -> np.ndarray:
+    def log_likelihood(
+        self, poses: object, features: object, correspondence: object = None, *, out: Any = None
+    ) -> np.ndarray:
         """log p(f_1 ... f_F | x, m) for each particle, natural logarithm.
 
+        A feature of which nothing was measured, or of which a part is outside what the sensor can measure, says
+        nothing: it is left out as if it had not been given.
+
         Args:
-            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad].
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
             features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN is what was not measured.
             correspondence: None, or (F,) indices of the landmarks that the features are, -1 for a false positive.
+            out: Where to write the result, in the memory where the poses are.
 
         Returns:
             (N,) log-likelihoods in the model's precision: densities in 1/m, 1/rad and 1/unit of the signature for what
@@ -137,11 +143,10 @@ class LandmarkModel:
 
         Raises:
             TypeError: an argument does not hold numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, a feature outside what the sensor can measure, an
-                index that is no landmark's, or more than 8 features for a joint association.
+            ValueError: a wrong shape, a pose that is not finite, an index that is no landmark's, or more than 8
+                features for a joint association.
         """
-        log_p, _, _ = self._score(poses, features, correspondence, each=False)
-        return log_p
+        return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
 
     def associate(self, poses: object, features: object) -> tuple[np.ndarray, np.ndarray]:
         """The landmark that each feature is, for each particle.
@@ -149,219 +154,138 @@ class LandmarkModel:
         With ``association="sum"`` it is the landmark with the largest part of the sum.
 
         Args:
-            poses: (N, 3) robot poses in the world [m, m, rad].
+            poses: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``.
             features: (F, 2) or (F, 3), as in ``log_likelihood``.
 
         Returns:
-            (N, F) int32 indices in the map, -1 where a false positive is likelier, and (N, F) what each feature adds to
-            the log-likelihood before the temperature.
+            (N, F) int32 indices in the map, -1 where a false positive is likelier or a feature is left out, and (N, F)
+            what each feature adds to the log-likelihood before the temperature. NumPy arrays, wherever the poses are.
 
         Raises:
             TypeError, ValueError: as ``log_likelihood``.
         """
-        _, which, parts = self._score(poses, features, None, each=True)
+        _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts
 
-    def explain(self) -> str:
-        """What this scene does not need, why, and what leaving it out saves; features as of the last call."""
-        p, count = self.parameters, len(self.landmarks)
-        title = f"landmark model, {self.association}, {self.precision}, {self.device.selection} ({self.device.name})"
-        code = frozenset() if self._last is None else self._last[0]
-        if not self._specialize:
-            return str(Plan(f"{title}, specialize=False", code, ()))
-        omissions = [
-            Omission(name[6:], f"{name} = None", cost)
-            for name, cost in (
-                ("sigma_range", "1 exponent per particle, feature and landmark"),
-                ("sigma_bearing", "1 arc tangent and 1 exponent per particle, feature and landmark"),
-                ("sigma_signature", "1 exponent per particle, feature and landmark"),
-            )
-            if getattr(p, name) is None
-        ]
-        if full_circle(p):
-            omissions.append(Omission("mass in the field of view", "it is a full circle", "2 erf or more per landmark"))
-        if not self.negative:
-            omissions.append(Omission("negative information", "negative=False", "a look at all landmarks in view"))
-        if self._last is not None:
-            omissions += self._last_omissions(*self._last, count)
-        return str(Plan(title, code, tuple(omissions)))
+    def _describe(self) -> tuple[str, list[Omission]]:
+        found = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)
+        return f"landmark model, {self.association}", found
 
-    def _last_omissions(
-        self, code: frozenset[str], prepared: PreparedFeatures, given: int, count: int
-    ) -> list[Omission]:
-        found, silent = [], given - len(prepared.columns)
-        if silent:
-            why = f"{silent} of {given} features do not depend on the pose"
-            found.append(Omission("features", why, f"{share(silent, given)} of the features"))
-        if "KNOWN" in code:
-            found.append(Omission("search", "correspondences are known", f"{count - 1} of {count} landmarks"))
-        elif len(prepared.columns) and np.isfinite(prepared.radius).any():
-            looked = self._looked_at(prepared)
-            why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
-            found.append(Omission("far landmarks", why, f"about {share(count - looked, count)} of {count} landmarks"))
-        return found
-
-    def _looked_at(self, prepared: PreparedFeatures) -> float:
-        """Landmarks that a feature looks at, on average over a map that is evenly filled."""
-        count, side = len(self.landmarks), self._buckets.resolution
-        across = np.maximum(2 * prepared.radius, 0) + side
-        rows, cols = self._buckets.shape
-        looked = np.minimum(across, rows * side) * np.minimum(across, cols * side) / (rows * cols * side**2)
-        return float(count * np.minimum(looked, 1).mean()) if len(looked) else 0.0
-
-    def _upload(self) -> dict[str, Buffer]:
-        """The map's tables on the device."""
-        b, p, real = self._buckets, self.parameters, self._real
-        signature = np.zeros((len(self.landmarks), 4))
-        if self.landmarks.signatures is not None:
-            own = self.landmarks.signatures[b.index]
-            high, low = split(own, real)
-            with np.errstate(divide="ignore"):
-                norm = -np.log(signature_mass(p, self.landmarks)[b.index])
-            signature[:, 0], signature[:, 1], signature[:, 2] = high, low, norm
-        self._norm = float(signature[:, 2].max(initial=0.0))
-        high, low = split(np.array([p.range_max, p.field_of_view]), real)
-        # The density of a bearing at zero range, over the largest one there is elsewhere, but for the scale.
-        scale = self._sensor.scales[1]
-        flat = p.field_of_view / math.sqrt(math.pi)
-        flat /= math.erf(math.pi * scale) if full_circle(p) and scale else 1.0
-        terms = np.array([high[0], low[0], high[1], flat], real)
-        arcs = np.empty((len(ARCS), 2), real)
-        given = np.array(ARCS)
-        arcs[:, 0] = given[:, 0]
-        arcs[:, 1] = (given[:, 0] - arcs[:, 0]) + given[:, 1]
-        own_tables = {
-            "landmark": b.table(real), "signature": signature.astype(real), "start": b.start, "terms": terms,
-            "arcs": arcs, "nobody": np.zeros(1, _INT),
-        }  # fmt: skip
-        return {name: self._backend.upload(np.ascontiguousarray(table)) for name, table in own_tables.items()}
-
-    def _flags(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
-        flags = {"FLOAT64"} if self._real == np.float64 else set()
+    def _code(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
+        """The flags of the kernels."""
         names = ("RANGE", "BEARING", "SIGNATURE")
         there = np.asarray(prepared.measured.any(axis=0))
-        flags |= {name for name, used in zip(names, there.tolist(), strict=True) if used or not self._specialize}
+        flags = {name for name, used in zip(names, there.tolist(), strict=True) if used or not self._specialize}
         flags |= {"FIELD"} if not full_circle(self.parameters) else set()
         flags |= {"KNOWN"} if known else {"MARGINAL"} if self.association == "sum" else set()
-        return frozenset(flags | ({"PER_BEAM"} if each else set()))
+        return self._flags | flags | ({"PER_BEAM"} if each else set())
 
-    def _score(
-        self, poses: object, features: object, correspondence: object, *, each: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """log p of each particle, and with ``each`` the (N, F) landmarks and what features add."""
-        p, backend = self.parameters, self._backend
-        cloud = Cloud(arrays.copied_to_host(poses, backend, "poses"), backend)
-        given = check_features(arrays.copied_to_host(features, backend, "features"), p, self._sensor.span)
+    def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> _Call:
+        """What kernels need of (F, 3) features that are possible."""
         known = correspondence is not None
-        partner = np.full(len(given), -1, np.int64)
-        if known:
-            partner = check_correspondence(correspondence, len(given), len(self.landmarks))
-        extent = max(self._buckets.shape) * self._buckets.resolution
         prepared = prepare_features(
-            given, p, self._sensor, self.mount, self._real,
-            extent=extent, norm=self._norm, gated=self._specialize and not known,
+            full, self.parameters, self._sensor, self.mount, self._real,
+            extent=max(self._buckets.shape) * self._buckets.resolution, norm=self._tables.norm,
+            gated=self._specialize and not known,
         )  # fmt: skip
-        fixed = 0.0
+        fixed, places = 0.0, np.zeros(0, _INT)
+        joint = not known and self.association == "joint"
         if known:
+            partner = check_correspondence(correspondence, len(full), len(self.landmarks))[prepared.columns]
             # False positives are the same at every pose.
-            mine = partner[prepared.columns] >= 0
+            mine = partner >= 0
             fixed = float(prepared.false[prepared.columns[~mine]].sum())
+            places = self._buckets.place_of[partner[mine]]
             prepared = PreparedFeatures(
                 prepared.columns[mine], prepared.numbers[mine], prepared.measured[mine], prepared.false
             )
-        elif self.association == "joint" and len(prepared.columns) > JOINT_FEATURES:
+        elif joint and len(prepared.columns) > JOINT_FEATURES:
             rule = f"must be at most {JOINT_FEATURES} with association='joint'"
             raise ValueError(f"features: {rule}, got {len(prepared.columns)}")
-        log_p = np.empty(cloud.count, self._real)
-        which = np.full((cloud.count, len(given) if each else 0), -1, _INT)
-        parts = np.zeros((cloud.count, len(given) if each else 0), self._real)
-        with self._lock:
-            flags = self._flags(prepared, known, each or self.negative)
-            self._run(cloud, prepared, partner, fixed, flags, (log_p, which, parts), each)
-            self._workspace.wait()
-        return log_p, which, parts
+        return _Call(prepared, places, fixed, self._code(prepared, known, each or self.negative), joint)
 
-    def _run(
-        self,
-        cloud: Cloud,
-        prepared: PreparedFeatures,
-        partner: np.ndarray,
-        fixed: float,
-        flags: frozenset[str],
-        out: tuple[np.ndarray, np.ndarray, np.ndarray],
-        each: bool,
-    ) -> None:
-        """Score all particles in pieces that fit the device."""
-        space, backend, real = self._workspace, self._backend, self._real
-        log_p, which, parts = out
-        count, known = len(prepared.columns), "KNOWN" in flags
-        feature = space.upload("feature", np.resize(prepared.numbers, (max(count, 1), prepared.numbers.shape[1])))
-        places = self._buckets.place_of[partner[prepared.columns]] if known else np.zeros(0, _INT)
-        partners = space.upload("partner", np.append(places, np.int32(0)).astype(_INT))
-        joint = not known and self.association == "joint"
-        looked = 1.0 if known else len(self.landmarks) if joint else self._looked_at(prepared)
-        work, kept = max(count, 1) * (1 + looked / _PER_READING), 0.0
-        if joint:
-            work, kept = work * (1 << count), (1 << count) * (1 + 2.0 * count)
-        elif "PER_BEAM" in flags:
-            kept = 2.0 * count
+    def _evaluate(
+        self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
+    ) -> tuple[Any, np.ndarray, np.ndarray]:
+        """log p of each particle, and with ``each`` the (N, F) landmarks and what features add."""
+        host = arrays.copied_to_host(features, self._backend, "features")
+        full, impossible = possible_features(host, self.parameters, self._sensor.span)
+        call = self._prepare(full, correspondence, each)
+        known = correspondence is not None
+        left_out = feature_omissions(
+            call.prepared, self._buckets, given=len(full), impossible=int(impossible.sum()), known=known
+        )
+        # By the first particle of each piece, since a piece that does not fit into memory is tried again in halves.
+        nobody = np.empty((0, len(full)))
+        pieces = {-1: (nobody.astype(_INT), nobody.astype(self._real))}
+
+        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
+            chosen, parts = self._launch_all(call, cloud, part, result)
+            if each:
+                pieces[part[0]] = self._download(call, part[1] - part[0], len(full), chosen, parts)
+
+        items, itemsize = self._cost(call, known)
+        log_p = self._score(poses, out, launch, left_out, items=items, itemsize=itemsize)
+        which, added = zip(*(pieces[first] for first in sorted(pieces)), strict=True)
+        return log_p, np.concatenate(which), np.concatenate(added)
+
+    def _cost(self, call: _Call, known: bool) -> tuple[int, float]:
+        """What a particle costs, in readings of a scan, and the bytes that it keeps for each."""
+        looked = 1.0 if known else len(self.landmarks) if call.joint else looked_at(call.prepared, self._buckets)
+        work, kept = max(call.count, 1) * (1 + looked / _PER_READING), 0.0
+        if call.joint:
+            work, kept = work * (1 << call.count), (1 << call.count) * (1 + 2.0 * call.count)
+        elif "PER_BEAM" in call.flags:
+            kept = 2.0 * call.count
         work = min(work, 1e9)
-        chunk = chunk_of(backend, math.ceil(work), real.itemsize * kept / work)
-        self._last = (flags, prepared, len(partner))
+        return math.ceil(work), self._real.itemsize * kept / work
 
-        def run(begin: int, end: int) -> None:
-            frame = (Region(0, 0, *self._buckets.shape), self._buckets, self.mount)
-            given = cloud.given(backend, space, (begin, end))
-            placed = cloud.place(backend, space, given, (begin, end), frame, real, careful=True)
-            size = (end - begin) * count
-            result = space.empty("log_p", end - begin, real)
-            part = space.empty("parts", size if "PER_BEAM" in flags else 1, real)
-            chosen = space.empty("which", size if "PER_BEAM" in flags else 1, _INT)
-            outputs = (result, part, chosen)
-            if joint:
-                self._launch_joint(placed, feature, flags, outputs, (end - begin, count), fixed)
-            else:
-                self._launch(placed, feature, partners, flags, outputs, (end - begin, count), fixed)
-            if self.negative:
-                self._launch_unseen(placed, chosen, result, (end - begin, count))
-            space.download(result, log_p[begin:end])
-            if each and count:
-                found = backend.download(chosen, np.empty((end - begin, count), _INT))
-                which[begin:end, prepared.columns] = np.where(
-                    found >= 0, self._buckets.index[found] if len(self.landmarks) else -1, -1
-                )
-                parts[begin:end, prepared.columns] = backend.download(part, np.empty((end - begin, count), real))
+    def _launch_all(self, call: _Call, cloud: Cloud, part: Part, result: Buffer) -> tuple[Buffer, Buffer]:
+        """Start to score some particles into a buffer; places of landmarks and what features add, where wanted."""
+        space, backend, real = self._workspace, self._backend, self._real
+        count, features = part[1] - part[0], call.count
+        given = cloud.given(backend, space, part)
+        frame = (Region(0, 0, *self._buckets.shape), self._buckets, self.mount)
+        placed = cloud.place(backend, space, given, part, frame, real, careful=True)
+        numbers = call.prepared.numbers
+        feature = space.upload("feature", np.resize(numbers, (max(features, 1), numbers.shape[1])))
+        size = count * features if "PER_BEAM" in call.flags else 1
+        parts, chosen = space.empty("parts", size, real), space.empty("which", size, _INT)
+        start = self._launch_joint if call.joint else self._launch_each
+        start(call, cloud, placed, feature, (result, parts, chosen), (count, features))
+        if self.negative:
+            self._launch_unseen(placed, chosen, result, (count, features))
+        return chosen, parts
 
-        in_chunks(cloud.count, chunk, space, run)
+    def _download(
+        self, call: _Call, count: int, given: int, chosen: Buffer, parts: Buffer
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(n, F) landmarks in the map and what features add; -1 and 0 for those that are not evaluated."""
+        which, added = np.full((count, given), -1, _INT), np.zeros((count, given), self._real)
+        if call.count:
+            place = self._backend.download(chosen, np.empty((count, call.count), _INT))
+            index = self._buckets.index[place] if len(self.landmarks) else -1
+            which[:, call.prepared.columns] = np.where(place >= 0, index, -1)
+            added[:, call.prepared.columns] = self._backend.download(parts, np.empty((count, call.count), self._real))
+        return which, added
 
-    def _launch(
-        self,
-        placed: Placed,
-        feature: Buffer,
-        partners: Buffer,
-        flags: frozenset[str],
-        outputs: tuple[Buffer, Buffer, Buffer],
+    def _launch_each(
+        self, call: _Call, cloud: Cloud, placed: Placed, feature: Buffer, outputs: tuple[Buffer, Buffer, Buffer],
         counts: tuple[int, int],
-        fixed: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         t, b, landmarks = self._tables, self._buckets, len(self.landmarks)
-        prior = -math.log(landmarks) if "MARGINAL" in flags and landmarks else 0.0
-        flags = widened(self._backend.info, "score_features", flags)
-        self._backend.compile("score_features", flags)(
-            (counts[0],), t["landmark"], t["signature"], t["start"], placed.cell, placed.pose, placed.low, feature,
-            partners, t["terms"], t["arcs"], *outputs, *b.shape, landmarks, *counts, b.resolution, prior, fixed,
-            self.temperature,
+        prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
+        partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
+        self._launch(
+            "score_features", widened(self._backend.info, "score_features", call.flags), cloud, counts[0],
+            t.landmark, t.signature, t.start, placed.cell, placed.pose, placed.low, feature, partner, t.terms, t.arcs,
+            *outputs, *b.shape, landmarks, *counts, b.resolution, prior, call.fixed,
         )  # fmt: skip
 
     def _launch_joint(
-        self,
-        placed: Placed,
-        feature: Buffer,
-        flags: frozenset[str],
-        outputs: tuple[Buffer, Buffer, Buffer],
+        self, call: _Call, cloud: Cloud, placed: Placed, feature: Buffer, outputs: tuple[Buffer, Buffer, Buffer],
         counts: tuple[int, int],
-        fixed: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         t, b, space = self._tables, self._buckets, self._workspace
         sets = 1 << counts[1]
         scratch = (
@@ -369,17 +293,17 @@ class LandmarkModel:
             space.empty("choice", counts[0] * sets * counts[1], _INT),
             space.empty("value", counts[0] * sets * counts[1], self._real),
         )
-        self._backend.compile("joint_features", flags)(
-            (counts[0],), t["landmark"], t["signature"], placed.cell, placed.pose, placed.low, feature, t["terms"],
-            t["arcs"], *scratch, *outputs, len(self.landmarks), *counts, sets, b.resolution, fixed, self.temperature,
+        self._launch(
+            "joint_features", call.flags, cloud, counts[0], t.landmark, t.signature, placed.cell, placed.pose,
+            placed.low, feature, t.terms, t.arcs, *scratch, *outputs, len(self.landmarks), *counts, sets, b.resolution,
+            call.fixed,
         )  # fmt: skip
 
     def _launch_unseen(self, placed: Placed, chosen: Buffer, result: Buffer, counts: tuple[int, int]) -> None:
         p, t, b = self.parameters, self._tables, self._buckets
         least = -2.0 if full_circle(p) else math.cos(p.field_of_view / 2)
         log_missed = self.temperature * log_weight(1 - p.p_detect)
-        flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
-        self._backend.compile("count_unseen", flags)(
-            (counts[0],), t["landmark"], t["start"], placed.cell, placed.pose, placed.low, chosen, result, *b.shape,
+        self._backend.compile("count_unseen", self._flags)(
+            (counts[0],), t.landmark, t.start, placed.cell, placed.pose, placed.low, chosen, result, *b.shape,
             *counts, b.resolution, p.range_max, math.cos(self.mount[2]), math.sin(self.mount[2]), least, log_missed,
         )  # fmt: skip

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, cast, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 
-from gpusense import _checks, arrays
+from gpusense import _checks
 from gpusense import compat as compat_module
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
@@ -19,10 +18,13 @@ from gpusense.cloud import Cloud, finish
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import TableMemoryError
+from gpusense.models.scan_call import TOGETHER, ScanCall, call_of
+from gpusense.models.terms import log_weight
 from gpusense.plan import Omission, Plan, share
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.region import Region
-from gpusense.scan import Beams, PreparedScan, check_beams, check_ranges, prepare_scan
+from gpusense.scan import Batch, Beams, PreparedScan, check_beams, prepare_scan
+from gpusense.scan_batch import part_of, prepare_batch, runs
 from gpusense.scanner import Scanner
 from gpusense.workspace import Workspace
 
@@ -74,52 +76,6 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     if dtype == np.float64 and not backend.info.float64:
         raise ValueError(f"precision: must be 'float32' on {backend.info.name}, which has no float64, got 'float64'")
     return dtype
-
-
-def clouds_of(poses: Any, scans: int, backend: Backend) -> list[Cloud]:
-    """The clouds of S scans from (S, N, 3) poses.
-
-    Raises:
-        TypeError, ValueError: not numbers, another shape, or a pose that is not finite.
-    """
-    if not arrays.on_device(poses):
-        return [Cloud(one, backend) for one in _checks.array("poses", arrays.to_host(poses), (scans, "N", 3))]
-    shape = tuple(getattr(poses, "shape", ()))
-    if len(shape) != 3 or shape[0] != scans or shape[2] != 3:
-        raise ValueError(f"poses: shape must be ({scans}, N, 3), got {_checks.shape_text(shape)}")
-    return [Cloud(poses[i], backend) for i in range(scans)]
-
-
-# Above this peak [1/m] an exponent's rounding errors could show beside a log density near 0.
-HIGH_PEAK = 64.0
-# A density that takes part in a linear sum must dwarf what underflow takes from the others, denormals or not.
-_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
-
-
-def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
-    """Whether the uniform density is large enough, beside the peak of the others, to sum densities."""
-    return rand >= _SMALLEST_DENSITY[real] * max(peak, 1.0)
-
-
-def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
-    """The numbers of a mixture in a model's precision, then what rounding took from the first two of them.
-
-    Raises:
-        ValueError: sigma_hit or lambda_short is beyond what the precision can hold.
-    """
-    with np.errstate(over="ignore"):
-        rounded = np.array(terms).astype(real)
-    # Logarithms of weights of 0 are -inf; nothing else may be infinite.
-    if np.isposinf(rounded).any() or rounded[1] < np.finfo(real).tiny:
-        raise ValueError(f"parameters: sigma_hit and lambda_short must fit {real.name}, got terms {terms}")
-    with np.errstate(invalid="ignore"):
-        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
-    return np.append(rounded, low.astype(real))
-
-
-def log_weight(weight: float) -> float:
-    """Logarithm of a mixture weight; -inf for 0."""
-    return math.log(weight) if weight > 0 else -math.inf
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
@@ -205,6 +161,8 @@ class ScanModel(ABC):
         self._z_max = z_max if self._peer is None else 0.0
         self._last_scan: PreparedScan | None = None
         self._last_code: frozenset[str] = frozenset()
+        # Scans that shared launches in the last call.
+        self._together = 0
 
     @property
     def device(self) -> BackendInfo:
@@ -258,35 +216,48 @@ class ScanModel(ABC):
             ValueError: a wrong shape, or a pose that is not finite; the message names it.
             MemoryError: the device cannot hold the map's table, or even a few particles.
         """
-        backend = self._backend
-        scans = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), self.scanner)
-        single = scans.ndim == 1
-        clouds = [Cloud(poses, backend)] if single else clouds_of(poses, len(scans), backend)
-        count = clouds[0].count if clouds else np.shape(cast(Any, poses))[1]
-        shape = (count,) if single else (len(scans), count)
-        given = arrays.check_out(out, shape, self._real, poses, backend)
-        flat: Any
-        if arrays.on_device(poses):
-            flat = arrays.blank(backend, math.prod(shape), self._real) if given is None else given
-        else:
-            flat = (np.empty(shape, self._real) if given is None else given).reshape(-1)
-        parts = np.zeros((*shape, self.scanner.count if per_beam else 0), self._real)
-        each_parts = parts.reshape(len(clouds), count, parts.shape[-1])
+        call = self._call(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            for i, cloud in enumerate(clouds):
-                own = (i * count, (i + 1) * count)
-                target = flat[slice(*own)] if cloud.host is not None else backend.part(flat, own[0], count)
-                self._score_scan(cloud, scans if single else scans[i], target, each_parts[i], per_beam)
-                if not single:
-                    self._workspace.start()
-            finish(self._workspace, any(cloud.on_device for cloud in clouds))
-        if out is not None:
-            log_p = out
-        elif arrays.on_device(poses):
-            log_p = arrays.result_for(poses, flat if single else flat.reshape(shape))
-        else:
-            log_p = arrays.like(poses, flat.reshape(shape))
-        return (log_p, parts) if per_beam else log_p
+            self._start(call)
+            finish(self._workspace, call.on_device)
+        log_p = call.log_p()
+        return (log_p, call.parts.reshape(*call.shape, call.parts.shape[-1])) if per_beam else log_p
+
+    def _call(
+        self,
+        poses: object,
+        ranges: object,
+        out: object,
+        *,
+        per_beam: bool = False,
+        known: dict[object, list[Cloud]] | None = None,
+    ) -> ScanCall:
+        """A call's arguments, checked."""
+        rays = max(self.scanner.count * self._rays_each, 1)
+        most = TOGETHER[self._backend.info.kind] // rays
+        if self._peer is None and self._impossible():
+            most = 0
+        return call_of(
+            poses, ranges, out, scanner=self.scanner, backend=self._backend, real=self._real, per_beam=per_beam,
+            most=min(most, self._chunk(rays)), known=known,
+        )  # fmt: skip
+
+    def _start(self, call: ScanCall) -> None:
+        """Start all that a call needs; parts are complete on return."""
+        self._together = 0
+        if call.together:
+            try:
+                self._score_together(call)
+                return
+            except MemoryError:
+                # Fewer at a time may fit.
+                self._workspace.release(keep="verdict")
+                call.separate(self._backend)
+        for i, cloud in enumerate(call.clouds):
+            target = call.target(self._backend, i * call.count, (i + 1) * call.count)
+            self._score_scan(cloud, call.ranges[i], target, call.parts[i], call.parts.shape[-1] > 0)
+            if not call.single:
+                self._workspace.start()
 
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
         """A call of ``log_likelihood`` with arrays that stay where they are, for filters that repeat it.
@@ -317,32 +288,24 @@ class ScanModel(ABC):
 
     def _score_scan(self, cloud: Cloud, ranges: np.ndarray, log_p: Any, parts: np.ndarray, per_beam: bool) -> None:
         """Start to write log-likelihoods into a host array or a buffer; parts are complete on return."""
-        if self._peer is not None:
-            ranges = self._peer.readings(ranges, self.scanner, self._end_points)
-        scan = prepare_scan(
-            ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize,
-            max_is_range=self._peer is not None, max_depends=self._max_depends, distinct=self._distinct,
-        )  # fmt: skip
+        scan = self._prepared(ranges)
         self._last_scan = scan
         if per_beam and len(scan.max_columns):
             parts[:, scan.max_columns] = log_weight(self._z_max)
         if len(scan.readings) == 0:
-            with np.errstate(divide="ignore"):
-                self._fill(log_p, self.temperature * (scan.constant if self._peer is None else np.log(self._lead)))
-            self._look_at(cloud)
+            self._fill(log_p, self._without_readings(scan.constant))
+            self._look_at(cloud, (0, cloud.count))
             return
         hits = scan.columns[np.isfinite(scan.readings)] if self._peer is None and self._impossible() else ()
         if len(hits):
             self._fill(log_p, -np.inf)
-            self._look_at(cloud)
+            self._look_at(cloud, (0, cloud.count))
             if per_beam:
                 parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)
                 parts[:, hits] = -np.inf
             return
         launch = self._prepare_launch(scan)
         space, backend = self._workspace, self._backend
-        kept = 1.0 if per_beam else self._kept_parts if backend.info.kind == "gpu" else 0.0
-        chunk = chunk_of(backend, len(scan.readings) * self._rays_each, self._real.itemsize * kept)
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:
@@ -356,13 +319,58 @@ class ScanModel(ABC):
                 shape = (end - begin, len(scan.readings))
                 parts[begin:end, scan.columns] = backend.download(each, np.empty(shape, self._real))
 
-        in_chunks(cloud.count, chunk, space, run)
+        in_chunks(cloud.count, self._chunk(len(scan.readings) * self._rays_each, per_beam), space, run)
 
-    def _look_at(self, cloud: Cloud) -> None:
+    def _score_together(self, call: ScanCall) -> None:
+        """Start to score several scans by common launches, each of as many scans as may be."""
+        (cloud,), backend, space, count = call.clouds, self._backend, self._workspace, call.count
+        scans = self._prepared(call.ranges)
+        self._last_scan = self._prepared(call.ranges[-1])
+        assert scans.batch is not None
+        most = max(self._chunk(max(scans.most_readings, 1) * self._rays_each) // count, 1)
+        for begin, end in runs(scans, most):
+            part = (begin * count, end * count)
+            target = call.target(backend, *part)
+            if scans.batch.counts[begin] == 0:
+                self._fill(target, self._without_readings(float(scans.batch.constants[begin])))
+                self._look_at(cloud, part)
+                continue
+            launch = self._prepare_launch(part_of(scans, begin, end))
+            result = target if cloud.host is None else space.empty("log_p", (end - begin) * count, self._real)
+            launch(cloud, part, result, False)
+            if cloud.host is not None:
+                space.download(result, target)
+            self._together = max(self._together, end - begin)
+            space.start()
+
+    def _prepared(self, ranges: np.ndarray) -> PreparedScan:
+        """Readings of one scan (K,), or of several (S, K), classed, chosen and grouped."""
+        prepare = prepare_scan if ranges.ndim == 1 else prepare_batch
+        if self._peer is not None:
+            ranges = self._peer.readings(ranges, self.scanner, self._end_points)
+        return prepare(
+            ranges, self.scanner, self._vectors, self._z_max, self.beams, self._specialize,
+            max_is_range=self._peer is not None, max_depends=self._max_depends, distinct=self._distinct,
+        )  # fmt: skip
+
+    def _chunk(self, rays: int, per_beam: bool = False) -> int:
+        """Particles of one launch of so many rays each."""
+        kept = 1.0 if per_beam else self._kept_parts if self._backend.info.kind == "gpu" else 0.0
+        return chunk_of(self._backend, rays, self._real.itemsize * kept)
+
+    def _without_readings(self, constant: float) -> float:
+        """The result of a scan none of whose readings depends on the pose."""
+        with np.errstate(divide="ignore"):
+            return float(self.temperature * (constant if self._peer is None else np.log(self._lead)))
+
+    def _fixed_of(self, batch: Batch) -> np.ndarray:
+        """What the sum of each scan begins with."""
+        return (batch.constants + self._lead).astype(self._real)
+
+    def _look_at(self, cloud: Cloud, part: tuple[int, int]) -> None:
         """Place poses on the device for nothing but to learn whether they are finite."""
         if cloud.on_device and cloud.count:
             frame = (Region(0, 0, *self.grid.shape), self.grid, self.scanner.mount)
-            part = (0, cloud.count)
             given = cloud.given(self._backend, self._workspace, part)
             cloud.place(self._backend, self._workspace, given, part, frame, self._real, careful=False)
 
@@ -406,6 +414,9 @@ class ScanModel(ABC):
         """The plan as of the last call."""
         if not self._specialize:
             return Plan(f"{title}, specialize=False", self._last_code, ())
+        if self._together > 1:
+            saved = f"{self._together - 1} of {self._together} sets of launches"
+            omissions.append(Omission("launches of single scans", f"{self._together} scans are scored together", saved))
         scan = self._last_scan
         if scan is not None:
             count, constant = self.scanner.count, len(scan.max_columns)

@@ -3,7 +3,7 @@
 A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
 its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
 von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
-*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything: that is a uniform density.
+*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything (RAND): that is a uniform density.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ WRAPS, WAVES = 3, 6
 # 2 pi / sigma^2, and from WAVE on 2 q^(n n).
 SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, DECAY, WAVE = range(7)
 HALF_TURN = 3.141592653589793
+# exp of minus this is below half an eps.
+NEGLIGIBLE = 40.0
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
 SINE = (
     -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,
@@ -63,7 +65,12 @@ def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
 
 
 def score_position(
-    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int
+    flags: frozenset[str],
+    place: np.ndarray,
+    terms: np.ndarray,
+    log_p: np.ndarray,
+    particles: int,
+    temperature: np.floating,
 ) -> None:
     """``terms`` = (a, b, c, peak), each followed by its low part, and the log of the uniform part.
 
@@ -74,11 +81,20 @@ def score_position(
     first = bounded_square(pair_product(x, a))
     second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)))
     exponent = pair_sum(first, second)
-    log_p[:particles] = either((terms[6] - exponent[0]) + (terms[7] - exponent[1]), terms[8])
+    found = (terms[6] - exponent[0]) + (terms[7] - exponent[1])
+    if "RAND" in flags:
+        found = either(found, terms[8])
+    log_p[:particles] = temperature * found
 
 
 def score_heading(
-    flags: frozenset[str], residual: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, kind: int
+    flags: frozenset[str],
+    residual: np.ndarray,
+    terms: np.ndarray,
+    log_p: np.ndarray,
+    particles: int,
+    kind: int,
+    temperature: np.floating,
 ) -> None:
     """Residuals are headings minus the reading in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
@@ -91,4 +107,6 @@ def score_heading(
         found = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
         if kind == NEARBY:
             found = found + log_other_turns(r, terms[DECAY])
-    log_p[:particles] = either(found, terms[RANDOM])
+    if "RAND" in flags:
+        found = either(found, terms[RANDOM])
+    log_p[:particles] = temperature * found

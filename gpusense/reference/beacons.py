@@ -63,7 +63,9 @@ def log_student_t(
     return (terms[PEAK] - terms[POWER] * (np.log(x[0]) + x[1] / x[0])) - np.log(mass)
 
 
-def log_range(d: Pair, beacon: np.ndarray, terms: np.ndarray, series: np.ndarray, kind: int) -> np.ndarray:
+def log_range(
+    flags: frozenset[str], d: Pair, beacon: np.ndarray, terms: np.ndarray, series: np.ndarray, kind: int
+) -> np.ndarray:
     """Log p of one range at each distance."""
     r = two_sum(d[0], -beacon[4])
     r = two_sum(r[0], r[1] + (d[1] - beacon[5]))
@@ -75,7 +77,7 @@ def log_range(d: Pair, beacon: np.ndarray, terms: np.ndarray, series: np.ndarray
         found = log_normal(r, near, far, terms, SCALE, PEAK)
     if kind == TWO_NORMALS:
         found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
-    return either(found, terms[RANDOM])
+    return either(found, terms[RANDOM]) if "RAND" in flags else found
 
 
 def score_beacons(
@@ -89,6 +91,7 @@ def score_beacons(
     beacons: int,
     count: int,
     kind: int,
+    temperature: np.floating,
 ) -> None:
     """Sum over beacons of log p of their ranges; the first ``count`` numbers of the series are a t's."""
     own = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
@@ -96,5 +99,5 @@ def score_beacons(
     total: Pair = (zero, zero)
     for one in beacon.reshape(-1)[: BEACON * beacons].reshape(-1, BEACON):
         d = distance_pair(offset(one[None, [0, 2, 1, 3]], own))
-        total = add_term(total, log_range(d, one, terms, series[:count], kind))
-    log_p[:particles] = np.where(np.isinf(total[0]), total[0], total[0] + total[1])
+        total = add_term(total, log_range(flags, d, one, terms, series[:count], kind))
+    log_p[:particles] = np.where(np.isinf(total[0]), total[0], temperature * (total[0] + total[1]))

@@ -10,6 +10,7 @@ from gpusense.reference.error_free import BLOCK_TERMS, add_term
 from gpusense.reference.mixture import log_density
 from gpusense.reference.ranges import cast_ranges
 from gpusense.reference.ray import expected_range
+from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.sensor_table import tabulated_density
 
 
@@ -25,6 +26,8 @@ def score_beams(
     terms: np.ndarray,
     edges: np.ndarray,
     sensor: np.ndarray,
+    start: np.ndarray,
+    fixed_of: np.ndarray,
     log_p: np.ndarray,
     parts: np.ndarray,
     rows: int,
@@ -45,8 +48,23 @@ def score_beams(
     range_max: np.floating,
     fixed: np.floating,
     temperature: np.floating,
+    per_scan: int,
+    ahead: int,
 ) -> None:
-    """Readings of ray r are first[r] to first[r + 1] - 1; what does not depend on the pose is fixed."""
+    """Readings of ray r are first[r] to first[r + 1] - 1; what does not depend on the pose is fixed.
+
+    Of several scans each has its rays from start on, and first counts the readings of all where rays are shared.
+    """
+    if "SCANS" in flags:
+        for scan, part in particles_of_scans(particles, per_scan, ahead):
+            begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
+            score_beams(
+                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone_rays :], own_first,
+                own_reading, terms, edges, sensor, start, fixed_of, log_p[part], parts, rows, cols,
+                part.stop - part.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
+                cells, per_metre, limit, resolution, range_max, fixed_of[scan], temperature, per_scan, 0,
+            )  # fmt: skip
+        return
     real = pose.dtype
     block = max((1 << 20) // max(readings * cone_rays, 1), 1)
     ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
@@ -96,6 +114,7 @@ def beam_tiles(
     terms: np.ndarray,
     edges: np.ndarray,
     sensor: np.ndarray,
+    start: np.ndarray,
     parts: np.ndarray,
     rows: int,
     cols: int,
@@ -116,16 +135,43 @@ def beam_tiles(
     across: int,
     along: int,
     spread: int,
+    per_scan: int,
 ) -> None:
     """What each reading adds, at parts[place * across + k * along], which GPUs find in tiles of particles and rays."""
+    places = np.arange(particles)
+    if "ORDERED" in flags:
+        places[order[:particles]] = np.arange(particles)
+    if "SCANS" in flags:
+        for scan, own in particles_of_scans(particles, per_scan):
+            begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
+            found = np.empty((own.stop - own.start) * int(own_first[some]), pose.dtype)
+            beam_tiles(
+                flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[own], pose[own], order,
+                ray[begin * cone_rays :], own_first, own_reading, terms, edges, sensor, start, found, rows, cols,
+                own.stop - own.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
+                cells, per_metre, limit, resolution, range_max, int(own_first[some]), 1, spread, per_scan,
+            )  # fmt: skip
+            at = places[own, None] * across + np.arange(own_first[some]) * along
+            parts[at] = found.reshape(at.shape)
+        return
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
-        flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor,
-        np.empty(particles, pose.dtype), each, rows, cols, particles, rays, readings, kinds, cone_rays, critical, bins,
-        slack, tolerance, cells, per_metre, limit, resolution, range_max, real(0), real(1),
+        flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start,
+        sensor, np.empty(particles, pose.dtype), each, rows, cols, particles, rays, readings, kinds, cone_rays,
+        critical, bins, slack, tolerance, cells, per_metre, limit, resolution, range_max, real(0), real(1), 1, 0,
     )  # fmt: skip
-    found = each.reshape(particles, readings)[order[:particles] if "ORDERED" in flags else slice(None)]
-    parts[np.arange(particles)[:, None] * across + np.arange(readings) * along] = found
+    parts[places[:, None] * across + np.arange(readings) * along] = each.reshape(particles, readings)
+
+
+def readings_of_scan(
+    flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
+) -> tuple[int, int, np.ndarray, np.ndarray]:
+    """One of several scans: its first ray, how many it has, where their readings begin, and these."""
+    begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
+    if "SHARED_RAYS" not in flags:
+        return begin, rays, np.arange(rays + 1), reading[begin:]
+    own = first[begin : begin + rays + 1]
+    return begin, rays, own - own[0], reading[own[0] :]
 
 
 def sum_terms(flags: frozenset[str], term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:

@@ -77,6 +77,7 @@ def score_contact(
     particles: int,
     segments: int,
     guard: float,
+    temperature: np.floating,
 ) -> None:
     """Sum over segments; points start[s] to start[s + 1] - 1 belong to segment s, which is pressed if that is not 0."""
     total = np.zeros(particles, terms.dtype)
@@ -88,4 +89,4 @@ def score_contact(
             col, row = pose_cell[:particles, 0] + end.col[:, 0], pose_cell[:particles, 1] + end.row[:, 0]
             nearest = np.minimum(nearest, table.reshape(-1)[field_cell(col, row, rows, cols)])
         total = total + log_bump(nearest, pressed[s], terms)
-    log_p[:particles] = total
+    log_p[:particles] = temperature * total

@@ -87,12 +87,12 @@ def nearest_echo(
         tolerance: See ``bins``.
 
     Returns:
-        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence, 1 and 0
-        there.
+        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence, 2 and 0
+        there: more than any cosine, so that the first of the bins may be for such beams alone.
     """
     real = pose.dtype.type
     nearest = np.full(len(cell), limit, pose.dtype)
-    cosine, sine = np.ones_like(nearest), np.zeros_like(nearest)
+    cosine, sine = np.full_like(nearest, 2), np.zeros_like(nearest)
     for i in range(ray.shape[1]):
         t = caster_of(flags).cast_ray(
             flags, map_table, rows, cols, cell, pose, ray[:, i], limit, bins, slack, tolerance

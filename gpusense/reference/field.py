@@ -10,6 +10,7 @@ import numpy as np
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import BLOCK_TERMS, Pair, pair_product, pair_sum
+from gpusense.reference.scans import particles_of_scans
 
 BLOCK = 1 << 18
 
@@ -92,6 +93,8 @@ def score_field(
     point: np.ndarray,
     point_low: np.ndarray,
     terms: np.ndarray,
+    start: np.ndarray,
+    fixed_of: np.ndarray,
     log_p: np.ndarray,
     parts: np.ndarray,
     rows: int,
@@ -101,8 +104,19 @@ def score_field(
     guard: np.floating,
     fixed: np.floating,
     temperature: np.floating,
+    per_scan: int,
+    ahead: int,
 ) -> None:
     """The table holds log densities, or capped distances in metres where it is interpolated."""
+    if "SCANS" in flags:
+        for scan, own in particles_of_scans(particles, per_scan, ahead):
+            first, last = start[scan], start[scan + 1]
+            score_field(
+                flags - {"SCANS"}, table, pose_cell[own], pose[own], pose_low[own], point[first:last],
+                point_low[first:last], terms, start, fixed_of, log_p[own], parts, rows, cols, own.stop - own.start,
+                int(last - first), guard, fixed_of[scan], temperature, per_scan, 0,
+            )  # fmt: skip
+        return
     block = max(BLOCK // max(readings, 1), 1)
     points = point[None, :readings]
     for begin in range(0, particles, block):
@@ -133,6 +147,7 @@ def field_blocks(
     point_low: np.ndarray,
     terms: np.ndarray,
     guard: np.ndarray,
+    start: np.ndarray,
     parts: np.ndarray,
     rows: int,
     cols: int,
@@ -141,12 +156,22 @@ def field_blocks(
     across: int,
     along: int,
     spread: int,
+    per_scan: int,
 ) -> None:
     """Sums of blocks of readings, at parts[n * across + block * along], which GPUs find one by one."""
+    if "SCANS" in flags:
+        for scan, own in particles_of_scans(particles, per_scan):
+            first, last = start[scan], start[scan + 1]
+            field_blocks(
+                flags - {"SCANS"}, table, pose_cell[own], pose[own], pose_low[own], point[first:last],
+                point_low[first:last], terms, guard, start, parts[own.start * across :], rows, cols,
+                own.stop - own.start, int(last - first), across, along, spread, per_scan,
+            )  # fmt: skip
+        return
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_field(
-        flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms,
-        np.empty(particles, pose.dtype), each, rows, cols, particles, readings, real(0), real(0), real(1),
+        flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms, start, guard,
+        np.empty(particles, pose.dtype), each, rows, cols, particles, readings, real(0), real(0), real(1), 1, 0,
     )  # fmt: skip
     each = each.reshape(particles, readings)
     for block, first in enumerate(range(0, readings, BLOCK_TERMS)):

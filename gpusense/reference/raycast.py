@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.ray import crossed, make_ray, off_grid, start_casts
+from gpusense.reference.ray import crossed, make_ray, start_casts
+from gpusense.reference.rectangles import OCCUPIED
 
 
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
@@ -59,9 +60,9 @@ def cast_ray(
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
         sides = map_table[table[active] + at[1] * (cols + 2) + at[0]]
-        stopped = sides == 0
+        stopped = sides <= OCCUPIED
         if stopped.any():
-            hit = stopped if "OUTSIDE_OCCUPIED" in flags else stopped & ~off_grid(at, rows, cols)
+            hit = stopped if "OUTSIDE_OCCUPIED" in flags else sides == OCCUPIED
             found[active[hit]] = t[active[hit]]
             active, sides = active[~stopped], sides[~stopped]
         speed, a, inv = r.speed[:, active], r.a[:, active], r.inv[:, active]

@@ -19,6 +19,8 @@ import numpy as np
 from gpusense.reference.bits import cells_left, cells_right, unpacked
 
 LONGEST = 255
+# Of a cell that is no rectangle's; the ring has 0.
+OCCUPIED = 1
 RECTANGLE_REACH = 254
 STACK = 256
 
@@ -130,7 +132,7 @@ def rectangles_rows(
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             wide, high = longest(run, width, height)[:, :, ::dx]
-            planes[sector] = (wide + 256 * high)[:, part]
+            planes[sector] = np.maximum(wide + 256 * high, OCCUPIED)[:, part]
 
 
 def free_rows(
@@ -165,4 +167,4 @@ def rectangles_scan(
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             high, wide = (side.T[::dy] for side in longest(run, height, width))
-            planes[sector] = (wide + 256 * high)[part]
+            planes[sector] = np.maximum(wide + 256 * high, OCCUPIED)[part]

@@ -11,6 +11,8 @@ def sum_parts(
     flags: frozenset[str],
     parts: np.ndarray,
     order: np.ndarray,
+    counts: np.ndarray,
+    fixed_of: np.ndarray,
     log_p: np.ndarray,
     particles: int,
     count: int,
@@ -19,21 +21,26 @@ def sum_parts(
     along: int,
     fixed: np.floating,
     temperature: np.floating,
+    per_scan: int,
 ) -> None:
     """Of each particle count numbers, each along farther than the last, from parts[place * across] on.
 
-    A block of them is added plainly, then its sum to a compensated total.
+    A block of them is added plainly, then its sum to a compensated total. Of several scans each has a count of its own;
+    what lies beyond it counts as 0, which changes no sum.
     """
-    places = np.arange(particles) * across
-    total = (np.full(particles, fixed, parts.dtype), np.zeros(particles, parts.dtype))
+    places, own = np.arange(particles) * across, order[:particles] if "ORDERED" in flags else np.arange(particles)
+    counted, lead = np.full(particles, count), np.full(particles, fixed, parts.dtype)
+    if "SCANS" in flags:
+        counted, lead = counts[own // per_scan], fixed_of[own // per_scan]
+    total = (lead, np.zeros(particles, parts.dtype))
     for first in range(0, count, block):
         part = np.zeros(particles, parts.dtype)
         for k in range(first, min(first + block, count)):
-            part += parts[places + k * along]
+            part += np.where(k < counted, parts[places + k * along], 0)
         total = add_term(total, part)
     scan = total[0] + total[1]
     scan = np.log(scan) if "CUBES" in flags else scan
     found = temperature * scan
     if "CUBES" not in flags:
         found = np.where(np.isinf(total[0]), total[0], found)
-    log_p[order[:particles] if "ORDERED" in flags else slice(0, particles)] = found
+    log_p[own] = found

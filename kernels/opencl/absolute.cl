@@ -2,7 +2,7 @@
 // A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
 // its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
 // von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
-// Directional Statistics (2000), section 3.5. With z_rand a reading may be anything: that is a uniform density.
+// Directional Statistics (2000), section 3.5. With z_rand a reading may be anything (RAND): that is a uniform density.
 // requires: error_free log_terms
 
 // How a heading is distributed: sums of normals, their Fourier series, von Mises.
@@ -68,7 +68,8 @@ real log_waves(const real2 residual, global const real *terms) {
 
 // One work-item a particle. terms = {a, b, c, peak}, each followed by its low part, and the log of the uniform part. The
 // exponent is (a x)^2 + (b x + c y)^2, where (x, y) lies from the reading to the sensor.
-kernel void score_position(global const real4 *place, global const real *terms, global real *log_p, const int particles) {
+kernel void score_position(global const real4 *place, global const real *terms, global real *log_p, const int particles,
+                           const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 x = place[n].xy, y = place[n].zw;
@@ -76,12 +77,16 @@ kernel void score_position(global const real4 *place, global const real *terms, 
     const real2 first = bounded_square(pair_product(x, a));
     const real2 second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)));
     const real2 exponent = pair_sum(first, second);
-    log_p[n] = either((terms[6] - exponent.x) + (terms[7] - exponent.y), terms[8]);
+    real found = (terms[6] - exponent.x) + (terms[7] - exponent.y);
+#if RAND
+    found = either(found, terms[8]);
+#endif
+    log_p[n] = temperature * found;
 }
 
 // One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
 kernel void score_heading(global const real2 *residual, global const real *terms, global real *log_p, const int particles,
-                          const int kind) {
+                          const int kind, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 r = residual[n];
@@ -94,5 +99,8 @@ kernel void score_heading(global const real2 *residual, global const real *terms
         found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y);
         if (kind == NEARBY) found += log_other_turns(r, terms[DECAY]);
     }
-    log_p[n] = either(found, terms[RANDOM]);
+#if RAND
+    found = either(found, terms[RANDOM]);
+#endif
+    log_p[n] = temperature * found;
 }

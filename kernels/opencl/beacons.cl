@@ -1,4 +1,4 @@
-// Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one.
+// Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one (RAND).
 //     p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
 // d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or two normals of which one is
 // wide; m is f's mass on [0, range_max], where d + bias is held to that interval. For a whole nu the mass of a t between 0
@@ -75,13 +75,17 @@ real log_range(const real2 d, global const real *beacon, global const real *term
     else
         found = log_normal(r, near, far, terms, SCALE, PEAK);
     if (kind == TWO_NORMALS) found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
+#if RAND
     return either(found, terms[RANDOM]);
+#else
+    return found;
+#endif
 }
 
 // One work-item a particle: the sum over beacons of log p of their ranges; the first count numbers of the series are a t's.
 kernel void score_beacons(global const real4 *place, global const real *beacon, global const real *terms,
                           global const real *series, global real *log_p, const int particles, const int beacons,
-                          const int count, const int kind) {
+                          const int count, const int kind, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 own = place[n];
@@ -91,5 +95,5 @@ kernel void score_beacons(global const real4 *place, global const real *beacon, 
         const real2 d = distance_pair(offset((real4)(one[0], one[2], one[1], one[3]), own));
         total = add_term(total, log_range(d, one, terms, series, count, kind));
     }
-    log_p[n] = isinf(total.x) ? total.x : total.x + total.y;
+    log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
 }

@@ -40,21 +40,31 @@ real scan_log(const real sum) {
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global real *log_p, global real *parts, const int rows,
-                        const int cols, const int particles, const int rays, const int readings, const int kinds,
-                        const int cone_rays, const real critical, const int bins, const real slack,
-                        const real tolerance, const int cells, const real per_metre, const real limit,
-                        const real resolution, const real range_max, const real fixed, const real temperature) {
+                        global const real *sensor, global const int *start, global const real *fixed_of,
+                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
+                        const int rays, const int readings, const int kinds, const int cone_rays, const real critical,
+                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
+                        const real limit, const real resolution, const real range_max, const real fixed,
+                        const real temperature, const int per_scan, const int ahead) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    real2 total = (real2)(fixed, 0);
+#if SCANS
+    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
+    const real lead = fixed_of[scan];
+    ray += start[scan];
+    reading += start[scan];
+#else
+    const int size = readings;
+    const real lead = fixed;
+#endif
+    real2 total = (real2)(lead, 0);
     real block = 0, one[LANES];
-    for (int k = 0; k < readings; k += LANES) {
+    for (int k = 0; k < size; k += LANES) {
         lanes x, y;
-        load_rays(ray, k, rays, &x, &y);
+        load_rays(ray, k, size, &x, &y);
         const lanes expected = expected_ranges(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit, resolution,
                                                range_max);
-        const int count = min(readings - k, LANES);
+        const int count = min(size - k, LANES);
         lanes z;
         if (count == LANES) {
             z = load_lanes(0, reading + k);
@@ -78,23 +88,40 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     log_p[n] = temperature * (total.x + total.y);
 }
 #else
-// One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared.
+// One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several scans
+// each has its rays from start on, and first counts the readings of all.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global real *log_p, global real *parts, const int rows,
-                        const int cols, const int particles, const int rays, const int readings, const int kinds,
-                        const int cone_rays, const real critical, const int bins, const real slack,
-                        const real tolerance, const int cells, const real per_metre, const real limit,
-                        const real resolution, const real range_max, const real fixed, const real temperature) {
+                        global const real *sensor, global const int *start, global const real *fixed_of,
+                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
+                        const int rays, const int readings, const int kinds, const int cone_rays, const real critical,
+                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
+                        const real limit, const real resolution, const real range_max, const real fixed,
+                        const real temperature, const int per_scan, const int ahead) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    real2 total = (real2)(fixed, 0);
+#if SCANS
+    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
+    const real lead = fixed_of[scan];
+    ray += start[scan] * cone_rays;
+#if SHARED_RAYS
+    first += start[scan];
+    const int begin = first[0];
+#else
+    const int begin = start[scan];
+#endif
+    reading += begin;
+#else
+    const int size = rays, begin = 0;
+    const real lead = fixed;
+#endif
+    real2 total = (real2)(lead, 0);
     real block = 0;
 #if !LINEAR
     int impossible = 0;
 #endif
-    for (int r = 0; r < rays; ++r) {
+    for (int r = 0; r < size; ++r) {
 #if ECHO
         const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + r * cone_rays,
                                        cone_rays, critical, limit, bins, slack, tolerance);
@@ -109,7 +136,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
         global const real *own = terms;
 #endif
 #if SHARED_RAYS
-        for (int k = first[r]; k < first[r + 1]; ++k) {
+        for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
 #else
         const int k = r;
         {
@@ -140,16 +167,19 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
 }
 
-// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
-kernel void beam_tiles(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                       global const real4 *pose, global const int *order, global const real2 *ray,
-                       global const int *first, global const real *reading, global const real *terms,
-                       global const real *edges, global const real *sensor, global real *parts, const int rows,
-                       const int cols, const int particles, const int rays, const int readings, const int kinds,
-                       const int cone_rays, const real critical, const int bins, const real slack,
-                       const real tolerance, const int cells, const real per_metre, const real limit,
-                       const real resolution, const real range_max, const int across, const int along,
-                       const int spread) {
+// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], fewer than 2^31
+// numbers. What is told not to overlap need not be read again after each of them is written.
+kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
+                       global const int2 *restrict pose_cell, global const real4 *restrict pose,
+                       global const int *restrict order, global const real2 *restrict ray,
+                       global const int *restrict first, global const real *restrict reading,
+                       global const real *restrict terms, global const real *restrict edges,
+                       global const real *restrict sensor, global const int *restrict start,
+                       global real *restrict parts, const int rows, const int cols, const int particles, const int rays,
+                       const int readings, const int kinds, const int cone_rays, const real critical, const int bins,
+                       const real slack, const real tolerance, const int cells, const real per_metre,
+                       const real limit, const real resolution, const real range_max, const int across,
+                       const int along, const int spread, const int per_scan) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;
 #if ORDERED
@@ -157,13 +187,28 @@ kernel void beam_tiles(global const entry *map_table, global const real2 *normal
 #else
     const int n = place;
 #endif
-    for (int r = tile_ray(item, spread); r < rays; r += tile_step(spread)) {
+    const int2 cell = pose_cell[n];
+    const real4 own_pose = pose[n];
+#if SCANS
+    const int scan = n / per_scan, size = start[scan + 1] - start[scan];
+    ray += start[scan] * cone_rays;
+#if SHARED_RAYS
+    first += start[scan];
+    const int begin = first[0];
+#else
+    const int begin = start[scan];
+#endif
+    reading += begin;
+#else
+    const int size = rays, begin = 0;
+#endif
+    for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #if ECHO
-        const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + r * cone_rays,
+        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, own_pose, ray + r * cone_rays,
                                        cone_rays, critical, limit, bins, slack, tolerance);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, rows, cols, cell, own_pose, ray[r], limit, bins, slack, tolerance);
 #endif
         const real expected = expected_range(t, limit, resolution, range_max);
 #if INCIDENCE
@@ -172,13 +217,13 @@ kernel void beam_tiles(global const entry *map_table, global const real2 *normal
         global const real *own = terms;
 #endif
 #if SHARED_RAYS
-        for (int k = first[r]; k < first[r + 1]; ++k) {
+        for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
 #else
         const int k = r;
         {
 #endif
             const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
-            parts[(long)place * across + (long)k * along] = term;
+            parts[place * across + k * along] = term;
         }
     }
 }

@@ -59,7 +59,7 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
                           global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                           global const int *start, global const int *pressed, global const real *terms,
                           global real *log_p, const int rows, const int cols, const int particles, const int segments,
-                          const real guard) {
+                          const real guard, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const int2 cell = pose_cell[n];
@@ -78,5 +78,5 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
         }
         total += log_bump(nearest, pressed[s], terms);
     }
-    log_p[n] = total;
+    log_p[n] = temperature * total;
 }

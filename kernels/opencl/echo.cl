@@ -5,7 +5,8 @@
 // requires: caster
 
 #if ECHO
-// Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 1 and 0 there.
+// Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 2 and 0 there: more than
+// any cosine, so that the first of the bins may be for such beams alone.
 typedef struct {
     real t, cosine, sine;
 } Echo;
@@ -32,11 +33,11 @@ real2 hit_normal(global const real2 *normals, const int rows, const int cols, co
         const real2 own = normal_at(normals, rows, cols, cell.x, cell.y);
         if (is_wall(own)) return own;
     }
-    const int col = cell.x + r.step_x * (int)crossed(t, r.speed_x, r.a_x, r.inv_x, 1);
-    const int before = cell.y + r.step_y * (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 0);
+    const int col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
+    const int before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
     const real2 found = normal_at(normals, rows, cols, col, before);
     if (is_wall(found)) return found;
-    return normal_at(normals, rows, cols, col, cell.y + r.step_y * (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 1));
+    return normal_at(normals, rows, cols, col, cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 1)));
 }
 
 // The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.
@@ -53,7 +54,7 @@ global const real *incidence_terms(global const real *terms, global const real *
 Echo nearest_echo(global const entry *map_table, global const real2 *normals, const int rows, const int cols,
                   const int2 cell, const real4 pose, global const real2 *ray, const int cone_rays, const real critical,
                   const real limit, const int bins, const real slack, const real tolerance) {
-    Echo echo = {limit, 1, 0};
+    Echo echo = {limit, 2, 0};
     for (int i = 0; i < cone_rays; ++i) {
         // Most casters need not look beyond what is found; those of tables and lines must.
         real farthest = echo.t;

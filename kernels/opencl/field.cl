@@ -83,23 +83,33 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 }
 
 #if !WIDE
-// One work-item a particle.
+// One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                        global const real *terms, global real *log_p, global real *parts, const int rows,
-                        const int cols, const int particles, const int readings, const real guard,
-                        const real fixed, const real temperature) {
+                        global const real *terms, global const int *start, global const real *fixed_of,
+                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
+                        const int readings, const real guard, const real fixed, const real temperature,
+                        const int per_scan, const int ahead) {
     const int n = get_global_id(0);
     if (n >= particles) return;
+#if SCANS
+    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
+    const real lead = fixed_of[scan];
+    point += start[scan];
+    point_low += start[scan];
+#else
+    const int size = readings;
+    const real lead = fixed;
+#endif
     const int2 origin = pose_cell[n];
 #if CAREFUL
     const real4 low = pose_low[n];
 #else
     const real4 low = (real4)(0);
 #endif
-    real2 total = (real2)(fixed, 0);
+    real2 total = (real2)(lead, 0);
     real block = 0;
-    for (int k = 0; k < readings; ++k) {
+    for (int k = 0; k < size; ++k) {
         const real term =
             reading_value(table, origin, pose[n], low, point[k], point_low[k], terms, rows, cols, guard);
 #if PER_BEAM
@@ -120,14 +130,22 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 }
 
 // For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-// parts[n * across + block * along]. Each block has its own guard.
+// parts[n * across + block * along]. Each block has its own guard; of several scans each has as many as the longest.
 kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                         global const real *terms, global const real *guard, global real *parts, const int rows,
-                         const int cols, const int particles, const int readings, const int across, const int along,
-                         const int spread) {
+                         global const real *terms, global const real *guard, global const int *start,
+                         global real *parts, const int rows, const int cols, const int particles, const int readings,
+                         const int across, const int along, const int spread, const int per_scan) {
     const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
     if (n >= particles) return;
+#if SCANS
+    const int scan = n / per_scan, size = start[scan + 1] - start[scan];
+    point += start[scan];
+    point_low += start[scan];
+    guard += scan * ((readings + BLOCK_TERMS - 1) / BLOCK_TERMS);
+#else
+    const int size = readings;
+#endif
     const int2 origin = pose_cell[n];
     const real4 own = pose[n];
 #if CAREFUL
@@ -135,14 +153,14 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
 #else
     const real4 low = (real4)(0);
 #endif
-    for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < readings; block += 1 << spread) {
-        const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, readings);
+    for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
+        const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
         real sum = 0;
 #if QUICK
         real worst = 0, off;
         const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
         const real sure = (real)0.5 - guard[block];
-        if (begin + BLOCK_TERMS <= readings) {
+        if (begin + BLOCK_TERMS <= size) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) {
                 const int2 cell = origin + rounded_cell(lowered, point[begin + i], &off);

@@ -117,17 +117,31 @@ __attribute__((noinline)) void mend_cells(EndPoints *ends, const real *most, con
 // One work-item VECTORS * LANES particles, block by block of beams.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                        global const real *terms, global real *log_p, global real *parts, const int rows,
-                        const int cols, const int particles, const int readings, const real guard,
-                        const real fixed, const real temperature) {
-    const int begin = LANES * get_global_id(0), left = particles - begin;
-    if (get_global_id(0) % VECTORS != 0 || left <= 0) return;
+                        global const real *terms, global const int *start, global const real *fixed_of,
+                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
+                        const int readings, const real guard, const real fixed, const real temperature,
+                        const int per_scan, const int ahead) {
+    const int item = get_global_id(0);
+#if SCANS
+    // Each scan has work-items of its own.
+    const int items = (per_scan + VECTORS * LANES - 1) / (VECTORS * LANES) * VECTORS, scan = item / items;
+    const int begin = scan * per_scan + LANES * (item % items), left = (scan + 1) * per_scan - begin;
+    if (item % VECTORS != 0 || left <= 0 || begin >= particles) return;
+    const int all_readings = start[scan + 1] - start[scan];
+    const real lead = fixed_of[scan];
+    point += start[scan];
+    point_low += start[scan];
+#else
+    const int begin = LANES * item, left = particles - begin, all_readings = readings;
+    const real lead = fixed;
+    if (item % VECTORS != 0 || left <= 0) return;
+#endif
     const int stride = cols + 2 * FIELD_RING, count = left < VECTORS * LANES ? left : VECTORS * LANES;
     Particles all[VECTORS];
     lanes head[VECTORS], lost[VECTORS];
     for (int v = 0; v * LANES < count; ++v) {
         Particles *of = &all[v];
-        head[v] = fixed;
+        head[v] = lead;
         lost[v] = 0;
         for (int i = 0; i < LANES; ++i) {
             const int lane = v * LANES + i, n = begin + (lane < count ? lane : count - 1);
@@ -158,8 +172,8 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     EndPoints ends;
     real most[BLOCK_TERMS];
 #endif
-    for (int from = 0; from < readings; from += BLOCK_TERMS) {
-        const int size = readings - from < BLOCK_TERMS ? readings - from : BLOCK_TERMS;
+    for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
+        const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
 #if !BILINEAR
         // An end point's rounding errors are at most 2.5 eps (its reading in cells) + 0.7 eps.
         real least = 0.5f;

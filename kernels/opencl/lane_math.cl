@@ -5,6 +5,7 @@
 // requires: lanes
 
 #if WIDE
+#if !FLOAT64
 // log 2 in a part of 16 bits, which has exact products with counts, and the rest.
 #define LOG2_HIGH 0.693145752f
 #define LOG2_LOW 1.42860677e-06f
@@ -92,4 +93,5 @@ lanes erf_lanes(const lanes x) {
     const lanes high = (W4 + W5 * b) + square * ((W6 + W7 * b) + square * W8);
     return one_minus_exp(-b * (low + (square * square) * high));
 }
+#endif
 #endif

@@ -1,8 +1,28 @@
 // 16 particles or beams at once in one work-item, in vector types, for processors whose compilers do not make such code of
-// scalar kernels. Where the processor's vectors are shorter, two of them wait for memory side by side. float32 only.
+// scalar kernels. Where the processor's vectors are shorter, two of them wait for memory side by side. float32; only the
+// sums to learn from have lanes of float64, 8 of them.
 // PoCL calls any, fabs, fmax, min and max as functions, which an inner loop cannot bear: comparisons and masks stand there.
 
 #if WIDE
+#if FLOAT64
+typedef double8 lanes;
+typedef long8 ilanes;
+#define LANES 8
+#define load_lanes vload8
+
+// Whether a comparison holds in any lane.
+int some(const ilanes holds) {
+    const long4 four = holds.lo | holds.hi;
+    const long2 two = four.lo | four.hi;
+    return (two.x | two.y) != 0;
+}
+
+real sum_lanes(const lanes a) {
+    const double4 four = a.lo + a.hi;
+    const double2 two = four.lo + four.hi;
+    return two.x + two.y;
+}
+#else
 typedef float16 lanes;
 typedef int16 ilanes;
 #define LANES 16
@@ -27,6 +47,14 @@ int some(const ilanes holds) {
     return (two.x | two.y) != 0;
 }
 
+real sum_lanes(const lanes a) {
+    const float8 eight = a.lo + a.hi;
+    const float4 four = eight.lo + eight.hi;
+    const float2 two = four.lo + four.hi;
+    return two.x + two.y;
+}
+
 // Bits of the sizes of numbers, which have the order of the sizes.
 ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
+#endif
 #endif

@@ -68,6 +68,7 @@ real short_peak(const real lambda, const real expected) {
 #endif
 
 #if WIDE
+#if !FLOAT64
 // p_rand is at least 1e-30 times the larger of 1 and the peak, so components may underflow one by one, from 2e-38 on, and
 // one logarithm is enough.
 lanes log_density(const lanes z, const lanes expected, global const real *terms) {
@@ -92,6 +93,7 @@ lanes log_density(const lanes z, const lanes expected, global const real *terms)
 #endif
     return log_lanes(p);
 }
+#endif
 #else
 #if LINEAR
 // p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.

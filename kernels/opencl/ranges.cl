@@ -34,9 +34,11 @@ kernel void cast_ranges(global const entry *map_table, global const int2 *pose_c
 }
 #endif
 
-// For GPUs, tiles of particles and rays.
-kernel void cast_tiles(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                       global const int *order, global const real2 *ray, global real *ranges, const int rows,
+// For GPUs, tiles of particles and rays: fewer than 2^31 ranges. What is told not to overlap need not be read again
+// after each of them is written.
+kernel void cast_tiles(global const entry *restrict map_table, global const int2 *restrict pose_cell,
+                       global const real4 *restrict pose, global const int *restrict order,
+                       global const real2 *restrict ray, global real *restrict ranges, const int rows,
                        const int cols, const int particles, const int rays, const int bins, const real slack,
                        const real tolerance, const real limit, const real resolution, const real range_max,
                        const int spread) {
@@ -47,8 +49,10 @@ kernel void cast_tiles(global const entry *map_table, global const int2 *pose_ce
 #else
     const int n = place;
 #endif
+    const int2 cell = pose_cell[n];
+    const real4 own = pose[n];
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
-        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance);
-        ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
+        const real t = cast_ray(map_table, rows, cols, cell, own, ray[k], limit, bins, slack, tolerance);
+        ranges[n * rays + k] = expected_range(t, limit, resolution, range_max);
     }
 }

@@ -3,6 +3,20 @@
 // requires: error_free
 // Casts and comparisons stand where floor, ceil, fmin and fmax would do: some drivers call those as functions.
 
+// Counts k of boundaries are real numbers from COUNT on, where numbers are whole: what is added to COUNT is rounded to
+// nearest, and the last bits are those of k and FIRST, so that a count is an index without a conversion.
+#if FLOAT64
+#define COUNT ((real)4503599627370496.0)
+#define FIRST 0u
+#define as_bits as_long
+#define as_real as_double
+#else
+#define COUNT ((real)8388608)
+#define FIRST 0x4b000000u
+#define as_bits as_int
+#define as_real as_float
+#endif
+
 // Smallest direction component that is told from zero: its inverse must be finite.
 #define TINY ((real)1e-30)
 
@@ -38,12 +52,15 @@ Ray make_ray(const real4 pose, const real2 ray) {
     return r;
 }
 
-// Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
+// k of a count.
+int whole(const real count) { return (int)((uint)as_bits(count) - FIRST); }
+
+// Count of the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
 // Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
 real crossed(const real t, const real speed, const real a, const real inv, const int until) {
-    const real place = ((t * speed - a) + ROUNDING) - ROUNDING, k = place > 0 ? place : 0;
-    const real here = (k + a) * inv;
-    return (until ? here <= t : here < t) ? k + 1 : k;
+    const real place = (t * speed - a) + COUNT, count = place > COUNT ? place : COUNT;
+    const real here = ((count - COUNT) + a) * inv;
+    return (here < t) | (until & (here == t)) ? count + 1 : count;
 }
 
 // Whether a cell is none of the grid's.
@@ -66,10 +83,10 @@ Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, co
         if (!(t >= 0 && t < limit)) return walk;
         if (enter_t_x > enter_t_y) {
             walk.k_x = enter_x;
-            walk.k_y = (int)crossed(t, r.speed_y, r.a_y, r.inv_y, 0);
+            walk.k_y = whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
         } else {
             walk.k_y = enter_y;
-            walk.k_x = (int)crossed(t, r.speed_x, r.a_x, r.inv_x, 1);
+            walk.k_x = whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
         }
         if (!off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols)) walk.t = t;
     }

@@ -39,30 +39,30 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
 #endif
 #endif
     const Walk start = start_walk(r, cell, rows, cols, limit);
-    real k_x = (real)start.k_x, k_y = (real)start.k_y, t = start.t;
-    if (t >= limit) return limit;
-    const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
-    const int origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols);
-    const int step_y = r.step_y * (cols + 2);
-    for (;;) {
-        const uint sides = map_table[origin + r.step_x * (int)k_x + step_y * (int)k_y];
-        if (sides == 0) {
-#if OUTSIDE_OCCUPIED
-            return t;
-#else
-            const int col = cell.x + r.step_x * (int)k_x, row = cell.y + r.step_y * (int)k_y;
-            return off_grid(col, row, rows, cols) ? limit : t;
+#if ORIGINS_OUTSIDE
+    if (start.t >= limit) return limit;
 #endif
-        }
-        const real far_x = k_x + (real)(int)((sides & 255) - 1), far_y = k_y + (real)(int)((sides >> 8) - 1);
-        const real t_x = (far_x + r.a_x) * r.inv_x, t_y = (far_y + r.a_y) * r.inv_y;
+    const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
+    const uint step_x = r.step_x, step_y = r.step_y * (cols + 2);
+    const uint origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols) - (step_x + step_y) * FIRST;
+    real k_x = COUNT + (real)start.k_x, k_y = COUNT + (real)start.k_y, t = start.t;
+    uint sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
+    // A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
+    while (sides > OCCUPIED && t < limit) {
+        const real end_x = as_real(as_bits(k_x) + (sides & 255)), end_y = as_real(as_bits(k_y) + (sides >> 8));
+        const real t_x = ((end_x - (COUNT + 1)) + r.a_x) * r.inv_x, t_y = ((end_y - (COUNT + 1)) + r.a_y) * r.inv_y;
         const int by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
-        if (t >= limit) return limit;
         const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x, !by_x);
-        k_x = by_x ? far_x + 1 : aside;
-        k_y = by_x ? aside : far_y + 1;
+        k_x = by_x ? end_x : aside;
+        k_y = by_x ? aside : end_y;
+        sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
     }
+#if OUTSIDE_OCCUPIED
+    return t < limit ? t : limit;
+#else
+    return t < limit && sides == OCCUPIED ? t : limit;
+#endif
 }
 
 #if WIDE
@@ -87,36 +87,35 @@ lanes cast_rays(global const entry *map_table, const int rows, const int cols, c
 #endif
     const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)(cols + 2) : (ilanes)(-cols - 2);
     const ilanes origin = plane * size + padded(cell.y, cell.x, cols);
-    lanes k_x = 0, k_y = 0, t = 0, found = limit;
+    lanes k_x = COUNT, k_y = COUNT, t = 0, found = limit;
     ilanes going = -1;
     for (;;) {
-        const ilanes at = going ? origin + step_x * to_ilanes(k_x) + step_y * to_ilanes(k_y) : (ilanes)0;
+        const ilanes x = as_ilanes(k_x) - (int)FIRST, y = as_ilanes(k_y) - (int)FIRST;
+        const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
         const ilanes sides = GATHER(ilanes, map_table, at);
-        const ilanes stopped = going & (sides == 0);
+        const ilanes stopped = going & (sides <= OCCUPIED);
         if (some(stopped)) {
 #if OUTSIDE_OCCUPIED
             found = stopped ? t : found;
 #else
-            const ilanes x = to_ilanes(k_x), y = to_ilanes(k_y);
-            const ilanes col = cell.x + (right ? x : -x), row = cell.y + (up ? y : -y);
-            found = stopped && col >= 0 && col < cols && row >= 0 && row < rows ? t : found;
+            found = stopped & (sides == OCCUPIED) ? t : found;
 #endif
-            going &= sides != 0;
+            going &= sides > OCCUPIED;
             if (!some(going)) return found;
         }
-        const lanes far_x = k_x + to_lanes((sides & 255) - 1), far_y = k_y + to_lanes((sides >> 8) - 1);
-        const lanes t_x = (far_x + a_x) * inv_x, t_y = (far_y + a_y) * inv_y;
+        const lanes end_x = as_lanes(as_ilanes(k_x) + (sides & 255)), end_y = as_lanes(as_ilanes(k_y) + (sides >> 8));
+        const lanes t_x = ((end_x - (COUNT + 1)) + a_x) * inv_x, t_y = ((end_y - (COUNT + 1)) + a_y) * inv_y;
         const ilanes by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
         going &= t < limit;
         if (!some(going)) return found;
         const lanes a = by_x ? a_y : a_x, inv = by_x ? inv_y : inv_x;
-        const lanes place = ((t * (by_x ? speed_y : speed_x) - a) + ROUNDING) - ROUNDING;
-        const lanes k = place > 0 ? place : (lanes)0, here = (k + a) * inv;
+        const lanes place = (t * (by_x ? speed_y : speed_x) - a) + COUNT;
+        const lanes count = place > COUNT ? place : (lanes)COUNT, here = ((count - COUNT) + a) * inv;
         const ilanes more = (here < t) | (~by_x & (here == t));
-        const lanes aside = more ? k + 1 : k;
-        k_x = by_x ? far_x + 1 : aside;
-        k_y = by_x ? aside : far_y + 1;
+        const lanes aside = more ? count + 1 : count;
+        k_x = by_x ? end_x : aside;
+        k_y = by_x ? aside : end_y;
     }
 }
 

@@ -11,6 +11,8 @@
 // requires: bits
 
 #define LONGEST 255
+// Of a cell that is no rectangle's; the ring has 0.
+#define OCCUPIED 1
 // Cells from a changed cell to the farthest one whose rectangle holds it.
 #define RECTANGLE_REACH 254
 // Room for the columns that may bound a rectangle.
@@ -80,7 +82,7 @@ kernel void rectangles_rows(global const uchar *runs, global int *stack, global 
             const int lower = known ? min(height, (int)run[other]) : 0;
             const int wider = lower * middle.y > width * middle.x;
             if (col < begin || col >= end) continue;
-            const int found = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : 0;
+            const int found = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : OCCUPIED;
             out[padded(row, col, cols)] = (ushort)found;
         }
     }
@@ -128,7 +130,7 @@ kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles,
         const int narrower = height > room ? 0 : min(width, (int)run[(height - 1) * step]);
         while (sector < sectors && narrower * middle.x < height * middle.y) {
             const int higher = narrower * middle.x > (height - 1) * middle.y;
-            const int found = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : 0;
+            const int found = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
             out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)found;
             middle = slope(sectors, ++sector);
         }

@@ -4,9 +4,10 @@
 // One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block of
 // them, 1 or BLOCK_TERMS, is added plainly, then its sum to a compensated total. BLOCK_TERMS numbers are read before any
 // is added, so that a work-item waits once for all of them; what lies beyond the last counts as 0, which changes no sum.
-kernel void sum_parts(global const real *parts, global const int *order, global real *log_p, const int particles,
-                      const int count, const int block, const int across, const int along, const real fixed,
-                      const real temperature) {
+kernel void sum_parts(global const real *parts, global const int *order, global const int *counts,
+                      global const real *fixed_of, global real *log_p, const int particles, const int count,
+                      const int block, const int across, const int along, const real fixed, const real temperature,
+                      const int per_scan) {
     const int place = get_global_id(0);
     if (place >= particles) return;
 #if ORDERED
@@ -14,12 +15,19 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
 #else
     const int n = place;
 #endif
+#if SCANS
+    const int own = counts[n / per_scan];
+    const real lead = fixed_of[n / per_scan];
+#else
+    const int own = count;
+    const real lead = fixed;
+#endif
     global const real *part = parts + (long)place * across;
-    real2 total = (real2)(fixed, 0);
-    for (int first = 0; first < count; first += BLOCK_TERMS) {
+    real2 total = (real2)(lead, 0);
+    for (int first = 0; first < own; first += BLOCK_TERMS) {
         real term[BLOCK_TERMS], sum = 0;
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < count ? part[(long)(first + i) * along] : 0;
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? part[(long)(first + i) * along] : 0;
 #pragma unroll
         for (int i = 0; i < BLOCK_TERMS; ++i) {
             if (block == 1)

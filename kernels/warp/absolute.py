@@ -3,7 +3,7 @@
 A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
 its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
 von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
-*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything: that is a uniform density.
+*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything (RAND): that is a uniform density.
 """
 
 import functools
@@ -33,7 +33,8 @@ def make(name, flags):
     """A kernel of the file specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    exact, logs = error_free.functions(flags), log_terms.functions(flags)
+    base = flags & {"FLOAT64"}
+    exact, logs = error_free.functions(base), log_terms.functions(base)
     two_sum, pair_sum, pair_product = exact.two_sum, exact.pair_sum, exact.pair_product
     bounded_square, log_one_plus, either = logs.bounded_square, logs.log_one_plus, logs.either
     ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
@@ -41,6 +42,7 @@ def make(name, flags):
     HALF_TURN_LOW = real(0.0 if "FLOAT64" in flags else -8.742277657347586e-08)
     # exp of minus this is below half an eps.
     NEGLIGIBLE = real(40.0)
+    RAND = "RAND" in flags
     S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
 
     # sin(r / 2) of an angle in [-pi, pi].
@@ -91,7 +93,11 @@ def make(name, flags):
     # The exponent is (a x)^2 + (b x + c y)^2, where (x, y) lies from the reading to the sensor.
     @kernel
     def score_position(
-        place: wp.array(dtype=vec4), terms: wp.array(dtype=real), log_p: wp.array(dtype=real), particles: wp.int32
+        place: wp.array(dtype=vec4),
+        terms: wp.array(dtype=real),
+        log_p: wp.array(dtype=real),
+        particles: wp.int32,
+        temperature: real,
     ):
         n = wp.tid()
         if n >= particles:
@@ -102,7 +108,10 @@ def make(name, flags):
         first = bounded_square(pair_product(x, vec2(terms[0], terms[1])))
         mixed = pair_sum(pair_product(x, vec2(terms[2], terms[3])), pair_product(y, vec2(terms[4], terms[5])))
         exponent = pair_sum(first, bounded_square(mixed))
-        log_p[n] = either((terms[6] - exponent.x) + (terms[7] - exponent.y), terms[8])
+        found = (terms[6] - exponent.x) + (terms[7] - exponent.y)
+        if RAND:
+            found = either(found, terms[8])
+        log_p[n] = temperature * found
 
     # One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
     @kernel
@@ -112,6 +121,7 @@ def make(name, flags):
         log_p: wp.array(dtype=real),
         particles: wp.int32,
         kind: wp.int32,
+        temperature: real,
     ):
         n = wp.tid()
         if n >= particles:
@@ -128,6 +138,8 @@ def make(name, flags):
             found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
             if kind == NEARBY:
                 found += log_other_turns(r, terms[DECAY])
-        log_p[n] = either(found, terms[RANDOM])
+        if RAND:
+            found = either(found, terms[RANDOM])
+        log_p[n] = temperature * found
 
     return {"score_position": score_position, "score_heading": score_heading}[name]

@@ -29,10 +29,11 @@ ARC, ODD = wp.constant(11), wp.constant(12)
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_beacons in the precision of the flags."""
+    """The kernel score_beacons specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    exact, logs, between = error_free.functions(flags), log_terms.functions(flags), offsets.functions(flags)
+    base = flags & {"FLOAT64"}
+    exact, logs, between = error_free.functions(base), log_terms.functions(base), offsets.functions(base)
     two_sum, add_term = exact.two_sum, exact.add_term
     offset, distance_pair = between.offset, between.distance_pair
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
@@ -42,6 +43,7 @@ def make(name, flags):
     STEEPEST = real(1e18)
     # Above this the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
+    RAND = "RAND" in flags
 
     # Log of a truncated normal; near and far are the distances of its mean from the interval's ends.
     @wp.func
@@ -109,7 +111,9 @@ def make(name, flags):
             found = log_normal(r, near, far, terms, SCALE, PEAK)
         if kind == TWO_NORMALS:
             found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
-        return either(found, terms[RANDOM])
+        if RAND:
+            found = either(found, terms[RANDOM])
+        return found
 
     # One work-item a particle: the sum over beacons of log p of their ranges; the first count numbers of the series are
     # a t's.
@@ -124,6 +128,7 @@ def make(name, flags):
         beacons: wp.int32,
         count: wp.int32,
         kind: wp.int32,
+        temperature: real,
     ):
         n = wp.tid()
         if n >= particles:
@@ -137,6 +142,6 @@ def make(name, flags):
             d = distance_pair(offset(at, own))
             total = add_term(total, log_range(d, beacon, one, terms, series, count, kind))
             i += 1
-        log_p[n] = wp.where(wp.isinf(total.x), total.x, total.x + total.y)
+        log_p[n] = wp.where(wp.isinf(total.x), total.x, temperature * (total.x + total.y))
 
     return {"score_beacons": score_beacons}[name]

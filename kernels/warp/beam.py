@@ -11,7 +11,7 @@ import warp as wp
 from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
 from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision
+from .prelude import kernel, precision, reader, writer
 from .ranges import caster_of
 from .tiles import tile_place, tile_ray, tile_step
 
@@ -38,8 +38,11 @@ def make(name, flags):
     ORDERED = "ORDERED" in flags
     ECHO = "ECHO" in flags
     INCIDENCE = "INCIDENCE" in flags
+    SCANS = "SCANS" in flags
     nearest_echo = echo.functions(flags).nearest_echo
     incidence_terms = echo.functions(flags).incidence_terms
+    cell_at, pose_at, ray_at = reader(wp.vec2i), reader(vec4), reader(vec2)
+    number_at, put = reader(real), writer(real)
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
@@ -76,8 +79,8 @@ def make(name, flags):
         else:
             return total
 
-    # One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. A launch has
-    # fewer than 2^31 parts.
+    # One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several
+    # scans each has its rays from start on, and first counts the readings of all. A launch has fewer than 2^31 parts.
     @kernel
     def score_beams(
         map_table: wp.array(dtype=ENTRY),
@@ -90,6 +93,8 @@ def make(name, flags):
         terms: wp.array(dtype=real),
         edges: wp.array(dtype=real),
         sensor: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
+        fixed_of: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         rows: wp.int32,
@@ -110,35 +115,52 @@ def make(name, flags):
         range_max: real,
         fixed: real,
         temperature: real,
+        per_scan: wp.int32,
+        ahead: wp.int32,
     ):
         n = wp.tid()
         if n >= particles:
             return
-        cell = pose_cell[n]
-        from_pose = pose[n]
-        total = vec2(fixed, ZERO)
+        cell = cell_at(pose_cell, n)
+        from_pose = pose_at(pose, n)
+        before = int(0)
+        size = rays
+        readings_before = int(0)
+        lead = fixed
+        if SCANS:
+            scan = (n + ahead) // per_scan
+            before = start[scan]
+            size = start[scan + 1] - before
+            readings_before = before
+            if SHARED_RAYS:
+                readings_before = first[before]
+            lead = fixed_of[scan]
+        total = vec2(lead, ZERO)
         block = real(0.0)
         impossible = bool(False)
-        for r in range(rays):
+        for r in range(size):
             own = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, from_pose, ray, r * cone_rays, cone_rays, critical, limit,
-                    bins, slack, tolerance,
+                    map_table, normals, rows, cols, cell, from_pose, ray, (before + r) * cone_rays, cone_rays, critical,
+                    limit, bins, slack, tolerance,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
                     own = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
-                t = cast_ray(map_table, rows, cols, cell, from_pose, ray[r], limit, bins, slack, tolerance)
+                t = cast_ray(
+                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                )
             expected = expected_range(t, limit, resolution, range_max)
             begin = r
             end = r + 1
             if SHARED_RAYS:
-                begin = first[r]
-                end = first[r + 1]
+                begin = first[before + r] - readings_before
+                end = first[before + r + 1] - readings_before
             for k in range(begin, end):
-                term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max)
+                z = number_at(reading, readings_before + k)
+                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -171,6 +193,7 @@ def make(name, flags):
         terms: wp.array(dtype=real),
         edges: wp.array(dtype=real),
         sensor: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
         parts: wp.array(dtype=real),
         rows: wp.int32,
         cols: wp.int32,
@@ -191,6 +214,7 @@ def make(name, flags):
         across: wp.int32,
         along: wp.int32,
         spread: wp.int32,
+        per_scan: wp.int32,
     ):
         item = wp.tid()
         place = tile_place(item, spread)
@@ -199,30 +223,43 @@ def make(name, flags):
         n = place
         if ORDERED:
             n = order[place]
-        cell = pose_cell[n]
-        from_pose = pose[n]
+        cell = cell_at(pose_cell, n)
+        from_pose = pose_at(pose, n)
+        before = int(0)
+        size = rays
+        readings_before = int(0)
+        if SCANS:
+            scan = n // per_scan
+            before = start[scan]
+            size = start[scan + 1] - before
+            readings_before = before
+            if SHARED_RAYS:
+                readings_before = first[before]
         r = tile_ray(item, spread)
-        while r < rays:
+        while r < size:
             own = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, from_pose, ray, r * cone_rays, cone_rays, critical, limit,
-                    bins, slack, tolerance,
+                    map_table, normals, rows, cols, cell, from_pose, ray, (before + r) * cone_rays, cone_rays, critical,
+                    limit, bins, slack, tolerance,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
                     own = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
-                t = cast_ray(map_table, rows, cols, cell, from_pose, ray[r], limit, bins, slack, tolerance)
+                t = cast_ray(
+                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                )
             expected = expected_range(t, limit, resolution, range_max)
             k = r
             end = r + 1
             if SHARED_RAYS:
-                k = first[r]
-                end = first[r + 1]
+                k = first[before + r] - readings_before
+                end = first[before + r + 1] - readings_before
             while k < end:
-                term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max)
-                parts[place * across + k * along] = term
+                z = number_at(reading, readings_before + k)
+                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
+                put(parts, place * across + k * along, term)
                 k += 1
             r += tile_step(spread)
 

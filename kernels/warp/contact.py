@@ -101,6 +101,7 @@ def make(name, flags):
         particles: wp.int32,
         segments: wp.int32,
         guard: real,
+        temperature: real,
     ):
         n = wp.tid()
         if n >= particles:
@@ -121,6 +122,6 @@ def make(name, flags):
                 i += 1
             total += log_bump(nearest, pressed[s], terms)
             s += 1
-        log_p[n] = total
+        log_p[n] = temperature * total
 
     return {"score_contact": score_contact}[name]

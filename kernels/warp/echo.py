@@ -26,15 +26,17 @@ def functions(flags):
     ENTRY = caster.ENTRY
     cast_ray = caster.functions(flags).cast_ray
     geometry = ray_file.functions(flags)
-    Ray, make_ray, crossed, off_grid = geometry.Ray, geometry.make_ray, geometry.crossed, geometry.off_grid
+    Ray, make_ray, off_grid = geometry.Ray, geometry.make_ray, geometry.off_grid
+    crossed, whole = geometry.crossed, geometry.whole
     padded = rectangles_file.functions(flags).padded
     INCIDENCE = "INCIDENCE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     TO_THE_LIMIT = bool({"LOOKUP", "BRESENHAM"} & flags)
-    ZERO, ONE = real(0.0), real(1.0)
+    ZERO, ONE, TWO = real(0.0), real(1.0), real(2.0)
     NOWHERE = real(math.nan)
 
-    # Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 1 and 0 there.
+    # Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 2 and 0 there: more
+    # than any cosine, so that the first of the bins may be for such beams alone.
     @wp.struct
     class Echo:
         t: real
@@ -64,12 +66,12 @@ def functions(flags):
             own = normal_at(normals, rows, cols, cell.x, cell.y)
             if is_wall(own):
                 return own
-        col = cell.x + r.step_x * int(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
-        before = cell.y + r.step_y * int(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
+        col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
+        before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
         found = normal_at(normals, rows, cols, col, before)
         if is_wall(found):
             return found
-        until = cell.y + r.step_y * int(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
+        until = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
         return normal_at(normals, rows, cols, col, until)
 
     # The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.
@@ -101,7 +103,7 @@ def functions(flags):
     ):
         echo = Echo()
         echo.t = limit
-        echo.cosine = ONE
+        echo.cosine = TWO
         for i in range(first, first + cone_rays):
             # Most casters need not look beyond what is found; those of tables and lines must.
             farthest = real(echo.t)

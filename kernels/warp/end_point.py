@@ -37,8 +37,10 @@ def functions(flags):
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_ONE = real(-1.0)
     EDGE = real(2.0**-33)
-    # Adding and taking off 1.5 * 2^23 rounds to nearest.
-    ROUNDING = real(12582912.0)
+    # Adding and taking off a large number rounds to nearest, and the bits of the sum hold the integer.
+    ROUNDING = real(1.5 * 2.0**52 if "FLOAT64" in flags else 1.5 * 2.0**23)
+    bits = wp.int64 if "FLOAT64" in flags else wp.int32
+    ROUNDING_BITS = bits(0x4338000000000000 if "FLOAT64" in flags else 0x4B400000)
 
     # The same as field_cell where no end point of the cloud leaves the table.
     @wp.func
@@ -128,9 +130,10 @@ def functions(flags):
     def rounded_cell(lowered: vec4, point: vec2):
         x = lowered.x + (lowered.z * point.x - lowered.w * point.y)
         y = lowered.y + (lowered.w * point.x + lowered.z * point.y)
-        whole_x = (x + ROUNDING) - ROUNDING
-        whole_y = (y + ROUNDING) - ROUNDING
-        return wp.vec2i(int(whole_x), int(whole_y)), wp.max(wp.abs(x - whole_x), wp.abs(y - whole_y))
+        to_x = x + ROUNDING
+        to_y = y + ROUNDING
+        cell = wp.vec2i(int(wp.cast(to_x, bits) - ROUNDING_BITS), int(wp.cast(to_y, bits) - ROUNDING_BITS))
+        return cell, wp.max(wp.abs(x - (to_x - ROUNDING)), wp.abs(y - (to_y - ROUNDING)))
 
     return SimpleNamespace(
         table_cell=table_cell,

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import error_free
-from .prelude import precision
+from .prelude import precision, reader
 
 
 @functools.cache
@@ -22,6 +22,7 @@ def functions(flags):
     real, vec2 = types.real, types.vec2
     two_product = error_free.functions(flags).two_product
     SHARP = "SHARP" in flags
+    at = reader(real)
     HIT = "HIT" in flags
     SHORT = "SHORT" in flags
     RAND = "RAND" in flags
@@ -58,17 +59,17 @@ def functions(flags):
         off = z - expected
         if SHARP:
             square = two_product(off, off)
-            product = two_product(square.x, terms[1])
-            return vec2(product.x, product.y + (square.y * terms[1] + square.x * terms[9]))
+            product = two_product(square.x, at(terms, 1))
+            return vec2(product.x, product.y + (square.y * at(terms, 1) + square.x * at(terms, 9)))
         else:
-            return vec2(off * (off * terms[1]), ZERO)
+            return vec2(off * (off * at(terms, 1)), ZERO)
 
     # Terms of the log domain: log of z_hit p_hit(z | z*).
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
         exponent = hit_exponent(z, expected, terms)
-        log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y)
-        mass = hit_mass(expected, terms[2], terms[6])
+        log_p = (at(terms, 0) - exponent.x) + (at(terms, 8) - exponent.y)
+        mass = hit_mass(expected, at(terms, 2), at(terms, 6))
         if mass == ONE:
             return log_p
         return log_p - wp.log(mass)
@@ -85,7 +86,7 @@ def functions(flags):
     @wp.func
     def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
         if z <= expected and expected > ZERO:
-            return terms[3] + wp.log(short_factor(terms[4] * expected)) - wp.log(expected) - terms[4] * z
+            return at(terms, 3) + wp.log(short_factor(at(terms, 4) * expected)) - wp.log(expected) - at(terms, 4) * z
         return NEVER
 
     # short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
@@ -106,16 +107,16 @@ def functions(flags):
         p = real(0.0)
         if HIT:
             exponent = hit_exponent(z, expected, terms)
-            hit = terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
-            mass = hit_mass(expected, terms[2], terms[6])
+            hit = at(terms, 0) * wp.exp(-exponent.x) * (ONE - exponent.y)
+            mass = hit_mass(expected, at(terms, 2), at(terms, 6))
             if mass == ONE:
                 p += hit
             else:
                 p += hit / mass
         if SHORT:
             if z <= expected and expected > ZERO:
-                p += terms[3] * wp.exp(-terms[4] * z) * short_peak(terms[4], expected)
-        return wp.log(p + terms[5])
+                p += at(terms, 3) * wp.exp(-at(terms, 4) * z) * short_peak(at(terms, 4), expected)
+        return wp.log(p + at(terms, 5))
 
     # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
     @wp.func
@@ -130,7 +131,7 @@ def functions(flags):
             shorter = log_short(z, expected, terms)
             largest = wp.max(largest, shorter)
         if RAND:
-            largest = wp.max(largest, terms[5])
+            largest = wp.max(largest, at(terms, 5))
         if SINGLE:
             return largest
         else:
@@ -142,7 +143,7 @@ def functions(flags):
             if SHORT:
                 p += wp.exp(shorter - largest)
             if RAND:
-                p += wp.exp(terms[5] - largest)
+                p += wp.exp(at(terms, 5) - largest)
             return largest + wp.log(p)
 
     log_density = log_density_linear if "LINEAR" in flags else log_density_log

@@ -24,3 +24,48 @@ def precision(flags):
     if "FLOAT64" in flags:
         return SimpleNamespace(real=wp.float64, vec2=wp.vec2d, vec4=wp.vec4d)
     return SimpleNamespace(real=wp.float32, vec2=wp.vec2f, vec4=wp.vec4f)
+
+
+_C_TYPES = {wp.float32: "float", wp.float64: "double", wp.int32: "int", wp.uint16: "unsigned short"}
+
+
+@functools.cache
+def reader(dtype):
+    """A function of (array, i) that reads numbers or vectors which the kernel does not write; i must not be negative.
+
+    Arrays are contiguous and begin at multiples of 16 bytes. Warp's subscripts would add the length to a negative i,
+    multiply by a stride of 64 bits and load vectors number by number: ten instructions in place of two on GPUs. There
+    vectors are loaded whole; on processors they are not, whose compilers make no vectors of loops that load vectors.
+    """
+    length = getattr(dtype, "_length_", 1)
+    scalar = getattr(dtype, "_wp_scalar_type_", dtype)
+    one = _C_TYPES[scalar]
+    if length == 1:
+        loads, whole, single = [], "__ldg(values.data + i)", "values.data[i]"
+    else:
+        # The widest load is of 16 bytes.
+        width = min(length, 16 // wp.types.type_size_in_bytes(scalar))
+        loads = [
+            f"const {one}{width} part{k} = __ldg(reinterpret_cast<const {one}{width} *>(values.data + i) + {k});"
+            for k in range(length // width)
+        ]
+        numbers = ", ".join(f"part{k}.{name}" for k in range(length // width) for name in "xyzw"[:width])
+        whole = f"wp::vec_t<{length}, {one}>({numbers})"
+        numbers = ", ".join(f"values.data[i].c[{k}]" for k in range(length))
+        single = f"wp::vec_t<{length}, {one}>({numbers})"
+    lines = ["#if defined(__CUDA_ARCH__)", *loads, f"return {whole};", "#else", f"return {single};", "#endif", ""]
+
+    @wp.func_native("\n".join(lines))
+    def read(values: wp.array(dtype=dtype), i: wp.int32) -> dtype: ...
+
+    return read
+
+
+@functools.cache
+def writer(dtype):
+    """A function of (array, i, value) that writes a number, like ``reader``."""
+
+    @wp.func_native("values.data[i] = value;")
+    def write(values: wp.array(dtype=dtype), i: wp.int32, value: dtype): ...
+
+    return write

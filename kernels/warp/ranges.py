@@ -6,7 +6,7 @@ import warp as wp
 
 from . import bresenham, cddt, dda, lookup, march, raycast
 from . import ray as ray_file
-from .prelude import kernel, precision
+from .prelude import kernel, precision, reader, writer
 from .tiles import tile_place, tile_ray, tile_step
 
 CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
@@ -27,6 +27,7 @@ def make(name, flags):
     cast_ray = caster.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
     ORDERED = "ORDERED" in flags
+    cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
 
     # One work-item a particle and ray, fewer than 2^31 in a launch.
     @kernel
@@ -50,8 +51,19 @@ def make(name, flags):
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
-        t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance)
-        ranges[n * rays + k] = expected_range(t, limit, resolution, range_max)
+        t = cast_ray(
+            map_table,
+            rows,
+            cols,
+            cell_at(pose_cell, n),
+            pose_at(pose, n),
+            ray_at(ray, k),
+            limit,
+            bins,
+            slack,
+            tolerance,
+        )
+        put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
 
     # For GPUs, tiles of particles and rays.
     @kernel
@@ -81,12 +93,12 @@ def make(name, flags):
         n = place
         if ORDERED:
             n = order[place]
-        cell = pose_cell[n]
-        own = pose[n]
+        cell = cell_at(pose_cell, n)
+        own = pose_at(pose, n)
         k = tile_ray(item, spread)
         while k < rays:
-            t = cast_ray(map_table, rows, cols, cell, own, ray[k], limit, bins, slack, tolerance)
-            ranges[n * rays + k] = expected_range(t, limit, resolution, range_max)
+            t = cast_ray(map_table, rows, cols, cell, own, ray_at(ray, k), limit, bins, slack, tolerance)
+            put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
             k += tile_step(spread)
 
     return {"cast_ranges": cast_ranges, "cast_tiles": cast_tiles}[name]

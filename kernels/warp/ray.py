@@ -29,8 +29,12 @@ def functions(flags):
     C1, C3, C5, C7, C9 = (real(c) for c in (0.15913362, -0.05256880, 0.02867033, -0.01354934, 0.00331601))
     # Smallest direction component that is told from zero: its inverse must be finite.
     TINY = real(1e-30)
-    # 1.5 * 2^52 or 2^23: sums with it have no digits behind the point.
-    ROUNDING = real(6755399441055744.0 if "FLOAT64" in flags else 12582912.0)
+    # Counts k of boundaries are real numbers from COUNT on, where numbers are whole: what is added to COUNT is rounded
+    # to nearest, and the last bits are those of k and FIRST, so that a count is an index without a conversion.
+    FLOAT64 = "FLOAT64" in flags
+    COUNT = real(4503599627370496.0 if FLOAT64 else 8388608.0)
+    FIRST = wp.uint32(0 if FLOAT64 else 0x4B000000)
+    bits = wp.uint64 if FLOAT64 else wp.uint32
 
     # Direction of a ray in the grid's frame, of unit length: sign, size and inverse of each component, and the distance
     # in x and y to the first boundaries.
@@ -78,14 +82,28 @@ def functions(flags):
         r.a_y = wp.where(r.up, ONE - pose.y, pose.y)
         return r
 
-    # Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
-    # Counts are whole real numbers, which spares conversions: adding and taking off a large number rounds to nearest.
-    # Rounded, the place on the axis names the only boundary that can be in doubt.
+    # The last 32 bits of a count.
+    @wp.func
+    def as_bits(count: real):
+        return wp.uint32(wp.cast(count, bits))
+
+    # The count of so many boundaries more.
+    @wp.func
+    def farther(count: real, more: wp.uint32):
+        return wp.cast(wp.cast(count, bits) + bits(more), real)
+
+    # k of a count.
+    @wp.func
+    def whole(count: real):
+        return wp.int32(as_bits(count) - FIRST)
+
+    # Count of the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as
+    # well. Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
     @wp.func
     def crossed(t: real, speed: real, a: real, inv: real, until: wp.bool):
-        k = wp.max(((t * speed - a) + ROUNDING) - ROUNDING, ZERO)
-        here = (k + a) * inv
-        return wp.where(wp.where(until, here <= t, here < t), k + ONE, k)
+        count = wp.max((t * speed - a) + COUNT, COUNT)
+        here = ((count - COUNT) + a) * inv
+        return wp.where(here < t or (until and here == t), count + ONE, count)
 
     # The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a
     # ray from outside meets the grid no nearer.
@@ -103,10 +121,10 @@ def functions(flags):
                 if t >= ZERO and t < limit:
                     if enter_t_x > enter_t_y:
                         walk.k_x = enter_x
-                        walk.k_y = int(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
+                        walk.k_y = whole(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
                     else:
                         walk.k_y = enter_y
-                        walk.k_x = int(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
+                        walk.k_x = whole(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
                     if not off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols):
                         walk.t = t
         return walk
@@ -141,6 +159,11 @@ def functions(flags):
         off_grid=off_grid,
         ray_direction=ray_direction,
         make_ray=make_ray,
+        COUNT=COUNT,
+        FIRST=FIRST,
+        as_bits=as_bits,
+        farther=farther,
+        whole=whole,
         crossed=crossed,
         start_walk=start_walk,
         turn_of=turn_of,

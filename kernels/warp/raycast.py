@@ -11,7 +11,7 @@ import warp as wp
 
 from . import ray as ray_file
 from . import rectangles as rectangles_file
-from .prelude import precision
+from .prelude import precision, reader
 
 ENTRY = wp.uint16
 
@@ -23,14 +23,17 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
     make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
-    crossed = geometry.crossed
+    crossed, as_bits, farther = geometry.crossed, geometry.as_bits, geometry.farther
+    COUNT, FIRST = geometry.COUNT, geometry.FIRST
     padded = rectangles_file.functions(flags).padded
+    entry_at = reader(ENTRY)
+    OCCUPIED = wp.uint32(rectangles_file.OCCUPIED)
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     SECTORS_2 = "SECTORS_2" in flags
     SECTORS_4 = "SECTORS_4" in flags
     SECTORS = 4 if SECTORS_4 else 2 if SECTORS_2 else 1
-    ZERO, ONE = real(0.0), real(1.0)
+    ZERO, ABOVE_COUNT = real(0.0), real(float(COUNT) + 1.0)
     FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
 
     # Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
@@ -64,35 +67,34 @@ def functions(flags):
             if off_grid(cell.x, cell.y, rows, cols):
                 return ZERO
         start = start_walk(r, cell, rows, cols, limit)
-        k_x = real(start.k_x)
-        k_y = real(start.k_y)
-        t = real(start.t)
-        if t >= limit:
-            return limit
+        if ORIGINS_OUTSIDE:
+            if start.t >= limit:
+                return limit
         plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
-        origin = plane * (rows + 2) * (cols + 2) + padded(cell.y, cell.x, cols)
-        step_y = r.step_y * (cols + 2)
-        while True:
-            sides = int(map_table[origin + r.step_x * int(k_x) + step_y * int(k_y)])
-            if sides == 0:
-                if OUTSIDE_OCCUPIED:
-                    return t
-                else:
-                    col = cell.x + r.step_x * int(k_x)
-                    row = cell.y + r.step_y * int(k_y)
-                    return wp.where(off_grid(col, row, rows, cols), limit, t)
-            far_x = k_x + real((sides & 255) - 1)
-            far_y = k_y + real((sides >> 8) - 1)
-            t_x = (far_x + r.a_x) * r.inv_x
-            t_y = (far_y + r.a_y) * r.inv_y
+        step_x = wp.uint32(r.step_x)
+        step_y = wp.uint32(r.step_y * (cols + 2))
+        origin = wp.uint32(plane * (rows + 2) * (cols + 2) + padded(cell.y, cell.x, cols)) - (step_x + step_y) * FIRST
+        k_x = COUNT + real(start.k_x)
+        k_y = COUNT + real(start.k_y)
+        t = real(start.t)
+        sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
+        # A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
+        while sides > OCCUPIED and t < limit:
+            end_x = farther(k_x, sides & wp.uint32(255))
+            end_y = farther(k_y, sides >> wp.uint32(8))
+            t_x = ((end_x - ABOVE_COUNT) + r.a_x) * r.inv_x
+            t_y = ((end_y - ABOVE_COUNT) + r.a_y) * r.inv_y
             by_x = t_x <= t_y
             t = wp.where(by_x, t_x, t_y)
-            if t >= limit:
-                return limit
             speed = wp.where(by_x, r.speed_y, r.speed_x)
             a = wp.where(by_x, r.a_y, r.a_x)
             aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x)
-            k_x = wp.where(by_x, far_x + ONE, aside)
-            k_y = wp.where(by_x, aside, far_y + ONE)
+            k_x = wp.where(by_x, end_x, aside)
+            k_y = wp.where(by_x, aside, end_y)
+            sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
+        if OUTSIDE_OCCUPIED:
+            return wp.min(t, limit)
+        else:
+            return wp.where(t < limit and sides == OCCUPIED, t, limit)
 
     return SimpleNamespace(cast_ray=cast_ray)

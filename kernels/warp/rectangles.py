@@ -20,6 +20,8 @@ from .bits import cells_left, cells_right
 from .prelude import kernel
 
 LONGEST = wp.constant(255)
+# Of a cell that is no rectangle's; the ring has 0.
+OCCUPIED = wp.constant(1)
 # Cells from a changed cell to the farthest one whose rectangle holds it.
 RECTANGLE_REACH = wp.constant(254)
 # Room for the columns that may bound a rectangle.
@@ -146,7 +148,7 @@ def rectangles_rows(
                 lower = int(0)
                 if width < LONGEST and other >= 0 and other < cols:
                     lower = wp.min(height, int(runs[run + other]))
-                found = wp.where(width > 0, width + 256 * height, 0)
+                found = wp.where(width > 0, width + 256 * height, OCCUPIED)
                 if lower * middle[1] > width * middle[0]:
                     found = width + 1 + 256 * lower
                 rectangles[out + padded(row, col, cols)] = wp.uint16(found)
@@ -222,7 +224,7 @@ def rectangles_scan(
         if height <= room:
             narrower = wp.min(width, int(runs[run + (height - 1) * step]))
         while sector < sectors and narrower * middle[0] < height * middle[1]:
-            found = wp.where(height > 1, width + 256 * (height - 1), 0)
+            found = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
             if narrower * middle[0] > (height - 1) * middle[1]:
                 found = narrower + 256 * height
             rectangles[out + sector * plane] = wp.uint16(found)

@@ -1,0 +1,38 @@
+"""The numbers of a mixture as kernels get them: which domain they are summed in, and how they are rounded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+# Above this peak [1/m] an exponent's rounding errors could show beside a log density near 0.
+HIGH_PEAK = 64.0
+# A density that takes part in a linear sum must dwarf what underflow takes from the others, denormals or not.
+_SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
+
+
+def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
+    """Whether the uniform density is large enough, beside the peak of the others, to sum densities."""
+    return rand >= _SMALLEST_DENSITY[real] * max(peak, 1.0)
+
+
+def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
+    """The numbers of a mixture in a model's precision, then what rounding took from the first two of them.
+
+    Raises:
+        ValueError: sigma_hit or lambda_short is beyond what the precision can hold.
+    """
+    with np.errstate(over="ignore"):
+        rounded = np.array(terms).astype(real)
+    # Logarithms of weights of 0 are -inf; nothing else may be infinite.
+    if np.isposinf(rounded).any() or rounded[1] < np.finfo(real).tiny:
+        raise ValueError(f"parameters: sigma_hit and lambda_short must fit {real.name}, got terms {terms}")
+    with np.errstate(invalid="ignore"):
+        low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
+    return np.append(rounded, low.astype(real))
+
+
+def log_weight(weight: float) -> float:
+    """Logarithm of a mixture weight; -inf for 0."""
+    return math.log(weight) if weight > 0 else -math.inf

@@ -249,11 +249,14 @@ class _DeviceCall(BoundCall):
         """Make the table where there is none, and keep the launches of a call; nothing is started."""
         model, scene, cloud = self._model, self._scene, self._cloud
         with model._lock:
-            # Kept, since another call of the model may need another table.
+            # Kept, since another call of the model may need another table; the last one first makes room.
+            self._table = None
             self._table, region, _ = cloud.ensure(scene.map, 0, cloud.count)
             score = model._bound_scorer(self._table, region)
             self._version = scene.map.version
             self._replay = cast(Repeating, self._backend).record(lambda: self._start(score, region))
+        # Other streams may come first to what was made just now.
+        self._backend.synchronize()
 
     def _start(self, score: Scorer, region: Region) -> None:
         """All launches of a call."""

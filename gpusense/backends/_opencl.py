@@ -243,6 +243,7 @@ class OpenCLBackend(ProcessBound):
     def gather(self) -> None:
         """See Gathering.gather."""
         if self._gathers:
+            self.check_process()
             with _driver_errors():
                 staging = self._stagings.begin()
             if not staging.settled:

@@ -21,15 +21,13 @@ _LARGEST = 256 << 10
 _MOST_PARTS = 1024
 
 
-class Locked:
-    """Page-locked memory of the host, as long as this object lives."""
-
-    def __init__(self, context: cl.Context, queue: cl.CommandQueue) -> None:
-        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
-        self._buffer = cl.Buffer(context, flags, _MEMORY)
-        both: Any = cl.map_flags.READ | cl.map_flags.WRITE
-        found: Any = cl.enqueue_map_buffer(queue, self._buffer, both, 0, (_MEMORY,), np.dtype(np.uint8))
-        self.bytes: np.ndarray = found[0]
+def locked(context: cl.Context, queue: cl.CommandQueue) -> np.ndarray:
+    """Page-locked memory of the host, for as long as the array lives."""
+    buffer = cl.Buffer(context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, _MEMORY)
+    both: Any = cl.map_flags.READ | cl.map_flags.WRITE
+    found: Any = cl.enqueue_map_buffer(queue, buffer, both, 0, (_MEMORY,), np.dtype(np.uint8))
+    array: np.ndarray = found[0]
+    return array
 
 
 class Staging:
@@ -37,10 +35,8 @@ class Staging:
 
     def __init__(self, context: cl.Context, queue: cl.CommandQueue, alignment: int) -> None:
         self._queue, self._alignment = queue, max(alignment, 256)
-        self._there, self._up, self._down = (
-            cl.Buffer(context, cl.mem_flags.READ_WRITE, _MEMORY), Locked(context, queue).bytes,
-            Locked(context, queue).bytes,
-        )  # fmt: skip
+        self._there = cl.Buffer(context, cl.mem_flags.READ_WRITE, _MEMORY)
+        self._up, self._down = locked(context, queue), locked(context, queue)
         self._parts: dict[tuple[int, int], cl.Buffer] = {}
         self.begin()
 

@@ -99,9 +99,9 @@ class Bench:
         def calls() -> list[Any]:
             return [model.log_likelihood(poses[i], scan) for i, scan in enumerate(ranges)]
 
-        self.add(what, [with_limit(ALWAYS, one_call), with_limit(NEVER, one_call), calls], self.arguments.seconds)
-        rays = poses.shape[1] * ranges.shape[1]
-        self.rows[-1]["shared"] = rays <= TOGETHER[self.device.info.kind]
+        ways = [with_limit(ALWAYS, one_call), with_limit(NEVER, one_call), calls]
+        shared = poses.shape[1] * ranges.shape[1] <= TOGETHER[self.device.info.kind]
+        self.add(what, ways, self.arguments.seconds, shared=shared)
 
     def models(self, what: str, models: list[Any], poses: np.ndarray, ranges: np.ndarray, seconds: float) -> None:
         """A row of several models, whose launches are queued one after the other."""
@@ -114,7 +114,7 @@ class Bench:
 
         self.add(what, [one_call, calls], seconds)
 
-    def add(self, what: str, ways: list[Callable[[], Any]], seconds: float) -> None:
+    def add(self, what: str, ways: list[Callable[[], Any]], seconds: float, *, shared: bool = False) -> None:
         """A row of two or three ways, of which the last are calls one by one."""
         bits = [bits_of(way()) for way in ways]
         differing = sum(
@@ -123,7 +123,7 @@ class Bench:
         times = in_turns(ways, seconds)
         names = WAYS if len(ways) == 3 else WAYS[1:]
         row = {
-            "backend": self.device.info.selection, "device": self.device.info.name, "what": what, "shared": False,
+            "backend": self.device.info.selection, "device": self.device.info.name, "what": what, "shared": shared,
             "differing_bits": differing, **{f"{name}_s": t for name, t in zip(names, times, strict=True)},
         }  # fmt: skip
         self.rows.append(row)

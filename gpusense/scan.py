@@ -31,6 +31,13 @@ class Batch:
     counts: np.ndarray
     constants: np.ndarray
 
+    @property
+    def start_readings(self) -> np.ndarray:
+        """(S + 1,) int32; readings of scan s are start_readings[s] to start_readings[s + 1] - 1."""
+        start = np.zeros(len(self.counts) + 1, np.int32)
+        np.cumsum(self.counts, out=start[1:])
+        return start
+
 
 @dataclass(frozen=True)
 class PreparedScan:

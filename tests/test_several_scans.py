@@ -76,6 +76,7 @@ MODELS: dict[str, tuple[Any, bool]] = {
     "field, float64": (field(precision="float64"), True),
     "field, 11 beams": (field(beams=11), False),
     "field, smooth": (field(parameters=gs.LikelihoodFieldParameters(interpolation="bilinear")), False),
+    "field, repeated bearings": (field(REPEATED), False),
     "field, nothing left out": (field(REPEATED, specialize=False), False),
     "field, impossible places": (field(parameters=ATOMS), False),
     "field, amcl": (field(compat="amcl"), False),

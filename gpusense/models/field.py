@@ -219,7 +219,7 @@ class LikelihoodFieldModel(ScanModel):
         else:
             *given, fixed_of = space.upload_all("points", [*numbers, self._fixed_of(batch)])
             of_blocks = -(-batch.counts // BLOCK_TERMS)
-            start, counts = space.upload_all("scans", (batch.start, of_blocks.astype(np.int32)))
+            start, counts = space.upload_all("scans", (batch.start_readings, of_blocks.astype(np.int32)))
         point, point_low, guards = given if len(given) == 3 else (*given, None)
         scans = 1 if batch is None else len(batch.counts)
 

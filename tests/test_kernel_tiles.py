@@ -197,7 +197,7 @@ def test_blocks_of_beams(names: tuple[str, ...], name: str, real: type, grouped:
     flags = scene_flags(real, "ORIGINS_OUTSIDE", *flags, *names)
     for count, rays, spread in itertools.product(COUNTS, (1, 15, 16, 17, 53), SPREADS):
         (cell, pose), ray = poses(count, real), rays_of(rays, real)
-        reading, order = scan(np.linspace(0, RANGE, rays), real, all_readings=False), an_order(count)
+        reading, order = scan(np.linspace(0, RANGE, rays), real), an_order(count)
         world = (cell, pose, order, ray, reading, terms, nothing(real), nothing(real))
         blocks = -(-rays // BLOCK_TERMS)
         way = WAYS[(count + rays + spread) % len(WAYS)]

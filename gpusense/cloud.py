@@ -16,7 +16,6 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.frames import Cells, Mount, frame_scalars, place_poses
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
-from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.heading import LIMIT
 from gpusense.reference.order import ALL_BINS, STRETCH
 from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
@@ -245,13 +244,6 @@ def spread_of(items: int, groups: int) -> int:
     while items << spread < _ENOUGH and 1 << spread < groups:
         spread += 1
     return spread
-
-
-def blocks_of(count: int, readings: int) -> tuple[int, int]:
-    """Work-items of a launch in tiles of particles and blocks of readings, and its spread."""
-    tiles = -(-count // TILE_PARTICLES)
-    spread = spread_of(tiles * TILE, -(-readings // BLOCK_TERMS))
-    return (tiles << spread) * TILE, spread
 
 
 def tiles_of(count: int, rays: int) -> tuple[int, int]:

@@ -249,12 +249,6 @@ KERNELS: dict[str, Kernel] = {
         "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "int across", "int along",
         "int spread", "int per_scan",
     ),
-    "beam_blocks": _kernel(
-        "beam", "item", *_CAST, *_NORMALS, *_POSES, "int order [particles]", _CONES, "real reading [rays]", *_TERMS,
-        "real sensor [(cells + 1) * (cells + 1)]", "out real parts [particles * ((rays + 15) // 16)]", *_MAP,
-        "int particles", "int rays", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "int across",
-        "int along", "int spread",
-    ),
     "cast_echoes": _kernel(
         "echo", "ray particle", *_CAST, *_NORMALS, *_POSES, _CONES, "out real ranges [particles * rays]",
         "out real incidence [particles * rays]", *_MAP, "int particles", "int rays", *_CONE, *_CASTER, *_RANGE,

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import BACKENDS
 from kernel_scenes import (
     EXACT,
     GRIDS,
@@ -182,33 +180,6 @@ def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: t
     assert name in MIXTURES
     found, expected = beam_tiles(device, name, real, 777, 53, 2, "particles", names)
     assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, real))
-
-
-@pytest.fixture(params=[name for name in BACKENDS if name == "opencl" or "cuda" in name])
-def grouped(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backend:
-    """Each device whose work-items have groups."""
-    return get_backend(needs(request.param))
-
-
-@pytest.mark.parametrize(("name", "real"), [("book", np.float32), ("hit", np.float32), ("short", np.float64)])
-@pytest.mark.parametrize("names", [(), ("ORDERED",)])
-def test_blocks_of_beams(names: tuple[str, ...], name: str, real: type, grouped: Backend) -> None:
-    flags, terms = mixture(name, real, z_max=0.05)
-    flags = scene_flags(real, "ORIGINS_OUTSIDE", *flags, *names)
-    for count, rays, spread in itertools.product(COUNTS, (1, 15, 16, 17, 53), SPREADS):
-        (cell, pose), ray = poses(count, real), rays_of(rays, real)
-        reading, order = scan(np.linspace(0, RANGE, rays), real), an_order(count)
-        world = (cell, pose, order, ray, reading, terms, nothing(real), nothing(real))
-        blocks = -(-rays // BLOCK_TERMS)
-        way = WAYS[(count + rays + spread) % len(WAYS)]
-        expected, found = on_both(
-            grouped, "beam_blocks", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), *world,
-            room_for(count, blocks, way, real), *OCCUPIED.shape, count, rays, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION,
-            RANGE, *strides(count, blocks, way), spread,
-        )  # fmt: skip
-        assert np.count_nonzero(found["parts"] == -77) == np.count_nonzero(expected["parts"] == -77)
-        here, there = (parts_at(one["parts"], count, blocks, way) for one in (found, expected))
-        assert_near(here, there.astype(np.float64), 2 * BLOCK_TERMS * per_beam(there, real))
 
 
 # ---- sums

@@ -100,22 +100,6 @@ def test_models(kind, ordered, as_gpu, backend):
             )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["all over", "inside"])
-def test_groups_add_blocks_of_readings(kind, as_gpu, monkeypatch):
-    """Where there are many particles and every beam has a ray of its own."""
-    monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
-    grid, scanner, z = world()
-    scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, mount=scanner.mount)
-    device, asked = as_gpu(), []
-    compiled = device.compile
-    monkeypatch.setattr(device, "compile", lambda name, flags: (asked.append(name), compiled(name, flags))[1])
-    for parameters in BEAM.values():
-        same_as_one_by_one(
-            lambda device, p=parameters: gs.BeamModel(grid, scanner, p, backend=device), as_gpu, poses_of(kind), z
-        )
-    assert ("beam_blocks" in asked) == device.info.groups and ("beam_tiles" in asked) != device.info.groups
-
-
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
 @pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_weights_of_other_programs(model, compat, ordered, as_gpu):

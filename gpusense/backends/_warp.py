@@ -53,7 +53,6 @@ def _describe(device: wp.Device) -> BackendInfo:
         memory=memory,
         max_buffer=memory,
         float64=True,
-        groups=device.is_cuda,
     )
 
 

@@ -29,7 +29,6 @@ class BackendInfo:
         memory: Bytes of device memory.
         max_buffer: Bytes of the largest buffer.
         float64: Whether float64 kernels exist on it.
-        groups: Whether work-items of a group can pass numbers on to each other.
         lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
     """
 
@@ -41,7 +40,6 @@ class BackendInfo:
     memory: int
     max_buffer: int
     float64: bool
-    groups: bool = True
     lanes: int = 1
 
 

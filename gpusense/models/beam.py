@@ -15,7 +15,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
-from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, blocks_of, ordered, tiles_of
+from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, tiles_of
 from gpusense.cones import bins_of, cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
@@ -403,29 +403,18 @@ class BeamModel(ScanModel):
             world += (self.scanner.range_max,)
             if gpu:
                 order = ordered(backend, space, placed, count, rays, real)
-                # Many particles fill a device even where groups take whole blocks of readings.
-                blocks = order is not None and not shared and batch is None and backend.info.groups
                 flags |= {"ORDERED"} if order is not None else set()
-                code = self._last_code = frozenset(flags)
+                self._last_code = frozenset(flags)
                 order = self._none if order is None else order
-                inputs = (table, normals, placed.cell, placed.pose, order, ray)
-                numbers, block = (-(-readings // BLOCK_TERMS), 1) if blocks else (readings, BLOCK_TERMS)
-                parts = space.empty("parts", count * numbers, real)
-                if blocks:
-                    items, spread = blocks_of(count, rays)
-                    backend.compile("beam_blocks", code)(
-                        (items,), *inputs, reading, self._terms_there, self._edges, self._sensor, parts, *world[:4],
-                        *world[5:], 1, count, spread,
-                    )  # fmt: skip
-                else:
-                    items, spread = tiles_of(count, rays)
-                    backend.compile("beam_tiles", code)(
-                        (items,), *inputs, first, reading, self._terms_there, self._edges, self._sensor, start, parts,
-                        *world, 1, count, spread, per_scan,
-                    )  # fmt: skip
-                backend.compile("sum_parts", code)(
-                    (count,), parts, order, counts, fixed_of, result, count, numbers, block, 1, count, *scalars,
-                    per_scan,
+                parts = space.empty("parts", count * readings, real)
+                tiles, spread = tiles_of(count, rays)
+                backend.compile("beam_tiles", self._last_code)(
+                    (tiles,), table, normals, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
+                    self._edges, self._sensor, start, parts, *world, 1, count, spread, per_scan,
+                )  # fmt: skip
+                backend.compile("sum_parts", self._last_code)(
+                    (count,), parts, order, counts, fixed_of, result, count, readings, BLOCK_TERMS, 1, count,
+                    *scalars, per_scan,
                 )  # fmt: skip
                 space.keep()
                 return parts

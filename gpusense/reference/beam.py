@@ -174,54 +174,6 @@ def readings_of_scan(
     return begin, rays, own - own[0], reading[own[0] :]
 
 
-def beam_blocks(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    order: np.ndarray,
-    ray: np.ndarray,
-    reading: np.ndarray,
-    terms: np.ndarray,
-    edges: np.ndarray,
-    sensor: np.ndarray,
-    parts: np.ndarray,
-    rows: int,
-    cols: int,
-    particles: int,
-    rays: int,
-    kinds: int,
-    cone_rays: int,
-    critical: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
-    cells: int,
-    per_metre: np.floating,
-    limit: np.floating,
-    resolution: np.floating,
-    range_max: np.floating,
-    across: int,
-    along: int,
-    spread: int,
-) -> None:
-    """Sums of BLOCK_TERMS readings, at parts[place * across + block * along], where every ray has one reading."""
-    first, each = np.arange(rays + 1, dtype=np.int32), np.empty(particles * rays, pose.dtype)
-    beam_tiles(
-        flags, map_table, normals, pose_cell, pose, order, ray, first, reading, terms, edges, sensor, first, each, rows,
-        cols, particles, rays, rays, kinds, cone_rays, critical, bins, slack, tolerance, cells, per_metre, limit,
-        resolution, range_max, rays, 1, spread, 1,
-    )  # fmt: skip
-    blocks = -(-rays // BLOCK_TERMS)
-    padded = np.zeros((particles, blocks * BLOCK_TERMS), pose.dtype)
-    padded[:, :rays] = each.reshape(particles, rays)
-    total = np.zeros((particles, blocks), pose.dtype)
-    for k in range(BLOCK_TERMS):
-        total += padded[:, k::BLOCK_TERMS]
-    parts[np.arange(particles)[:, None] * across + np.arange(blocks) * along] = total
-
-
 def sum_terms(flags: frozenset[str], term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:
     """Sum of (M, K) terms and a fixed one, in the order of the beams, or its logarithm; -inf where one term is.
 

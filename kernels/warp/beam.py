@@ -11,14 +11,14 @@ import warp as wp
 from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
 from .error_free import BLOCK_TERMS
-from .prelude import GET, MEET, PUT, group_memory, kernel, precision, reader, writer
+from .prelude import kernel, precision, reader, writer
 from .ranges import caster_of
-from .tiles import TILE, TILE_PARTICLES, TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
+from .tiles import tile_place, tile_ray, tile_step
 
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_beams, beam_tiles or beam_blocks specialised by the flags."""
+    """The kernel score_beams or beam_tiles specialised by the flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
@@ -43,7 +43,6 @@ def make(name, flags):
     incidence_terms = echo.functions(flags).incidence_terms
     cell_at, pose_at, ray_at = reader(wp.vec2i), reader(vec4), reader(vec2)
     number_at, put = reader(real), writer(real)
-    added = group_memory(real, int(BLOCK_TERMS) * int(TILE_PARTICLES))
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
@@ -264,83 +263,4 @@ def make(name, flags):
                 k += 1
             r += tile_step(spread)
 
-    # The same where every ray has one reading and there is one scan: a group's work-items pass what readings add on to
-    # each other and add them up in blocks of BLOCK_TERMS, as other kernels do. A block's sum is at
-    # parts[place * across + block * along].
-    @kernel
-    def beam_blocks(
-        map_table: wp.array(dtype=ENTRY),
-        normals: wp.array(dtype=vec2),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        order: wp.array(dtype=wp.int32),
-        ray: wp.array(dtype=vec2),
-        reading: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        edges: wp.array(dtype=real),
-        sensor: wp.array(dtype=real),
-        parts: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
-        particles: wp.int32,
-        rays: wp.int32,
-        kinds: wp.int32,
-        cone_rays: wp.int32,
-        critical: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
-        cells: wp.int32,
-        per_metre: real,
-        limit: real,
-        resolution: real,
-        range_max: real,
-        across: wp.int32,
-        along: wp.int32,
-        spread: wp.int32,
-    ):
-        item = wp.tid()
-        own = item % TILE
-        place = tile_place(item, spread)
-        first = tile_place(item - own, spread)
-        last = particles - 1
-        # Work-items without a particle keep the others company, since all of a group must meet.
-        n = wp.min(place, last)
-        if ORDERED:
-            n = order[n]
-        cell = cell_at(pose_cell, n)
-        from_pose = pose_at(pose, n)
-        block = tile_group(item, spread)
-        while block * BLOCK_TERMS < rays:
-            i = own % TILE_RAYS
-            while i < BLOCK_TERMS:
-                r = block * BLOCK_TERMS + i
-                term = ZERO
-                if r < rays and place <= last:
-                    kind = terms
-                    if ECHO:
-                        heard = nearest_echo(
-                            map_table, normals, rows, cols, cell, from_pose, ray, r * cone_rays, cone_rays, critical,
-                            limit, bins, slack, tolerance,
-                        )  # fmt: skip
-                        t = heard.t
-                        if INCIDENCE:
-                            kind = incidence_terms(terms, edges, kinds, heard.cosine)
-                    else:
-                        to = ray_at(ray, r)
-                        t = cast_ray(map_table, rows, cols, cell, from_pose, to, limit, bins, slack, tolerance)
-                    expected = expected_range(t, limit, resolution, range_max)
-                    z = number_at(reading, r)
-                    term = reading_term(z, expected, kind, sensor, cells, per_metre, range_max)
-                added(PUT, i * TILE_PARTICLES + own // TILE_RAYS, term)
-                i += TILE_RAYS
-            added(MEET, 0, ZERO)
-            if own < TILE_PARTICLES and first + own <= last:
-                total = real(0.0)
-                for k in range(BLOCK_TERMS):
-                    total += added(GET, k * TILE_PARTICLES + own, ZERO)
-                put(parts, (first + own) * across + block * along, total)
-            added(MEET, 0, ZERO)
-            block += 1 << spread
-
-    return {"score_beams": score_beams, "beam_tiles": beam_tiles, "beam_blocks": beam_blocks}[name]
+    return {"score_beams": score_beams, "beam_tiles": beam_tiles}[name]

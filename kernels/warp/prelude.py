@@ -69,30 +69,3 @@ def writer(dtype):
     def write(values: wp.array(dtype=dtype), i: wp.int32, value: dtype): ...
 
     return write
-
-
-# What a work-item does with its group's memory.
-PUT, MEET, GET = wp.constant(0), wp.constant(1), wp.constant(2)
-
-
-@functools.cache
-def group_memory(dtype, size):
-    """A function of (PUT, i, value), (MEET, 0, value) or (GET, i, value) on numbers that a group's work-items share.
-
-    All of a group must come to MEET, after which each sees what the others had put before. CUDA has groups, processors
-    have none.
-    """
-    lines = [
-        "#if defined(__CUDA_ARCH__)",
-        f"__shared__ {_C_TYPES[dtype]} numbers[{size}];",
-        f"if (what == {PUT}) numbers[i] = value;",
-        f"if (what == {MEET}) __syncthreads();",
-        f"if (what == {GET}) return numbers[i];",
-        "#endif",
-        "return value;",
-    ]
-
-    @wp.func_native("\n".join(lines))
-    def exchange(what: wp.int32, i: wp.int32, value: dtype) -> dtype: ...
-
-    return exchange

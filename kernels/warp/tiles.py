@@ -10,12 +10,6 @@ TILE_PARTICLES = wp.constant(16)
 TILE = wp.constant(64)
 
 
-# Which of a tile's groups a work-item belongs to.
-@wp.func
-def tile_group(item: wp.int32, spread: wp.int32):
-    return (item // TILE) & ((1 << spread) - 1)
-
-
 # Place in the order of a work-item's particle, its first ray, and how many rays farther the next one is.
 @wp.func
 def tile_place(item: wp.int32, spread: wp.int32):
@@ -24,7 +18,7 @@ def tile_place(item: wp.int32, spread: wp.int32):
 
 @wp.func
 def tile_ray(item: wp.int32, spread: wp.int32):
-    return tile_group(item, spread) * TILE_RAYS + item % TILE_RAYS
+    return ((item // TILE) & ((1 << spread) - 1)) * TILE_RAYS + item % TILE_RAYS
 
 
 @wp.func

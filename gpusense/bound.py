@@ -180,9 +180,11 @@ class _DeviceCall(BoundCall):
         self._given = (poses, ranges, found, self.out)
         # Buffers of its own: other calls of the model may come between.
         self._space = Workspace(backend)
-        self._none, self._no_terms = backend.upload(np.zeros(1, _INT)), backend.upload(np.zeros(1, real))
+        self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
-        self._scan, self._place, self._fixed_rows = self._placing_of(found)
+        self._scan, self._place, self._fixed = self._placing_of(found)
+        numbers = -(-self._scan.places // BLOCK_TERMS) if model._end_points else self._scan.places
+        self._counts = backend.upload(np.array([numbers], _INT))
         self._record()
 
     def __call__(self, stream: Any = None) -> Any:
@@ -199,8 +201,8 @@ class _DeviceCall(BoundCall):
         self._replay.wait()
         finish(self._space, on_device=True)
 
-    def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Callable[[], None], int]:
-        """Where readings are placed, what starts that, and rows of parts for what those without a place add."""
+    def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Callable[[], None], bool]:
+        """Where readings are placed, what starts that, and whether those without a place add something."""
         model, backend, real, space = self._model, self._backend, self._real, self._space
         z_max, scanner, end_points = model._z_max, model.scanner, model._end_points
         beams = np.arange(scanner.count)
@@ -242,8 +244,7 @@ class _DeviceCall(BoundCall):
         def place() -> None:
             backend.compile("place_readings", frozenset(flags))((max(blocks, 1),), *arguments)
 
-        rows = 1 if end_points else BLOCK_TERMS
-        return scan, place, rows if kind == MAX_FIXED or not possible else 0
+        return scan, place, kind == MAX_FIXED or not possible
 
     def _record(self) -> None:
         """Make the table where there is none, and keep the launches of a call; nothing is started."""
@@ -263,7 +264,9 @@ class _DeviceCall(BoundCall):
         model, scan, backend, space, cloud = self._model, self._scan, self._backend, self._space, self._cloud
         flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
         each, block = (-(-scan.places // BLOCK_TERMS), 1) if model._end_points else (scan.places, BLOCK_TERMS)
-        fixed, chunk = self._fixed_rows, model._bound_chunk(scan.places)
+        # One of several scans has a fixed term on the device.
+        flags |= {"SCANS"} if self._fixed else set()
+        counts, chunk = self._counts, model._bound_chunk(scan.places)
         frame = (region, model.grid, model.scanner.mount)
         self._place()
         for begin in range(0, cloud.count, chunk):
@@ -271,12 +274,10 @@ class _DeviceCall(BoundCall):
             count = part[1] - begin
             given = cloud.given(backend, space, part)
             placed = cloud.place(backend, space, given, part, frame, self._real, careful=self._scene.careful)
-            parts = space.empty("parts", count * (fixed + each), self._real)
-            if fixed:
-                backend.compile("fill_fixed", flags)((count,), scan.fixed, parts, count, fixed)
+            parts = space.empty("parts", count * each, self._real)
             if each:
-                score(placed, cloud.headings(), count, scan, backend.part(parts, count * fixed, count * each))
+                score(placed, cloud.headings(), count, scan, parts)
             backend.compile("sum_parts", flags)(
-                (count,), parts, self._none, self._none, self._no_terms, backend.part(self._result, begin, count),
-                count, fixed + each, block, 1, count, 0.0, model.temperature, count,
+                (count,), parts, self._none, counts, scan.fixed, backend.part(self._result, begin, count), count, each,
+                block, 1, count, 0.0, model.temperature, count,
             )  # fmt: skip

@@ -236,12 +236,14 @@ def ordered(backend: Backend, space: Workspace, placed: Placed, count: int, rays
 
 # Work-items that fill any device, and the tiles of the kernel file ``tiles``.
 _ENOUGH = 1 << 21
+# The same for the likelihood field, whose work-items are short, so that their beginnings count.
+ENOUGH_SHORT = 1 << 19
 
 
-def spread_of(items: int, groups: int) -> int:
+def spread_of(items: int, groups: int, enough: int = _ENOUGH) -> int:
     """By how many powers of two to split the work of some work-items, each with so many groups of readings or rays."""
     spread = 0
-    while items << spread < _ENOUGH and 1 << spread < groups:
+    while items << spread < enough and 1 << spread < groups:
         spread += 1
     return spread
 

@@ -225,9 +225,6 @@ KERNELS: dict[str, Kernel] = {
         "int max_readings", "int possible", "double nearest", "double farthest", "double log_max", "double resolution",
         "double top", "double guard_scale",
     ),
-    "fill_fixed": _kernel(
-        "scan", "particle", "real fixed [1]", "out real parts [particles * rows]", "int particles", "int rows",
-    ),
     "cast_ranges": _kernel(
         "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,
         "int particles", "int rays", *_CASTER, *_RANGE, wide=True,

@@ -208,12 +208,14 @@ def test_without_graphs_launches_are_started_one_by_one(gathering, monkeypatch):
 
 def test_only_launches_are_recorded(gathering):
     device, _ = gathering
-    buffer = device.empty(4, np.dtype(np.float32))
+    buffer, whole = device.empty(4, np.dtype(np.float32)), device.empty(4, np.dtype(np.int32))
     for wait in (True, False):
         with pytest.raises(RuntimeError, match="only launches can be recorded"):
             device.record(
                 lambda wait=wait: (
-                    device.compile("fill_fixed", frozenset())((1,), buffer, buffer, 1, 1),
+                    device.compile("sum_parts", frozenset())(
+                        (1,), buffer, whole, whole, buffer, buffer, 1, 1, 1, 1, 1, 0.0, 1.0, 1
+                    ),
                     device.upload(np.ones(4, np.float32), buffer, wait=wait),
                 )
             )

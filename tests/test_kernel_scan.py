@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS, on_both, run, scene_flags
+from kernel_scenes import on_both, scene_flags
 
 import gpusense as gs
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend
 from gpusense.frames import ray_vectors, split
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED, is_chosen
@@ -122,13 +122,3 @@ def test_an_even_choice_is_that_of_the_host() -> None:
         kinds = np.full(informative, Reading.HIT)
         expected = choose_beams(kinds, chosen, True)
         assert (is_chosen(np.arange(informative), informative, chosen) == expected).all()
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_what_is_fixed_is_a_row_of_parts(precision: type, device: Backend) -> None:
-    fixed = np.array([-3.5], precision)
-    for one, rows in itertools.product((get_backend("numpy"), device), (1, 16)):
-        parts = np.full(100 * 18, 77, precision)
-        found = run(one, "fill_fixed", scene_flags(precision), (100,), fixed, parts, 100, rows)["parts"]
-        assert (found[:100] == -3.5).all() and (found[100 * rows :] == 77).all()
-        assert (found[100 : 100 * rows] == 0).all()

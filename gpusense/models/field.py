@@ -12,7 +12,7 @@ from gpusense import compat as compat_module
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
-from gpusense.cloud import Cloud, Placed, all_within, spread_of
+from gpusense.cloud import ENOUGH_SHORT, Cloud, Placed, all_within, spread_of
 from gpusense.frames import split
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
@@ -247,7 +247,7 @@ class LikelihoodFieldModel(ScanModel):
             given = (table, placed.cell, placed.pose, placed.low, point, point_low, self._terms_there)
             if gpu:
                 parts = space.empty("parts", count * blocks, real)
-                spread = spread_of(count, blocks)
+                spread = spread_of(count, blocks, ENOUGH_SHORT)
                 backend.compile("field_blocks", flags)(
                     ((-(-count // _GROUP) << spread) * _GROUP,), *given, guards, start, parts, region.rows,
                     region.cols, count, readings, 1, count, spread, per_scan,
@@ -293,7 +293,7 @@ class LikelihoodFieldModel(ScanModel):
         blocks = self._backend.compile("field_blocks", self._flags | {"ALL_READINGS"})
 
         def score(placed: Placed, headings: frozenset[str], count: int, scan: PlacedScan, parts: Buffer) -> None:
-            spread = spread_of(count, -(-scan.places // BLOCK_TERMS))
+            spread = spread_of(count, -(-scan.places // BLOCK_TERMS), ENOUGH_SHORT)
             blocks(
                 ((-(-count // _GROUP) << spread) * _GROUP,), table, placed.cell, placed.pose, placed.low, scan.point,
                 scan.low, self._terms_there, scan.guard, self._none, parts, region.rows, region.cols, count,

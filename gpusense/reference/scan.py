@@ -85,9 +85,3 @@ def place_readings(
     fixed[0] = np.count_nonzero(used & far) * log_max if max_readings == MAX_FIXED else 0.0
     if not possible and (used & hit).any():
         fixed[0] = -np.inf
-
-
-def fill_fixed(flags: frozenset[str], fixed: np.ndarray, parts: np.ndarray, particles: int, rows: int) -> None:
-    """What is fixed as the first of so many rows of parts, one of which is a number a particle; 0 in the others."""
-    first = parts[: rows * particles].reshape(rows, particles)
-    first[0], first[1:] = fixed[0], 0

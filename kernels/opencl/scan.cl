@@ -102,12 +102,3 @@ kernel void place_readings(global const coordinate *ranges, global const int *be
         if (impossible > 0) fixed[0] = -INFINITY;
     }
 }
-
-// One work-item a particle: what is fixed as the first of so many rows of parts, one of which is a number a particle; 0
-// in the others.
-kernel void fill_fixed(global const real *fixed, global real *parts, const int particles, const int rows) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-    parts[n] = fixed[0];
-    for (int row = 1; row < rows; ++row) parts[(long)row * particles + n] = 0;
-}

@@ -6,6 +6,7 @@ are such constants too, negative ones of their own: some versions of Warp lose t
 """
 
 import functools
+import inspect
 from types import SimpleNamespace
 
 import warp as wp
@@ -14,8 +15,11 @@ import warp as wp
 # compilers as a ban on fused multiply-add) and division correctly, which CUDA does unless fast_math is on.
 OPTIONS = {"fuse_fp": False, "fast_math": False, "enable_backward": False}
 
+# Every launch has a thread for each work-item, so none need look for another one; older Warp always lets them.
+_ONE_EACH = {"grid_stride": False} if "grid_stride" in inspect.signature(wp.kernel).parameters else {}
+
 # A decorator: the kernel and the functions that it calls become a module of their own, named by their contents.
-kernel = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+kernel = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
 
 
 @functools.cache

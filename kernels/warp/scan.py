@@ -162,22 +162,4 @@ def make(name, flags):
                 constant = NEVER
             fixed[0] = constant
 
-    # One work-item a particle: what is fixed as the first of so many rows of parts, one of which is a number a
-    # particle; 0 in the others.
-    @kernel
-    def fill_fixed(
-        fixed: wp.array(dtype=real),
-        parts: wp.array(dtype=real),
-        particles: wp.int32,
-        rows: wp.int32,
-    ):
-        n = wp.tid()
-        if n >= particles:
-            return
-        parts[n] = fixed[0]
-        row = int(1)
-        while row < rows:
-            parts[row * particles + n] = NOTHING
-            row += 1
-
-    return {"place_readings": place_readings, "fill_fixed": fill_fixed}[name]
+    return {"place_readings": place_readings}[name]

@@ -2,7 +2,7 @@
 
 What a call of few particles takes beside its kernels is what the host does: checks, the scan's preparation, a start for
 each launch. Where poses and readings are on the device, all of that is done once: readings are classed and placed there
-by the kernel file ``scan``, and the launches become a CUDA graph (``Repeating.record``).
+by the kernel file ``scan``, and the launches become a CUDA graph (``Gathering.record``).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends.base import Buffer, Repeating
+from gpusense.backends.base import Buffer, Gathering
 from gpusense.cloud import Cloud, Placed, finish
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
@@ -255,7 +255,7 @@ class _DeviceCall(BoundCall):
             self._table, region, _ = cloud.ensure(scene.map, 0, cloud.count)
             score = model._bound_scorer(self._table, region)
             self._version = scene.map.version
-            self._replay = cast(Repeating, self._backend).record(lambda: self._start(score, region))
+            self._replay = cast(Gathering, self._backend).record(lambda: self._start(score, region))
         # Other streams may come first to what was made just now.
         self._backend.synchronize()
 

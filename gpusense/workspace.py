@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer, Gathering, Repeating
+from gpusense.backends.base import Backend, Buffer, Gathering
 
 # Calls whose launches are kept.
 _MOST_KEPT = 64
@@ -55,20 +55,19 @@ class Workspace:
         gathering = self._gathering
         if gathering is None or (mark := gathering.mark()) is None:
             return False
-        repeating = cast(Repeating, gathering)
-        key += tuple([repeating.address(buffer) for buffer in buffers])
+        key += tuple([gathering.address(buffer) for buffer in buffers])
         kept = self._kept.get(key)
         if kept is None:
             self._begun = (key, mark)
             return False
-        repeating.repeat(kept)
+        gathering.repeat(kept)
         return True
 
     def keep(self) -> None:
         """Keep the launches since ``again``."""
         if self._begun is not None and self._gathering is not None:
             key, mark = self._begun
-            kept = cast(Repeating, self._gathering).kept(mark)
+            kept = self._gathering.kept(mark)
             if kept is not None:
                 if len(self._kept) >= _MOST_KEPT:
                     del self._kept[next(iter(self._kept))]

@@ -12,7 +12,6 @@ import numpy as np
 import pyopencl as cl
 
 from gpusense.backends import _pocl
-from gpusense.backends._opencl_copies import Stagings
 from gpusense.backends.base import BackendInfo, Buffer, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel, lanes_of
@@ -117,8 +116,7 @@ class OpenCLBackend(ProcessBound):
     """One OpenCL device: a context, an in-order queue and the programs compiled for it.
 
     A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, copies are
-    NumPy's instead: they wait for all commands before them, and are done when they return. Everywhere else the small
-    ones of a call are gathered, see ``_opencl_copies``.
+    NumPy's instead: they wait for all commands before them, and are done when they return.
     """
 
     def __init__(self, info: BackendInfo, device: cl.Device) -> None:
@@ -129,10 +127,6 @@ class OpenCLBackend(ProcessBound):
         self._context = cl.Context([device])
         self._queue = cl.CommandQueue(self._context)
         self._shared = _shares_memory(device)
-        self._gathers = not self._shared
-        self._stagings = Stagings(self._context, self._queue, device.mem_base_addr_align // 8)
-        # Events of copies that are not waited for: pyopencl would wait where they are dropped.
-        self._copies: list[Any] = []
         # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
         self._count = threading.RLock()
         self._queued = self._ended = 0
@@ -154,12 +148,7 @@ class OpenCLBackend(ProcessBound):
                 buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
                 return buffer
             with _driver_errors():
-                staging = self._stagings.own()
-                if staging is not None:
-                    if not wait and (part := staging.upload(array)) is not None:
-                        return part
-                    staging.start()
-                self._keep(cl.enqueue_copy(self._queue, buffer, array, is_blocking=wait), wait)
+                cl.enqueue_copy(self._queue, buffer, array, is_blocking=wait)
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
@@ -197,17 +186,8 @@ class OpenCLBackend(ProcessBound):
                 out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
                 return out
             with _driver_errors():
-                staging = self._stagings.own()
-                if staging is not None:
-                    if not wait and staging.download(buffer, out):
-                        return out
-                    staging.start()
-                self._keep(cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait), wait)
+                cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
-
-    def _keep(self, copy: Any, ended: bool) -> None:
-        if not ended:
-            self._copies.append(copy)
 
     def part(self, buffer: Buffer, first: int, count: int) -> Buffer:
         """See Backend.part."""
@@ -225,48 +205,10 @@ class OpenCLBackend(ProcessBound):
         """See Backend.synchronize."""
         with self._count:
             queued = self._queued
-        staging = self._stagings.own()
-        copies, self._copies = self._copies, []
         with _driver_errors():
-            if staging is None:
-                self._queue.finish()
-            elif not staging.wait():
-                staging.start()
-                self._queue.finish()
-            # They have ended, so that this waits no more.
-            copies.clear()
-            if staging is not None:
-                staging.deliver()
+            self._queue.finish()
         with self._count:
             self._ended = max(self._ended, queued)
-
-    def gather(self) -> None:
-        """See Gathering.gather."""
-        if self._gathers:
-            self.check_process()
-            with _driver_errors():
-                staging = self._stagings.begin()
-            if not staging.settled:
-                # An error ended the call before, and something of it may be under way.
-                with _driver_errors():
-                    self._queue.finish()
-            staging.begin()
-
-    def start(self) -> None:
-        """See Gathering.start."""
-        staging = self._stagings.own()
-        if staging is not None:
-            with _driver_errors():
-                staging.start()
-                self._queue.flush()
-
-    def scatter(self) -> None:
-        """See Gathering.scatter."""
-        self._stagings.end()
-
-    def mark(self) -> object | None:
-        """See Gathering.mark: launches are not repeated."""
-        return None
 
     def _settle(self) -> None:
         """Wait until no command of this thread can be under way."""
@@ -275,9 +217,6 @@ class OpenCLBackend(ProcessBound):
 
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
         """Queue a launch of a kernel whose arguments are set."""
-        staging = self._stagings.own()
-        if staging is not None:
-            staging.start()
         cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
         with self._count:
             self._queued += 1

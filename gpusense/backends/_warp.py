@@ -183,7 +183,7 @@ class WarpBackend(ProcessBound):
         return None if queue is None else (queue.started, len(queue.steps))
 
     def kept(self, mark: object) -> object | None:
-        """See Repeating.kept."""
+        """See Gathering.kept."""
         queue = self.gathering()
         assert queue is not None and isinstance(mark, tuple)
         started, first = mark
@@ -195,17 +195,17 @@ class WarpBackend(ProcessBound):
         return group
 
     def repeat(self, kept: object) -> None:
-        """See Repeating.repeat."""
+        """See Gathering.repeat."""
         queue = self.gathering()
         assert queue is not None and isinstance(kept, Group)
         queue.steps.append(kept)
 
     def address(self, buffer: wp.array) -> int:
-        """See Repeating.address."""
+        """See Gathering.address."""
         return int(buffer.ptr or 0)
 
     def record(self, run: Callable[[], None]) -> Repeated:
-        """See Repeating.record."""
+        """See Gathering.record."""
         before, recording = self.gathering(), Recording()
         self._thread.queue = recording
         try:

@@ -97,11 +97,7 @@ class Gathering(Protocol):
         """Start what still waits, and gather no more."""
 
     def mark(self) -> object | None:
-        """Where in what this thread gathers it is now; None where it does not, or nothing could be repeated."""
-
-
-class Repeating(Gathering, Protocol):
-    """A backend that gathers and can repeat what it gathered."""
+        """Where in what this thread gathers it is now; None where it does not."""
 
     def kept(self, mark: object) -> object | None:
         """The launches since a mark, to be repeated; None if there was anything else. It keeps no buffer alive."""

@@ -81,7 +81,8 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
     """Whether a kernel file computes in float64 whatever the precision of the model."""
-    texts = (re.sub(r"//.*", "", opencl_source(needed)) for needed in required_files(file, flags))
+    kept = (resolve(opencl_source(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
+    texts = (re.sub(r"//.*", "", text) for text in kept)
     return any(re.search(r"\bdouble[24]?\b", text) for text in texts)
 
 

@@ -76,9 +76,9 @@ def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypat
 
     def broken(name):
         text = source(name)
-        return text.replace("real k_x = (real)start.k_x", "real k_x = nonsense") if name == "raycast" else text
+        return text.replace("real k_x = COUNT + (real)start.k_x", "real k_x = nonsense") if name == "raycast" else text
 
-    line = 1 + source("raycast").split("real k_x = (real)start")[0].count("\n")
+    line = 1 + source("raycast").split("real k_x = COUNT + (real)start")[0].count("\n")
     monkeypatch.setattr(sources, "opencl_source", broken)
     with pytest.raises(RuntimeError) as caught:
         device._build("ranges", frozenset({"ORIGINS_OUTSIDE"}))
@@ -90,8 +90,8 @@ def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypat
 
 def test_places_in_the_whole_source_become_places_in_files():
     source = sources.assemble("ranges", frozenset())
-    number = 1 + source.split("real k_x = (real)start")[0].count("\n")
-    line = 1 + sources.opencl_source("raycast").split("real k_x = (real)start")[0].count("\n")
+    number = 1 + source.split("real k_x = COUNT + (real)start")[0].count("\n")
+    line = 1 + sources.opencl_source("raycast").split("real k_x = COUNT + (real)start")[0].count("\n")
     assert sources.with_places(f"<kernel>:{number}:15: error", source) == f"raycast.cl:{line}:15: error"
     assert sources.with_places("<kernel>:1:1: error", source) == "<kernel>:1:1: error"
 

@@ -242,7 +242,7 @@ class _DeviceCall(BoundCall):
         )  # fmt: skip
 
         def place() -> None:
-            backend.compile("place_readings", frozenset(flags))((max(blocks, 1),), *arguments)
+            backend.compile("place_readings", frozenset(flags))((max(len(beams), 1),), *arguments)
 
         return scan, place, kind == MAX_FIXED or not possible
 

@@ -219,7 +219,7 @@ KERNELS: dict[str, Kernel] = {
         "int first_col", "int first_row", *_MAP, "int particles",
     ),
     "place_readings": _kernel(
-        "scan", "block", "coordinate ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
+        "scan", "place", "coordinate ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
         "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
         "out real guard [blocks]", "out real fixed [1]", "int beams", "int each", "int places", "int chosen",
         "int max_readings", "int possible", "double nearest", "double farthest", "double log_max", "double resolution",

@@ -13,6 +13,9 @@ from map_files import yaml_text
 
 from gpusense.backends import Backend, get_backend
 
+# JAX would take three quarters of a GPU's memory for each process that imports it.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
 # Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
 

@@ -43,8 +43,8 @@ def placed(device: Backend, flags: frozenset[str], ranges: np.ndarray, vectors: 
     beam = np.arange(beams, dtype=np.int32)
     flags |= {"RANGES_FLOAT32"} if ranges.dtype == np.float32 else frozenset()
     call = (
-        "place_readings", flags, (blocks,), ranges, beam, vectors, *room, beams, each, places, chosen, kind, possible,
-        nearest, RANGE, log_max, RESOLUTION, top, GUARD,
+        "place_readings", flags, (max(beams, places, 1),), ranges, beam, vectors, *room, beams, each, places, chosen,
+        kind, possible, nearest, RANGE, log_max, RESOLUTION, top, GUARD,
     )  # fmt: skip
     reference, found = on_both(device, *call)
     for name in reference:

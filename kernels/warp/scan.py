@@ -43,11 +43,11 @@ def make(name, flags):
     NOTHING, NEVER = real(0.0), real(-math.inf)
     NO_READING, AHEAD = real(math.nan), vec2(1.0, 0.0)
 
-    # One work-item a block of places: it looks at all readings, of which 16 are read before any is looked at. A place
-    # gets its reading, at most top, and as points the vectors of its beam, each of them; with END_POINTS a point is the
-    # reading times its vector, in cells, and what rounding took from it. A max reading is inf. The guard is guard_scale
-    # (longest + 2 cells) of a block. Fixed is what max readings add that have no place; -inf where a range is there and
-    # none is possible.
+    # One work-item a beam and place: it looks at all readings, of which 16 are read before any is looked at, finds the
+    # place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam, each
+    # of them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A max
+    # reading is inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings add
+    # that have no place; -inf where a range is there and none is possible.
     @kernel
     def place_readings(
         ranges: wp.array(dtype=coordinate),
@@ -71,10 +71,8 @@ def make(name, flags):
         top: wp.float64,
         guard_scale: wp.float64,
     ):
-        block = wp.tid()
-        begin = block * BLOCK_TERMS
-        end = wp.min(begin + BLOCK_TERMS, places)
-        if block > 0 and begin >= places:
+        own = wp.tid()
+        if own >= wp.max(wp.max(beams, places), 1):
             return
         informative = beams
         if chosen < beams:
@@ -85,8 +83,11 @@ def make(name, flags):
                     informative += 1
         rank = int(0)
         place = int(0)
+        own_place = int(places)
         far_count = int(0)
         impossible = bool(False)
+        own_value = wp.float64(MISSING)
+        # Of the readings in the block of places that begins with the own one, if one does.
         longest = wp.float64(0.0)
         first = int(0)
         while first < beams:
@@ -102,59 +103,55 @@ def make(name, flags):
                 far = z >= farthest
                 told = hit or (far and max_readings != MAX_LEFT_OUT)
                 used = told and is_chosen(rank, informative, chosen)
-                if told:
-                    rank += 1
-                value = MISSING
-                if used:
-                    if hit:
-                        if possible != 0:
-                            value = z
-                        else:
-                            impossible = True
-                    else:
-                        far_count += 1
-                        if max_readings == MAX_PLACED:
-                            value = FAR
-                placed = not wp.isnan(value)
+                as_range = used and hit and possible != 0
+                as_far = used and far and max_readings == MAX_PLACED
+                rank += int(told)
+                far_count += int(used and far)
+                if used and hit and possible == 0:
+                    impossible = True
+                placed = as_range or as_far
                 if ALL_READINGS:
                     placed = k < beams
-                if placed:
-                    if place >= begin and place < end:
-                        if END_POINTS:
-                            cells = value / resolution
-                            length = wp.where(wp.isfinite(cells), cells, ZERO)
-                            x = vector[2 * k * each] * length
-                            y = vector[2 * k * each + 1] * length
-                            high = vec2(real(x), real(y))
-                            point_low[place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
-                            if not wp.isfinite(cells):
-                                high = vec2(real(cells), real(cells))
-                            point[place] = high
-                            longest = wp.max(longest, length)
-                        else:
-                            for j in range(each):
-                                source = 2 * (k * each + j)
-                                point[place * each + j] = vec2(real(vector[source]), real(vector[source + 1]))
-                            rounded = real(value)
-                            if rounded > real(top) and not wp.isinf(rounded):
-                                rounded = real(top)
-                            reading[place] = rounded
-                    place += 1
+                if placed and k == own:
+                    own_place = place
+                    own_value = wp.where(as_range, z, wp.where(as_far, FAR, MISSING))
+                if as_range and place >= own_place and place < own_place + BLOCK_TERMS:
+                    longest = wp.max(longest, z)
+                place += int(placed)
             first += BLOCK_TERMS
-        rest = wp.max(place, begin)
-        while rest < end:
-            if END_POINTS:
-                point[rest] = vec2(NO_READING, NO_READING)
-                point_low[rest] = vec2(NOTHING, NOTHING)
-            else:
-                for j in range(each):
-                    point[rest * each + j] = AHEAD
-                reading[rest] = NO_READING
-            rest += 1
+        left_over = own >= place and own < places
         if END_POINTS:
-            if begin < places:
-                guard[block] = real(guard_scale * (longest + wp.float64(2.0)))
-        if block == 0:
+            if own_place < places:
+                cells = own_value / resolution
+                length = wp.where(wp.isfinite(cells), cells, ZERO)
+                x = vector[2 * own * each] * length
+                y = vector[2 * own * each + 1] * length
+                high = vec2(real(x), real(y))
+                point_low[own_place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
+                if not wp.isfinite(cells):
+                    high = vec2(real(cells), real(cells))
+                point[own_place] = high
+                if own_place % BLOCK_TERMS == 0:
+                    guard[own_place // BLOCK_TERMS] = real(guard_scale * (longest / resolution + wp.float64(2.0)))
+            if left_over:
+                point[own] = vec2(NO_READING, NO_READING)
+                point_low[own] = vec2(NOTHING, NOTHING)
+                if own % BLOCK_TERMS == 0:
+                    guard[own // BLOCK_TERMS] = real(guard_scale * wp.float64(2.0))
+        else:
+            if own_place < places:
+                for j in range(each):
+                    source = 2 * (own * each + j)
+                    point[own_place * each + j] = vec2(real(vector[source]), real(vector[source + 1]))
+                rounded = real(own_value)
+                if rounded > real(top) and not wp.isinf(rounded):
+                    rounded = real(top)
+                reading[own_place] = rounded
+            if left_over:
+                for j in range(each):
+                    point[own * each + j] = AHEAD
+                reading[own] = NO_READING
+        if own == 0:
             constant = NOTHING
             if max_readings == MAX_FIXED:
                 constant = real(wp.float64(far_count) * log_max)

@@ -183,6 +183,14 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
     assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])
 
 
+def test_work_items_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "70", "--beams", "20", "--size", "20", "--repeats", "2", "--power", "3", "--power", "9"]
+    report = run_script("work_items.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "items")
+    whats = {f"{what}, {cloud}" for what in ("rays", "beam model", "field") for cloud in ("global", "tracking")}
+    assert {(row["what"], row["power"]) for row in report["rows"]} == {(what, n) for what in whats for n in (3, 9)}
+    assert all(row["main_s"] > 0 and row["all_s"] > 0 for row in report["rows"])
+
+
 def test_several_scans_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", "numpy", "--backend", needs("opencl"), "--particles", "30", "--beams", "12"]
     small = ["--scans", "3", "--models", "2", "--size", "20", "--seconds", "0.01"]

@@ -69,10 +69,10 @@ def rows_of(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
 
                 run()
                 launches = recorder.launches_of(run)
-                jobs.append((power, run, launches, launches[-1 if what == "rays" or len(launches) == 2 else -2]))
+                jobs.append((power, launches, launches[-1 if what == "rays" or len(launches) == 2 else -2]))
             best = {power: [np.inf, np.inf] for power, *_ in jobs}
             for _ in range(arguments.repeats):
-                for power, _, launches, main in jobs:
+                for power, launches, main in jobs:
                     everything = seconds(device, lambda launches=launches: [launch() for launch in launches])
                     alone = seconds(device, lambda main=main: [main() for _ in range(AGAIN)]) / AGAIN
                     best[power] = [min(best[power][0], everything), min(best[power][1], alone)]

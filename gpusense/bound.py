@@ -183,8 +183,10 @@ class _DeviceCall(BoundCall):
         self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
         self._scan, self._place, self._fixed = self._placing_of(found)
-        numbers = -(-self._scan.places // BLOCK_TERMS) if model._end_points else self._scan.places
-        self._counts = backend.upload(np.array([numbers], _INT))
+        # Numbers that a particle's sum adds, and how many of them plainly: end points are looked up by the block.
+        places = self._scan.places
+        self._each, self._block = (-(-places // BLOCK_TERMS), 1) if model._end_points else (places, BLOCK_TERMS)
+        self._counts = backend.upload(np.array([self._each], _INT))
         self._record()
 
     def __call__(self, stream: Any = None) -> Any:
@@ -263,7 +265,7 @@ class _DeviceCall(BoundCall):
         """All launches of a call."""
         model, scan, backend, space, cloud = self._model, self._scan, self._backend, self._space, self._cloud
         flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
-        each, block = (-(-scan.places // BLOCK_TERMS), 1) if model._end_points else (scan.places, BLOCK_TERMS)
+        each, block = self._each, self._block
         # One of several scans has a fixed term on the device.
         flags |= {"SCANS"} if self._fixed else set()
         counts, chunk = self._counts, model._bound_chunk(scan.places)

@@ -53,6 +53,7 @@ def _describe(device: wp.Device) -> BackendInfo:
         memory=memory,
         max_buffer=memory,
         float64=True,
+        vector_loops=not device.is_cuda,
     )
 
 

@@ -30,6 +30,7 @@ class BackendInfo:
         max_buffer: Bytes of the largest buffer.
         float64: Whether float64 kernels exist on it.
         lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
+        vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
     """
 
     selection: str
@@ -41,6 +42,7 @@ class BackendInfo:
     max_buffer: int
     float64: bool
     lanes: int = 1
+    vector_loops: bool = False
 
 
 class ProcessBound:

@@ -260,8 +260,7 @@ class LikelihoodFieldModel(ScanModel):
                 return parts
             flags |= several | cloud.headings() | ({"PER_BEAM"} if per_beam else set())
             flags = widened(backend.info, "score_field", flags)
-            # Warp's compiler for processors makes vectors of loops over readings, others of work-items, or lanes do.
-            if quick and (backend.info.backend, backend.info.kind) == ("warp", "cpu"):
+            if quick and backend.info.vector_loops:
                 flags |= {"QUICK"}
             self._last_code = flags
             parts = space.empty("parts", count * readings if per_beam else 1, real)

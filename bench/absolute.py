@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, best, command_line, machine, write_report
+from speed import Recorder, best, publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -138,12 +138,7 @@ def main() -> int:
         for backend in arguments.backend or present
         for name, how in sensors(grid, xy).items()
     ]
-    command, host = command_line("bench/absolute.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    table = f"{to_markdown(rows)}\n\nMachine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        write_report(arguments.output, {"command": command, "machine": host, "rows": rows}, table)
+    publish("absolute.py", arguments, to_markdown(rows), {"rows": rows})
     return 0
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import command_line, machine, write_report
+from speed import publish
 
 import gpusense as gs
 from gpusense import fitting, held_out
@@ -104,15 +104,8 @@ def main() -> int:
     if arguments.data is None:
         parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
     logs = [measure(arguments.data, name, arguments) for name in arguments.log or LOGS]
-    # The folder of the data is no one's business.
-    command = command_line("bench/fit_localisation.py").replace(str(arguments.data), "DATA")
-    host = machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    text = f"{to_markdown(logs)}\n\n{arguments.particles} particles. Machine: {described}. Command: `{command}`.\n"
-    print(text)
-    if arguments.output:
-        report = {"command": command, "machine": host, "particles": arguments.particles, "logs": logs}
-        write_report(arguments.output, report, text)
+    note, report = f"{arguments.particles} particles.", {"particles": arguments.particles, "logs": logs}
+    publish("fit_localisation.py", arguments, to_markdown(logs), report, note)
     return 0
 
 

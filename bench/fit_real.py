@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 from sonar_field import recorded, ring_of
-from speed import command_line, machine, write_report
+from speed import publish
 
 import gpusense as gs
 from gpusense import fitting, held_out
@@ -306,16 +306,8 @@ def main() -> int:
     for name in arguments.set or SETS:
         print(name, file=sys.stderr, flush=True)
         reports.append(measure(arguments.data, name, arguments))
-    # The folder of the data is no one's business.
-    command = command_line("bench/fit_real.py").replace(str(arguments.data), "DATA")
-    host = machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
     device = reports[0]["fit"]["device"]
-    text = f"{to_markdown(reports)}\n\nDevice: {device}. Machine: {described}. Command: `{command}`.\n"
-    print(text)
-    if arguments.output:
-        report = {"command": command, "machine": host, "device": device, "sets": reports}
-        write_report(arguments.output, report, text)
+    publish("fit_real.py", arguments, to_markdown(reports), {"device": device, "sets": reports}, f"Device: {device}.")
     return 0 if all(report["fit"]["converged"] for report in reports) else 1
 
 

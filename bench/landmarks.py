@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, best, command_line, machine, write_report
+from speed import Recorder, best, publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -169,13 +169,7 @@ def main() -> int:
             scene = make_scene(count, arguments.particles, arguments.seed)
             for cloud in arguments.cloud or scene.clouds:
                 rows += [row_of(backend, scene, what, cloud, arguments) for what in chosen]
-    command, host = command_line("bench/landmarks.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    table = f"{to_markdown(rows)}\n\nMachine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        report = {"command": command, "machine": host, "rows": rows}
-        write_report(arguments.output, report, table)
+    publish("landmarks.py", arguments, to_markdown(rows), {"rows": rows})
     return 0
 
 

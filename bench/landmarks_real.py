@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from landmark_sets import run_of
-from speed import command_line, machine, write_report
+from speed import publish
 
 import gpusense as gs
 from gpusense import landmark_runs as lr
@@ -139,15 +139,8 @@ def main() -> int:
     if arguments.data is None:
         parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
     sets = [measure(arguments.data, name, arguments) for name in arguments.set or SETS]
-    # The folder of the data is no one's business.
-    command = command_line("bench/landmarks_real.py").replace(str(arguments.data), "DATA")
-    host = machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    text = f"{to_markdown(sets)}\n\n{arguments.particles} particles. Machine: {described}. Command: `{command}`.\n"
-    print(text)
-    if arguments.output:
-        report = {"command": command, "machine": host, "particles": arguments.particles, "sets": sets}
-        write_report(arguments.output, report, text)
+    note, report = f"{arguments.particles} particles.", {"particles": arguments.particles, "sets": sets}
+    publish("landmarks_real.py", arguments, to_markdown(sets), report, note)
     return 0
 
 

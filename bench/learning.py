@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import best, command_line, machine, write_report
+from speed import best, publish
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
@@ -276,21 +276,13 @@ def main() -> int:
     identified, within = (sum(scene[name] for scene in scenes) for name in ("identified", "within"))
     fell = max((scene["fall"] for scene in scenes), default=0.0)
     off = max((nats for scene in scenes for nats in scene["ends"].values()), default=0.0)
-    command, host = command_line("bench/learning.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    text = (
+    table = (
         f"{to_markdown(rows, scenes)}\n\n{within} of {identified} identified parameters within 3 standard errors; "
         f"exact EM falls by at most {fell:.1e} of the log-likelihood; other ways end within {off:.1e} nats. "
-        f"Passes over the pairs of 9 fits in 10: {passes_text(scenes)}.\n\n"
-        f"Machine: {described}. Command: `{command}`.\n"
+        f"Passes over the pairs of 9 fits in 10: {passes_text(scenes)}."
     )
-    print(text)
-    if arguments.output:
-        report = {
-            "command": command, "machine": host, "rows": rows, "scenes": scenes, "identified": identified,
-            "within": within, "fall": fell, "off": off,
-        }  # fmt: skip
-        write_report(arguments.output, report, text)
+    report = {"rows": rows, "scenes": scenes, "identified": identified, "within": within, "fall": fell, "off": off}
+    publish("learning.py", arguments, table, report)
     return 1 if fell > FALLS or within < SHARE * identified or off > NATS else 0
 
 

@@ -12,14 +12,13 @@ the least and the median of several runs; machines are noisy, so compare within 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, best, command_line, machine
+from speed import Recorder, best, publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -168,15 +167,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
     arguments = parser.parse_args()
     rows = [row for backend in arguments.backend for row in measure(backend, arguments)]
-    command, host = command_line("bench/limits.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    table = f"{to_markdown(rows)}\n\nMachine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        report = {"command": command, "machine": host, "rows": rows}
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(table)
+    publish("limits.py", arguments, to_markdown(rows), {"rows": rows})
     return 0
 
 

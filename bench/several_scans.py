@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from small_calls import MODELS, on_device, read
-from speed import command_line, machine, write_report
+from speed import publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -172,15 +172,10 @@ def main() -> int:
         bench = Bench(selection, arguments)
         bench.run()
         rows += bench.rows
-    command, host = command_line("bench/several_scans.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
     devices = ", ".join(sorted({f"{row['backend']} is {row['device']}" for row in rows}))
     scene = f"built-in building, {bench.grid.shape[0]} x {bench.grid.shape[1]} cells, range_max {arguments.range_max:g}"
-    table = f"{to_markdown(rows)}\n\nScene: {scene}. Devices: {devices}. Machine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        report = {"command": command, "scene": scene, "machine": host, "rows": rows}
-        write_report(arguments.output, report, table)
+    note = f"Scene: {scene}. Devices: {devices}."
+    publish("several_scans.py", arguments, to_markdown(rows), {"scene": scene, "rows": rows}, note)
     return 0
 
 

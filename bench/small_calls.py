@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, command_line, machine, write_report
+from speed import Recorder, publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -238,14 +238,8 @@ def main() -> int:
         bench = Bench(selection, arguments)
         bench.run()
         rows += bench.rows
-    command, host = command_line("bench/small_calls.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
     scene = f"built-in building, {bench.grid.shape[0]} x {bench.grid.shape[1]} cells, range_max {arguments.range_max:g}"
-    table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        report = {"command": command, "scene": scene, "machine": host, "rows": rows}
-        write_report(arguments.output, report, table)
+    publish("small_calls.py", arguments, to_markdown(rows), {"scene": scene, "rows": rows}, f"Scene: {scene}.")
     return 0
 
 

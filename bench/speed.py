@@ -181,6 +181,19 @@ def write_report(output: Path, report: dict[str, Any], text: str) -> None:
     output.with_suffix(".md").write_text(text)
 
 
+def publish(script: str, arguments: argparse.Namespace, table: str, report: dict[str, Any], note: str = "") -> None:
+    """Print a script's table with machine and command below it, and write both and the report where --output says."""
+    command, host = command_line(f"bench/{script}"), machine(arguments.commit)
+    if getattr(arguments, "data", None) is not None:
+        # The folder of the data is no one's business.
+        command = command.replace(str(arguments.data), "DATA")
+    described = ", ".join(f"{name} {value}" for name, value in host.items())
+    text = f"{table}\n\n{note and note + ' '}Machine: {described}. Command: `{command}`.\n"
+    print(text)
+    if arguments.output:
+        write_report(arguments.output, {"command": command, "machine": host, **report}, text)
+
+
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -213,16 +226,7 @@ def main() -> int:
     for backend in arguments.backend or present:
         rows += rows_of(backend, clouds, (grid, scanner, ranges), arguments)
     scene = f"{arguments.map.name if arguments.map else 'built-in building'}, {grid.shape[0]} x {grid.shape[1]} cells"
-    command = command_line("bench/speed.py")
-    host = machine(arguments.commit)
-    report = {"command": command, "scene": scene, "machine": host, "rows": rows}
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    table = f"{to_markdown(rows)}\n\nScene: {scene}. Machine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(table)
+    publish("speed.py", arguments, to_markdown(rows), {"scene": scene, "rows": rows}, f"Scene: {scene}.")
     return 0
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, command_line, machine, write_report
+from speed import Recorder, publish
 
 import gpusense as gs
 from gpusense import cloud
@@ -107,13 +107,8 @@ def main() -> int:
     arguments = parser.parse_args()
     arguments.power = arguments.power or [19, 20, 21, 22]
     rows = [row for backend in arguments.backend for row in rows_of(backend, arguments)]
-    command, host = command_line("bench/work_items.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    sizes = f"{arguments.particles} x {arguments.beams}"
-    table = f"{to_markdown(rows)}\n\nSizes: {sizes}. Machine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        write_report(arguments.output, {"command": command, "machine": host, "rows": rows}, table)
+    sizes = f"Sizes: {arguments.particles} x {arguments.beams}."
+    publish("work_items.py", arguments, to_markdown(rows), {"rows": rows}, sizes)
     return 0
 
 

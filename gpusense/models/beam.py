@@ -21,18 +21,16 @@ from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
+from gpusense.models.beam_mixture import mixture_of, peer_mixture, tabulated
 from gpusense.models.caster import MapCaster
 from gpusense.models.scan_model import ScanModel
-from gpusense.models.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.models.terms import HIGH_PEAK
 from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
-
-# Bins of a sensor's table along each axis: 268 MB in float32.
-_MOST_BINS = 8192
 
 
 class BeamModel(ScanModel):
@@ -274,54 +272,19 @@ class BeamModel(ScanModel):
         title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
         return str(self._plan(title, omissions))
 
-    def _peer_mixture(self) -> tuple[frozenset[str], np.ndarray]:
-        """Flags and numbers of the kernel file ``compat``."""
-        p, range_max = self._kinds[0], self.scanner.range_max
-        flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}
-        hit = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-        if self.compat == "amcl":
-            flags.add("AMCL")
-            hit = p.z_hit
-        shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
-        terms = [hit, *shape, p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
-        return frozenset(flags), rounded_terms(terms, self._real)
-
     def _mixture(self) -> tuple[frozenset[str], np.ndarray]:
-        """Flags of the components, and the numbers of the kernel file ``mixture``."""
+        """Flags of the components, and their numbers."""
+        range_max, real = self.scanner.range_max, self._real
         if self._peer is not None:
-            return self._peer_mixture()
-        range_max, kinds = self.scanner.range_max, self._kinds
-        weights = {name: max(getattr(p, f"z_{name.lower()}") for p in kinds) for name in ("HIT", "SHORT", "RAND")}
-        flags = {name for name, weight in weights.items() if weight > 0 or not self._specialize}
-        # Where no range is possible at any angle, something must say so of each.
-        flags |= {"RAND"} if self._max_depends and not flags else set()
-        peaks = [p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi)) for p in kinds]
-        if self._specialize and len(flags) == 1:
-            flags.add("SINGLE")
-        if max(peaks) > HIGH_PEAK or not self._specialize:
-            flags.add("SHARP")
-        if all(
-            sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), self._real)
-            for p, peak in zip(kinds, peaks, strict=True)
-        ):
-            flags.add("LINEAR")
-        terms = [self._terms_of(p, peak, "LINEAR" in flags) for p, peak in zip(kinds, peaks, strict=True)]
+            return peer_mixture(self._kinds[0], range_max, real, amcl=self.compat == "amcl")
+        flags, terms = mixture_of(
+            self._kinds, range_max, real, specialize=self._specialize, max_depends=self._max_depends
+        )
         if self.sensor_table is not None:
-            flags = {"SENSOR_TABLE"} | (flags & {"LINEAR"})
+            flags = (flags & {"LINEAR"}) | {"SENSOR_TABLE"}
         if self._discrete is not None:
-            flags = {"SENSOR_TABLE"}
-        return frozenset(flags), np.concatenate(terms)
-
-    def _terms_of(self, p: BeamParameters, peak: float, linear: bool) -> np.ndarray:
-        range_max = self.scanner.range_max
-        if linear:
-            head = (peak, p.z_short, p.z_rand / range_max)
-        else:
-            log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
-            head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
-        shape = (0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit)
-        terms = [head[0], *shape, head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-        return rounded_terms(terms, self._real)
+            flags = frozenset({"SENSOR_TABLE"})
+        return flags, terms
 
     def _tabulate(self, width: float | None) -> tuple[Buffer, int]:
         """The sensor's table on the device, and its number of bins; no table and 0 where the mixture is evaluated."""
@@ -332,20 +295,8 @@ class BeamModel(ScanModel):
             return self._backend.upload(table), self._discrete.bins
         if width is None:
             return self._backend.upload(np.zeros(1, self._real)), 0
-        from gpusense.reference.densities import log_mixture  # loads SciPy
-
-        range_max = self.scanner.range_max
-        width = _checks.real("sensor_table", width, low=range_max / _MOST_BINS, high=range_max)
-        cells = max(round(range_max / width), 1)
-        middle = (np.arange(cells) + 0.5) * (range_max / cells)
-        expected = np.append(middle, range_max)
-        table = np.full((cells + 1, cells + 1), log_weight(self._kinds[0].z_max), self._real)
-        # In blocks of rows: the densities need some forty numbers for each of theirs.
-        for first in range(0, cells, 64):
-            rows = slice(first, first + 64)
-            own = self._kinds[0].to_dict()
-            table[:-1][rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **own)
-        return self._backend.upload(table), cells
+        table = tabulated(self._kinds[0], width, self.scanner.range_max, self._real)
+        return self._backend.upload(table), len(table) - 1
 
     def _impossible(self) -> bool:
         # Where max readings depend on the pose, the kernel tells.

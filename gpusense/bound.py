@@ -91,6 +91,8 @@ class PlacedScan:
 
     Attributes:
         places: Places of readings; those at the end may be missing (nan).
+        parts: How many numbers a particle's sum adds.
+        block: 1 where these are sums of readings, BLOCK_TERMS where they are single readings'.
         point: End points in cells, or the vectors of beams.
         low: What rounding took from end points.
         reading: Ranges, where points are vectors.
@@ -99,6 +101,8 @@ class PlacedScan:
     """
 
     places: int
+    parts: int
+    block: int
     point: Buffer
     low: Buffer
     reading: Buffer
@@ -183,10 +187,7 @@ class _DeviceCall(BoundCall):
         self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
         self._scan, self._place, self._fixed = self._placing_of(found)
-        # Numbers that a particle's sum adds, and how many of them plainly: end points are looked up by the block.
-        places = self._scan.places
-        self._each, self._block = (-(-places // BLOCK_TERMS), 1) if model._end_points else (places, BLOCK_TERMS)
-        self._counts = backend.upload(np.array([self._each], _INT))
+        self._counts = backend.upload(np.array([self._scan.parts], _INT))
         self._record()
 
     def __call__(self, stream: Any = None) -> Any:
@@ -227,6 +228,7 @@ class _DeviceCall(BoundCall):
         each, blocks = vectors.shape[1], -(-places // BLOCK_TERMS)
         scan = PlacedScan(
             places,
+            *model._bound_parts(min(self._cloud.count, model._bound_chunk(places)), places),
             point=space.empty("point", 2 * places * each, real),
             low=space.empty("point_low", 2 * places if end_points else 2, real),
             reading=space.empty("reading", 1 if end_points else places, real),
@@ -265,7 +267,6 @@ class _DeviceCall(BoundCall):
         """All launches of a call."""
         model, scan, backend, space, cloud = self._model, self._scan, self._backend, self._space, self._cloud
         flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
-        each, block = self._each, self._block
         # One of several scans has a fixed term on the device.
         flags |= {"SCANS"} if self._fixed else set()
         counts, chunk = self._counts, model._bound_chunk(scan.places)
@@ -276,10 +277,10 @@ class _DeviceCall(BoundCall):
             count = part[1] - begin
             given = cloud.given(backend, space, part)
             placed = cloud.place(backend, space, given, part, frame, self._real, careful=self._scene.careful)
-            parts = space.empty("parts", count * each, self._real)
-            if each:
+            parts = space.empty("parts", count * scan.parts, self._real)
+            if scan.places:
                 score(placed, cloud.headings(), count, scan, parts)
             backend.compile("sum_parts", flags)(
-                (count,), parts, self._none, counts, scan.fixed, backend.part(self._result, begin, count), count, each,
-                block, 1, count, 0.0, model.temperature, count,
+                (count,), parts, self._none, counts, scan.fixed, backend.part(self._result, begin, count), count,
+                scan.parts, scan.block, 1, count, 0.0, model.temperature, count,
             )  # fmt: skip

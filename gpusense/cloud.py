@@ -16,6 +16,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.frames import Cells, Mount, frame_scalars, place_poses
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
+from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.heading import LIMIT
 from gpusense.reference.order import ALL_BINS, STRETCH
 from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
@@ -246,6 +247,11 @@ def spread_of(items: int, groups: int, enough: int = _ENOUGH) -> int:
     while items << spread < enough and 1 << spread < groups:
         spread += 1
     return spread
+
+
+def stranded(rays: int, spread: int) -> bool:
+    """Whether a launch in tiles has a block of rays for each of a tile's groups: then work-items add up strands."""
+    return -(-rays // BLOCK_TERMS) >= 1 << spread
 
 
 def tiles_of(count: int, rays: int) -> tuple[int, int]:

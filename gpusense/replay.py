@@ -19,6 +19,7 @@ from gpusense.backends.base import Launcher
 from gpusense.reference import field as field_kernels
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.echo import incidence_terms
+from gpusense.reference.error_free import block_sums, strand_sums
 from gpusense.reference.mixture import log_density
 from gpusense.reference.sensor_table import tabulated_density
 from gpusense.signatures import KERNELS, Argument
@@ -149,7 +150,8 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
             for shift in itertools.product((-guard, guard), repeat=2):
                 moved = _replay_field(launch, values, shift)
                 parts = np.where(np.abs(moved - like) < np.abs(parts - like), moved, parts)
-        return sum_terms(launch.flags, parts, values["fixed"], values["temperature"]), parts
+        plainly = strand_sums if launch.kernel == "score_beams" else block_sums
+        return sum_terms(launch.flags, parts, values["fixed"], values["temperature"], plainly), parts
 
 
 def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) -> np.ndarray:

@@ -41,6 +41,7 @@ FLAGS = {
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "HUGE_HEADINGS": "some heading is beyond 2^20 rad",
     "ORDERED": "particles come in an order in which neighbours have much the same position and heading",
+    "STRANDED": "readings are so many that a work-item adds up whole strands of them",
     "QUICK": "nearest cells are found by rounding, and again with more digits only where that is in doubt",
     "INSIDE": "no end point of the cloud leaves the field's table",
     "SCANS": "several scans are scored together, each with readings and particles of its own",

@@ -11,7 +11,7 @@ from test_kernel_scores import field_scene, mixture, scan
 from test_kernel_tiles import OCCUPIED, RANGE, an_order, guards_of, items, poses, rays_of, room_for, strides
 
 from gpusense.backends import Backend
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.error_free import BLOCK_TERMS, strands_in
 from gpusense.tolerances import differing, per_beam, per_scan
 
 PER_SCAN, SCANS = 37, 4
@@ -76,14 +76,15 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
     )
 
 
-@pytest.mark.parametrize("names", [(), ("ORDERED",), ("CUBES",)])
+@pytest.mark.parametrize("names", [(), ("ORDERED",), ("CUBES",), ("STRANDED",)])
 @pytest.mark.parametrize("block", [1, BLOCK_TERMS])
 def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> None:
     counts = np.array([5, 0, 48, 16], np.int32)
     parts = np.random.default_rng(4).uniform(0.1, 3, 48 * COUNT).astype(REAL)
     # What no scan has counts for nothing.
     place_scan = (an_order(COUNT) if "ORDERED" in names else np.arange(COUNT)) // PER_SCAN
-    parts.reshape(48, COUNT)[np.arange(48)[:, None] >= counts[place_scan]] = np.nan
+    added = strands_in(counts) if "STRANDED" in names else counts
+    parts.reshape(48, COUNT)[np.arange(48)[:, None] >= added[place_scan]] = np.nan
     reference, found = on_both(
         device, "sum_parts", scene_flags(REAL, "SCANS", *names), (COUNT,), parts, an_order(COUNT), counts,
         np.array(np.abs(FIXED), REAL), np.full(COUNT, np.nan, REAL), COUNT, 48, block, 1, COUNT, 0.0, 0.75, PER_SCAN,
@@ -123,17 +124,18 @@ def test_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
         assert np.ptp(expected) > 10 and counts.min() == 0
 
 
-@pytest.mark.parametrize("names", [("ORDERED",), ("ORDERED", "SHARED_RAYS")])
+@pytest.mark.parametrize("names", [("ORDERED",), ("ORDERED", "SHARED_RAYS"), ("ORDERED", "STRANDED")])
 def test_tiles_of_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
     flags, arrays, counts, most = beams(names)
     (cell, pose), rays, order = poses(COUNT, REAL), int(np.diff(START).max()), an_order(COUNT)
+    each, added = (strands_in(most), strands_in(counts)) if "STRANDED" in names else (most, counts)
     for spread in (0, 3):
         reference, found = on_both(
             device, "beam_tiles", flags, items(COUNT, spread), planes_of(OCCUPIED), nothing(REAL, 2), cell, pose, order,
-            *arrays, room_for(COUNT, most, "particles", REAL), *OCCUPIED.shape, COUNT, rays, most, *LASER, *EXACT, 0,
-            0.0, LIMIT, RESOLUTION, RANGE, *strides(COUNT, most, "particles"), spread, PER_SCAN,
+            *arrays, room_for(COUNT, each, "particles", REAL), *OCCUPIED.shape, COUNT, rays, most, *LASER, *EXACT, 0,
+            0.0, LIMIT, RESOLUTION, RANGE, *strides(COUNT, each, "particles"), spread, PER_SCAN,
         )  # fmt: skip
         expected = reference["parts"].astype(np.float64)
-        assert_near(found["parts"], expected, 2 * per_beam(expected, REAL))
-        written = (found["parts"].reshape(-1)[: COUNT * most].reshape(most, COUNT) != -77).sum(axis=0)
-        assert (written == counts[order // PER_SCAN]).all()
+        assert_near(found["parts"], expected, 8 * per_beam(expected, REAL))
+        written = (found["parts"].reshape(-1)[: COUNT * each].reshape(each, COUNT) != -77).sum(axis=0)
+        assert (written == added[order // PER_SCAN]).all()

@@ -30,7 +30,7 @@ from test_kernel_scores import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mixt
 
 from gpusense.backends import Backend, get_backend
 from gpusense.models.field import _GUARD
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.error_free import BLOCK_TERMS, strand_sums, strands_in
 from gpusense.reference.tiles import TILE, TILE_PARTICLES
 from gpusense.tolerances import differing, per_beam
 
@@ -151,15 +151,16 @@ def beam_tiles(
     first = np.append(0, np.cumsum(repeats)).astype(np.int32)
     reading = scan(np.linspace(0, RANGE, first[-1]), real, all_readings="ALL_READINGS" in names)
     readings, order = len(reading), an_order(count)
+    each = strands_in(readings) if "STRANDED" in names else readings
     expected, found = on_both(
         device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
-        ray, first, reading, terms, nothing(real), nothing(real), first, room_for(count, readings, way, real),
+        ray, first, reading, terms, nothing(real), nothing(real), first, room_for(count, each, way, real),
         *OCCUPIED.shape, count, rays, readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE,
-        *strides(count, readings, way), spread, 1,
+        *strides(count, each, way), spread, 1,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
-    return parts_at(found["parts"], count, readings, way), parts_at(expected["parts"], count, readings, way)
+    return parts_at(found["parts"], count, each, way), parts_at(expected["parts"], count, each, way)
 
 
 @pytest.mark.parametrize("names", [(), ("ORDERED",)])
@@ -172,6 +173,17 @@ def test_tiles_of_beams(way: str, names: tuple[str, ...], device: Backend) -> No
 
 # Each set of flags is compiled: as in test_kernel_scores, each mixture once plain in float32 and once full in float64.
 TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
+
+
+@pytest.mark.parametrize("names", [(), ("ORDERED", "ALL_READINGS")])
+@pytest.mark.parametrize("way", WAYS)
+def test_tiles_that_add_up_strands(way: str, names: tuple[str, ...], device: Backend) -> None:
+    """The sums of strands, no more and no fewer, are those of what single readings add, to the bit."""
+    for count, rays, spread in itertools.product((1, 17), (1, 3, 4, 16, 21, 53), SPREADS):
+        found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, way, (*names, "STRANDED"))
+        single, _ = beam_tiles(device, "book", np.float32, count, rays, spread, way, names)
+        assert differing(found, strand_sums(single)) == 0
+        assert_near(found, expected.astype(np.float64), 8 * per_beam(expected, np.float32))
 
 
 @pytest.mark.parametrize(("names", "real"), [*zip(TILED, PRECISIONS, strict=True)])

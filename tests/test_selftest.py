@@ -15,6 +15,7 @@ from gpusense.backends import get_backend
 from gpusense.backends._numpy import NumpyBackend
 from gpusense.cli import main
 from gpusense.reference import beam, distance, echo, mixture, order, ranges, sums
+from gpusense.reference.error_free import block_sums, strand_sums
 from gpusense.replay import Recorder, replay
 from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
 
@@ -68,13 +69,14 @@ def test_per_beam_bound_scales_with_the_logarithm_and_is_zero_at_infinity():
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 1000, 10_000])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
-def test_per_scan_bound_holds_for_perturbed_beams(count, scale):
+@pytest.mark.parametrize("plainly", [block_sums, strand_sums])
+def test_per_scan_bound_holds_for_perturbed_beams(plainly, scale, count):
     """Worst-case errors of every beam, added up in float32 as the kernels do, stay within the bound."""
     random = np.random.default_rng(count)
     truth = random.normal(-2, 3, (20, count)) * scale
     for sign in (1, -1, random.choice([-1, 1], truth.shape)):
         wrong = truth + 0.9 * sign * per_beam(truth, np.float32)
-        found = beam.sum_terms(frozenset(), wrong.astype(np.float32), np.float32(-7), np.float32(0.5))
+        found = beam.sum_terms(frozenset(), wrong.astype(np.float32), np.float32(-7), np.float32(0.5), plainly)
         exact = 0.5 * (np.array([math.fsum(row) for row in truth]) - 7)
         bound = per_scan(truth, np.float32, fixed=-7, temperature=0.5)
         assert (np.abs(found - exact) <= bound).all()

@@ -15,7 +15,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
-from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, tiles_of
+from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, stranded, tiles_of
 from gpusense.cones import bins_of, cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
@@ -27,7 +27,7 @@ from gpusense.models.scan_model import ScanModel
 from gpusense.models.terms import HIGH_PEAK
 from gpusense.parameters import BeamParameters, IncidenceParameters
 from gpusense.plan import Omission, launch_omissions, scene_omissions, share
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.error_free import BLOCK_TERMS, strands_in
 from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
@@ -357,15 +357,18 @@ class BeamModel(ScanModel):
                 flags |= {"ORDERED"} if order is not None else set()
                 self._last_code = frozenset(flags)
                 order = self._none if order is None else order
-                parts = space.empty("parts", count * readings, real)
                 tiles, spread = tiles_of(count, rays)
+                each, block = readings, BLOCK_TERMS
+                if not shared and stranded(rays, spread):
+                    self._last_code |= {"STRANDED"}
+                    each, block = int(strands_in(readings)), 1
+                parts = space.empty("parts", count * each, real)
                 backend.compile("beam_tiles", self._last_code)(
                     (tiles,), table, normals, placed.cell, placed.pose, order, ray, first, reading, self._terms_there,
                     self._edges, self._sensor, start, parts, *world, 1, count, spread, per_scan,
                 )  # fmt: skip
                 backend.compile("sum_parts", self._last_code)(
-                    (count,), parts, order, counts, fixed_of, result, count, readings, BLOCK_TERMS, 1, count,
-                    *scalars, per_scan,
+                    (count,), parts, order, counts, fixed_of, result, count, each, block, 1, count, *scalars, per_scan,
                 )  # fmt: skip
                 space.keep()
                 return parts
@@ -386,6 +389,9 @@ class BeamModel(ScanModel):
         vectors = self._vectors[:, None] if self._cones.rays == 1 else self._cone_vectors
         return Scene(self._caster.map, vectors, top=top if self._cells else math.inf)
 
+    def _bound_parts(self, count: int, places: int) -> tuple[int, int]:
+        return (int(strands_in(places)), 1) if stranded(places, tiles_of(count, places)[1]) else (places, BLOCK_TERMS)
+
     def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
         normals, kinds = self._caster.normals(region, self._cones.flags), len(self._kinds)
         flags = self._components | self._scene_flags() | self._caster.flags | self._cones.flags
@@ -396,7 +402,8 @@ class BeamModel(ScanModel):
 
         def score(placed: Placed, headings: frozenset[str], count: int, scan: PlacedScan, parts: Buffer) -> None:
             tiles, spread = tiles_of(count, scan.places)
-            self._backend.compile("beam_tiles", frozenset(flags | headings))(
+            own = {"STRANDED"} if scan.block == 1 else set()
+            self._backend.compile("beam_tiles", frozenset(flags | headings | own))(
                 (tiles,), table, normals, placed.cell, placed.pose, self._none, scan.point, self._one_each,
                 scan.reading, self._terms_there, self._edges, self._sensor, self._none, parts, region.rows, region.cols,
                 count, scan.places, scan.places, kinds, *world, 1, count, spread, count,

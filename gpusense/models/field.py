@@ -287,6 +287,9 @@ class LikelihoodFieldModel(ScanModel):
         careful = "CAREFUL" in self._flags
         return Scene(self._map, self._vectors[:, None], guard_scale=self._guard, careful=careful)
 
+    def _bound_parts(self, count: int, places: int) -> tuple[int, int]:
+        return -(-places // BLOCK_TERMS), 1
+
     def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
         # Missing readings have no place in the map, so cells are not found by rounding alone.
         blocks = self._backend.compile("field_blocks", self._flags | {"ALL_READINGS"})

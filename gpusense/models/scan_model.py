@@ -393,6 +393,10 @@ class ScanModel(ABC):
         """What bound calls are made of."""
 
     @abstractmethod
+    def _bound_parts(self, count: int, places: int) -> tuple[int, int]:
+        """PlacedScan.parts and .block of launches for so many particles and readings."""
+
+    @abstractmethod
     def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
         """What starts to find what readings that are on the device add, with the table of the whole map."""
 

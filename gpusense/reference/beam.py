@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from gpusense.reference.compat import compat_density
 from gpusense.reference.echo import echoes, incidence_terms
-from gpusense.reference.error_free import BLOCK_TERMS, add_term
+from gpusense.reference.error_free import add_term, strand_sums, strands_in
 from gpusense.reference.mixture import log_density
 from gpusense.reference.ranges import cast_ranges
 from gpusense.reference.ray import expected_range
@@ -98,7 +100,7 @@ def score_beams(
             term = np.where(np.isnan(z), 0, atom).astype(real)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
-        log_p[begin:end] = sum_terms(flags, term, fixed, temperature)
+        log_p[begin:end] = sum_terms(flags, term, fixed, temperature, strand_sums)
 
 
 def beam_tiles(
@@ -137,30 +139,37 @@ def beam_tiles(
     spread: int,
     per_scan: int,
 ) -> None:
-    """What each reading adds, at parts[place * across + k * along], which GPUs find in tiles of particles and rays."""
+    """What each reading adds, at parts[place * across + k * along], which GPUs find in tiles of particles and rays.
+
+    With STRANDED it is the sum of each strand, in place of that of reading k.
+    """
     places = np.arange(particles)
     if "ORDERED" in flags:
         places[order[:particles]] = np.arange(particles)
     if "SCANS" in flags:
         for scan, own in particles_of_scans(particles, per_scan):
             begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
-            found = np.empty((own.stop - own.start) * int(own_first[some]), pose.dtype)
+            each = int(own_first[some])
+            each = strands_in(each) if "STRANDED" in flags else each
+            found = np.empty((own.stop - own.start) * each, pose.dtype)
             beam_tiles(
                 flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[own], pose[own], order,
                 ray[begin * cone_rays :], own_first, own_reading, terms, edges, sensor, start, found, rows, cols,
                 own.stop - own.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
-                cells, per_metre, limit, resolution, range_max, int(own_first[some]), 1, spread, per_scan,
+                cells, per_metre, limit, resolution, range_max, each, 1, spread, per_scan,
             )  # fmt: skip
-            at = places[own, None] * across + np.arange(own_first[some]) * along
+            at = places[own, None] * across + np.arange(each) * along
             parts[at] = found.reshape(at.shape)
         return
-    real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
+    real, single = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
         flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start,
-        sensor, np.empty(particles, pose.dtype), each, rows, cols, particles, rays, readings, kinds, cone_rays,
+        sensor, np.empty(particles, pose.dtype), single, rows, cols, particles, rays, readings, kinds, cone_rays,
         critical, bins, slack, tolerance, cells, per_metre, limit, resolution, range_max, real(0), real(1), 1, 0,
     )  # fmt: skip
-    parts[places[:, None] * across + np.arange(readings) * along] = each.reshape(particles, readings)
+    term = single.reshape(particles, readings)
+    term = strand_sums(term) if "STRANDED" in flags else term
+    parts[places[:, None] * across + np.arange(term.shape[1]) * along] = term
 
 
 def readings_of_scan(
@@ -174,18 +183,21 @@ def readings_of_scan(
     return begin, rays, own - own[0], reading[own[0] :]
 
 
-def sum_terms(flags: frozenset[str], term: np.ndarray, fixed: np.floating, temperature: np.floating) -> np.ndarray:
+def sum_terms(
+    flags: frozenset[str],
+    term: np.ndarray,
+    fixed: np.floating,
+    temperature: np.floating,
+    plainly: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
     """Sum of (M, K) terms and a fixed one, in the order of the beams, or its logarithm; -inf where one term is.
 
-    BLOCK_TERMS terms are added plainly, then the block's sum to a compensated total.
+    What is added plainly is block_sums or strand_sums; these go to a compensated total.
     """
     finite = np.where(np.isneginf(term), 0, term).astype(term.dtype)
     total = (np.full(len(term), fixed, term.dtype), np.zeros(len(term), term.dtype))
-    for first in range(0, term.shape[1] + 1, BLOCK_TERMS):
-        block = np.zeros(len(term), term.dtype)
-        for k in range(first, min(first + BLOCK_TERMS, term.shape[1])):
-            block += finite[:, k]
-        total = add_term(total, block)
+    for part in plainly(finite).T:
+        total = add_term(total, part)
     scan = total[0] + total[1]
     scan = np.log(scan) if "CUBES" in flags else scan
     return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan)

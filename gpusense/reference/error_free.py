@@ -5,9 +5,12 @@ Source: Knuth (``two_sum``), Dekker and Veltkamp (``two_product``).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 BLOCK_TERMS = 16
+STRANDS = 4
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -50,3 +53,29 @@ def add_term(total: tuple[np.ndarray, np.ndarray], term: np.ndarray) -> tuple[np
     """One more term in a compensated sum: the running sum, and what its roundings lost."""
     head, lost = two_sum(total[0], term)
     return head, total[1] + lost
+
+
+def strands_in(terms: Any) -> Any:
+    """How many strands so many terms have: STRANDS in each whole block, of what is left as many as there are terms."""
+    return terms // BLOCK_TERMS * STRANDS + np.minimum(terms % BLOCK_TERMS, STRANDS)
+
+
+def block_sums(term: np.ndarray) -> np.ndarray:
+    """Plain sums of the terms of each block, of (M, K) terms."""
+    return _sums(term, 1)
+
+
+def strand_sums(term: np.ndarray) -> np.ndarray:
+    """(M, strands_in(K)) plain sums of every STRANDS-th of the terms of each block, of (M, K) terms."""
+    return _sums(term, STRANDS)[:, : strands_in(term.shape[1])]
+
+
+def _sums(term: np.ndarray, strands: int) -> np.ndarray:
+    rows, count = term.shape
+    blocks = np.zeros((rows, -(-count // BLOCK_TERMS) * BLOCK_TERMS), term.dtype)
+    blocks[:, :count] = term
+    blocks = blocks.reshape(rows, -1, BLOCK_TERMS // strands, strands)
+    total = np.zeros_like(blocks[:, :, 0])
+    for k in range(BLOCK_TERMS // strands):
+        total += blocks[:, :, k]
+    return total.reshape(rows, -1)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
-from gpusense.reference.error_free import BLOCK_TERMS, Pair, pair_product, pair_sum
+from gpusense.reference.error_free import Pair, block_sums, pair_product, pair_sum
 from gpusense.reference.scans import particles_of_scans
 
 BLOCK = 1 << 18
@@ -134,7 +134,7 @@ def score_field(
             term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
         if "PER_BEAM" in flags:
             parts[begin * readings : some.stop * readings] = term.ravel()
-        log_p[some] = sum_terms(flags, term, fixed, temperature)
+        log_p[some] = sum_terms(flags, term, fixed, temperature, block_sums)
 
 
 def field_blocks(
@@ -174,8 +174,5 @@ def field_blocks(
         np.empty(particles, pose.dtype), each, rows, cols, particles, readings, real(0), real(0), real(1), 1, 0,
     )  # fmt: skip
     each = each.reshape(particles, readings)
-    for block, first in enumerate(range(0, readings, BLOCK_TERMS)):
-        total = np.zeros(particles, pose.dtype)
-        for k in range(first, min(first + BLOCK_TERMS, readings)):
-            total += each[:, k]
-        parts[np.arange(particles) * across + block * along] = total
+    sums = block_sums(each)
+    parts[np.arange(particles)[:, None] * across + np.arange(sums.shape[1]) * along] = sums

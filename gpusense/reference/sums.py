@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.error_free import add_term
+from gpusense.reference.error_free import add_term, strand_sums, strands_in
 
 
 def sum_parts(
@@ -25,18 +25,19 @@ def sum_parts(
 ) -> None:
     """Of each particle count numbers, each along farther than the last, from parts[place * across] on.
 
-    A block of them is added plainly, then its sum to a compensated total. Of several scans each has a count of its own;
-    what lies beyond it counts as 0, which changes no sum.
+    They are sums of blocks or strands, and block is 1, or single terms, whose strands are added plainly first. All go
+    to a compensated total. Of several scans each has a count of its own, with STRANDED of readings, whose strands are
+    added; what lies beyond it counts as 0, which changes no sum.
     """
     places, own = np.arange(particles) * across, order[:particles] if "ORDERED" in flags else np.arange(particles)
     counted, lead = np.full(particles, count), np.full(particles, fixed, parts.dtype)
     if "SCANS" in flags:
         counted, lead = counts[own // per_scan], fixed_of[own // per_scan]
+        counted = strands_in(counted) if "STRANDED" in flags else counted
     total = (lead, np.zeros(particles, parts.dtype))
-    for first in range(0, count, block):
-        part = np.zeros(particles, parts.dtype)
-        for k in range(first, min(first + block, count)):
-            part += np.where(k < counted, parts[places + k * along], 0)
+    k = np.arange(count)
+    term = np.where(k < counted[:, None], parts[places[:, None] + k * along], parts.dtype.type(0))
+    for part in (term if block == 1 else strand_sums(term)).T:
         total = add_term(total, part)
     scan = total[0] + total[1]
     scan = np.log(scan) if "CUBES" in flags else scan

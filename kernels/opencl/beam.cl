@@ -35,8 +35,7 @@ real scan_log(const real sum) {
 #endif
 
 #if WIDE
-// One work-item a particle, LANES rays at a time, each with one reading. Lanes are added in their order, so that sums
-// are those of the scalar kernel.
+// One work-item a particle, LANES rays at a time, a block, each with one reading. Sums are those of the scalar kernel.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
@@ -58,7 +57,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     const real lead = fixed;
 #endif
     real2 total = (real2)(lead, 0);
-    real block = 0, one[LANES];
+    real one[LANES];
     for (int k = 0; k < size; k += LANES) {
         lanes x, y;
         load_rays(ray, k, size, &x, &y);
@@ -72,19 +71,18 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
             for (int i = 0; i < LANES; ++i) one[i] = reading[k + min(i, count - 1)];
             z = load_lanes(0, one);
         }
-        store_lanes(log_density(z, expected, terms), 0, one);
-        for (int i = 0; i < count; ++i) {
+        lanes term = log_density(z, expected, terms);
 #if PER_BEAM
-            parts[(long)n * readings + k + i] = one[i];
+        store_lanes(term, 0, one);
+        for (int i = 0; i < count; ++i) parts[(long)n * readings + k + i] = one[i];
 #endif
-            block += one[i];
+        if (count < LANES) {
+            store_lanes(term, 0, one);
+            for (int i = count; i < LANES; ++i) one[i] = 0;
+            term = load_lanes(0, one);
         }
-        if ((k + LANES) % BLOCK_TERMS == 0) {
-            total = add_term(total, block);
-            block = 0;
-        }
+        total = add_strands(total, ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi);
     }
-    total = add_term(total, block);
     log_p[n] = temperature * (total.x + total.y);
 }
 #else
@@ -117,7 +115,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     const real lead = fixed;
 #endif
     real2 total = (real2)(lead, 0);
-    real block = 0;
+    real strands[STRANDS] = {0, 0, 0, 0};
 #if !LINEAR
     int impossible = 0;
 #endif
@@ -146,20 +144,20 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
             parts[(long)n * readings + k] = term;
 #endif
 #if LINEAR
-            block += term;
+            strands[k % STRANDS] += term;
 #else
             if (term == -INFINITY)
                 impossible = 1;
             else
-                block += term;
+                strands[k % STRANDS] += term;
 #endif
             if ((k + 1) % BLOCK_TERMS == 0) {
-                total = add_term(total, block);
-                block = 0;
+                total = add_strands(total, vload4(0, strands));
+                for (int i = 0; i < STRANDS; ++i) strands[i] = 0;
             }
         }
     }
-    total = add_term(total, block);
+    total = add_strands(total, vload4(0, strands));
 #if LINEAR
     log_p[n] = temperature * scan_log(total.x + total.y);
 #else
@@ -167,8 +165,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
 }
 
-// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], fewer than 2^31
-// numbers. What is told not to overlap need not be read again after each of them is written.
+// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], or with the flag
+// STRANDED the sum of each strand in place of that of reading k; fewer than 2^31 numbers. A work-item then takes whole
+// strands. What is told not to overlap need not be read again after each of them is written.
 kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
                        global const int2 *restrict pose_cell, global const real4 *restrict pose,
                        global const int *restrict order, global const real2 *restrict ray,
@@ -202,7 +201,13 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
 #else
     const int size = rays, begin = 0;
 #endif
+#if STRANDED
+    const int strand = item % TILE_RAYS;
+    real sum = 0;
+    for (int r = tile_group(item, spread) * BLOCK_TERMS + strand; r < size;) {
+#else
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
+#endif
 #if ECHO
         const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, own_pose, ray + r * cone_rays,
                                        cone_rays, critical, limit, bins, slack, tolerance);
@@ -223,7 +228,17 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         {
 #endif
             const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
+#if STRANDED
+            sum += term;
+            r += STRANDS;
+            if (r >= size || r % BLOCK_TERMS == strand) {
+                parts[place * across + ((r - STRANDS) / BLOCK_TERMS * STRANDS + strand) * along] = sum;
+                sum = 0;
+                r += ((1 << spread) - 1) * BLOCK_TERMS;
+            }
+#else
             parts[place * across + k * along] = term;
+#endif
         }
     }
 }

@@ -45,8 +45,17 @@ real2 pair_product(const real2 a, const real2 b) {
 // compensating every term, at nearly the cost of none.
 #define BLOCK_TERMS 16
 
+// A block of the beam model's sums has so many strands, each of every fourth term: a strand is added plainly, then its sum
+// to the compensated total. So work-items and lanes that share a block need not ask one another for terms.
+#define STRANDS 4
+
 // One more term in a compensated sum: total.x is the running sum, total.y what its roundings lost.
 real2 add_term(const real2 total, const real term) {
     const real2 sum = two_sum(total.x, term);
     return (real2)(sum.x, total.y + sum.y);
+}
+
+// A block more, by its strands.
+real2 add_strands(const real2 total, const real4 strands) {
+    return add_term(add_term(add_term(add_term(total, strands.x), strands.y), strands.z), strands.w);
 }

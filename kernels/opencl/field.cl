@@ -153,31 +153,34 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
 #else
     const real4 low = (real4)(0);
 #endif
+#if QUICK
+    const int2 from = table_origin(origin, cols);
+    const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
+#endif
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
         real sum = 0;
 #if QUICK
         real worst = 0, off;
-        const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
-        const real sure = (real)0.5 - guard[block];
+        const real sure = sure_of(guard[block]);
         if (begin + BLOCK_TERMS <= size) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) {
-                const int2 cell = origin + rounded_cell(lowered, point[begin + i], &off);
+                const int2 near = rounded_cell(lowered, point[begin + i], &off);
                 worst = fmax(worst, off);
-                sum += table[table_cell(cell.x, cell.y, rows, cols)];
+                sum += table[table_cell(near, from, rows, cols)];
             }
         } else {
             for (int k = begin; k < end; ++k) {
-                const int2 cell = origin + rounded_cell(lowered, point[k], &off);
+                const int2 near = rounded_cell(lowered, point[k], &off);
                 worst = fmax(worst, off);
-                sum += table[table_cell(cell.x, cell.y, rows, cols)];
+                sum += table[table_cell(near, from, rows, cols)];
             }
         }
         if (worst > sure) {
             sum = 0;
             for (int k = begin; k < end; ++k) {
-                int2 cell = rounded_cell(lowered, point[k], &off);
+                int2 cell = rounded_cell(lowered, point[k], &off) - ROUNDING_BITS;
                 if (off > sure) cell = end_point(own, low, point[k], point_low[k], 0, guard[block]).cell;
                 sum += table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)];
             }

@@ -1,9 +1,10 @@
 // Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings.
 // requires: error_free
 
-// One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block of
-// them, 1 or BLOCK_TERMS, is added plainly, then its sum to a compensated total. BLOCK_TERMS numbers are read before any
-// is added, so that a work-item waits once for all of them; what lies beyond the last counts as 0, which changes no sum.
+// One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. They are sums
+// of blocks or strands, and block is 1, or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first.
+// All go to a compensated total. With STRANDED counts are of readings, and what is added are their strands. BLOCK_TERMS numbers are read before any is added, so that a work-item waits once for all
+// of them; what lies beyond the last counts as 0, which changes no sum.
 kernel void sum_parts(global const real *parts, global const int *order, global const int *counts,
                       global const real *fixed_of, global real *log_p, const int particles, const int count,
                       const int block, const int across, const int along, const real fixed, const real temperature,
@@ -16,7 +17,11 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
     const int n = place;
 #endif
 #if SCANS
+#if STRANDED
+    const int terms = counts[n / per_scan], own = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
+#else
     const int own = counts[n / per_scan];
+#endif
     const real lead = fixed_of[n / per_scan];
 #else
     const int own = count;
@@ -25,17 +30,17 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
     global const real *part = parts + (long)place * across;
     real2 total = (real2)(lead, 0);
     for (int first = 0; first < own; first += BLOCK_TERMS) {
-        real term[BLOCK_TERMS], sum = 0;
+        real term[BLOCK_TERMS];
 #pragma unroll
         for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? part[(long)(first + i) * along] : 0;
 #pragma unroll
         for (int i = 0; i < BLOCK_TERMS; ++i) {
             if (block == 1)
                 total = add_term(total, term[i]);
-            else
-                sum += term[i];
+            else if (i >= STRANDS)
+                term[i % STRANDS] += term[i];
         }
-        if (block != 1) total = add_term(total, sum);
+        if (block != 1) total = add_strands(total, (real4)(term[0], term[1], term[2], term[3]));
     }
 #if CUBES
     log_p[n] = temperature * log(total.x + total.y);

@@ -10,10 +10,10 @@ import warp as wp
 
 from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
-from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision, reader, writer
+from .error_free import BLOCK_TERMS, STRANDS
+from .prelude import kernel, precision, reader, work_item, writer
 from .ranges import caster_of
-from .tiles import tile_place, tile_ray, tile_step
+from .tiles import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
 
 
 @functools.cache
@@ -30,12 +30,13 @@ def make(name, flags):
     SENSOR_TABLE = "SENSOR_TABLE" in flags
     CUBES = "CUBES" in flags
     log_density = mixture.functions(flags).log_density
-    add_term = error_free.functions(flags).add_term
+    add_strands = error_free.functions(flags).add_strands
     SHARED_RAYS = "SHARED_RAYS" in flags
     ALL_READINGS = "ALL_READINGS" in flags
     PER_BEAM = "PER_BEAM" in flags
     LINEAR = "LINEAR" in flags
     ORDERED = "ORDERED" in flags
+    STRANDED = "STRANDED" in flags
     ECHO = "ECHO" in flags
     INCIDENCE = "INCIDENCE" in flags
     SCANS = "SCANS" in flags
@@ -136,7 +137,7 @@ def make(name, flags):
                 readings_before = first[before]
             lead = fixed_of[scan]
         total = vec2(lead, ZERO)
-        block = real(0.0)
+        strands = vec4()
         impossible = bool(False)
         for r in range(size):
             own = terms
@@ -164,22 +165,23 @@ def make(name, flags):
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
-                    block += term
+                    strands[k % STRANDS] = strands[k % STRANDS] + term
                 else:
                     if term == NEVER:
                         impossible = True
                     else:
-                        block += term
+                        strands[k % STRANDS] = strands[k % STRANDS] + term
                 if (k + 1) % BLOCK_TERMS == 0:
-                    total = add_term(total, block)
-                    block = ZERO
-        total = add_term(total, block)
+                    total = add_strands(total, strands)
+                    strands = vec4()
+        total = add_strands(total, strands)
         if impossible:
             log_p[n] = NEVER
         else:
             log_p[n] = temperature * scan_log(total.x + total.y)
 
-    # For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along].
+    # For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], or with the
+    # flag STRANDED the sum of each strand in place of that of reading k. A work-item then takes whole strands.
     @kernel
     def beam_tiles(
         map_table: wp.array(dtype=ENTRY),
@@ -216,7 +218,7 @@ def make(name, flags):
         spread: wp.int32,
         per_scan: wp.int32,
     ):
-        item = wp.tid()
+        item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:
             return
@@ -235,7 +237,12 @@ def make(name, flags):
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-        r = tile_ray(item, spread)
+        strand = item % TILE_RAYS
+        summed = real(0.0)
+        if STRANDED:
+            r = tile_group(item, spread) * BLOCK_TERMS + strand
+        else:
+            r = tile_ray(item, spread)
         while r < size:
             own = terms
             if ECHO:
@@ -259,8 +266,19 @@ def make(name, flags):
             while k < end:
                 z = number_at(reading, readings_before + k)
                 term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
-                put(parts, place * across + k * along, term)
+                if STRANDED:
+                    summed += term
+                else:
+                    put(parts, place * across + k * along, term)
                 k += 1
-            r += tile_step(spread)
+            if STRANDED:
+                r += STRANDS
+                if r >= size or r % BLOCK_TERMS == strand:
+                    q = (r - STRANDS) // BLOCK_TERMS * STRANDS + strand
+                    put(parts, place * across + q * along, summed)
+                    summed = ZERO
+                    r += ((1 << spread) - 1) * BLOCK_TERMS
+            else:
+                r += tile_step(spread)
 
     return {"score_beams": score_beams, "beam_tiles": beam_tiles}[name]

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import error_free
-from .prelude import precision
+from .prelude import fused, precision
 
 FIELD_RING = wp.constant(2)
 
@@ -25,7 +25,7 @@ def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """table_cell, careful_offset, whole_cells, end_point and rounded_cell specialised by the flags."""
+    """careful_offset, whole_cells, end_point, sure_of, rounded_cell, table_origin and table_cell for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
@@ -34,21 +34,16 @@ def functions(flags):
     CAREFUL = "CAREFUL" in flags
     INSIDE = "INSIDE" in flags
     SHARP = "SHARP" in flags
+    one = "double" if "FLOAT64" in flags else "float"
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_ONE = real(-1.0)
     EDGE = real(2.0**-33)
     # Adding and taking off a large number rounds to nearest, and the bits of the sum hold the integer.
     ROUNDING = real(1.5 * 2.0**52 if "FLOAT64" in flags else 1.5 * 2.0**23)
     bits = wp.int64 if "FLOAT64" in flags else wp.int32
-    ROUNDING_BITS = bits(0x4338000000000000 if "FLOAT64" in flags else 0x4B400000)
-
-    # The same as field_cell where no end point of the cloud leaves the table.
-    @wp.func
-    def table_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
-        if INSIDE:
-            return (row + FIELD_RING) * (cols + 2 * FIELD_RING) + col + FIELD_RING
-        else:
-            return field_cell(col, row, rows, cols)
+    # What cells have too much that are the bits of a number to which ROUNDING was added.
+    ROUNDING_BITS = wp.int32(0 if "FLOAT64" in flags else 0x4B400000)
+    multiply_add = fused(real)
 
     # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
     # the working precision.
@@ -124,22 +119,54 @@ def functions(flags):
         end.to_next_y = to_next_y
         return end
 
-    # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest. How far the place is off
-    # a cell's centre comes second.
+    # What is left of half a cell where end points are off by guard if products are rounded, by 3.12 eps of the reading
+    # and 1.5 altogether. On GPUs they are not, and it is 2 eps and 1.6.
+    @wp.func_native(f"""
+    #if defined(__CUDA_ARCH__)
+    return static_cast<{one}>(0.5) - static_cast<{one}>(0.6875) * guard;
+    #else
+    return static_cast<{one}>(0.5) - guard;
+    #endif
+    """)
+    def sure_of(guard: real) -> real: ...
+
+    # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest, and ROUNDING_BITS too
+    # much. How far the place is off a cell's centre comes second.
     @wp.func
     def rounded_cell(lowered: vec4, point: vec2):
-        x = lowered.x + (lowered.z * point.x - lowered.w * point.y)
-        y = lowered.y + (lowered.w * point.x + lowered.z * point.y)
+        x = multiply_add(lowered.z, point.x, multiply_add(-lowered.w, point.y, lowered.x))
+        y = multiply_add(lowered.w, point.x, multiply_add(lowered.z, point.y, lowered.y))
         to_x = x + ROUNDING
         to_y = y + ROUNDING
-        cell = wp.vec2i(int(wp.cast(to_x, bits) - ROUNDING_BITS), int(wp.cast(to_y, bits) - ROUNDING_BITS))
-        return cell, wp.max(wp.abs(x - (to_x - ROUNDING)), wp.abs(y - (to_y - ROUNDING)))
+        near = wp.vec2i(wp.int32(wp.cast(to_x, bits)), wp.int32(wp.cast(to_y, bits)))
+        return near, wp.max(wp.abs(x - (to_x - ROUNDING)), wp.abs(y - (to_y - ROUNDING)))
+
+    # Index of such a cell of the padded table, seen from what table_origin makes of the pose's cell. Where no end point
+    # of the cloud leaves the table that is a sum and a product modulo 2^32: what is too much is taken off once for all.
+    @wp.func
+    def table_origin(origin: wp.vec2i, cols: wp.int32):
+        if INSIDE:
+            stride = cols + 2 * FIELD_RING
+            more = FIELD_RING - ROUNDING_BITS
+            return wp.vec2i((origin.y + more) * stride + origin.x + more, stride)
+        else:
+            return wp.vec2i(origin.x - ROUNDING_BITS, origin.y - ROUNDING_BITS)
+
+    @wp.func
+    def table_cell(near: wp.vec2i, start: wp.vec2i, rows: wp.int32, cols: wp.int32):
+        if INSIDE:
+            return near.y * start.y + (near.x + start.x)
+        else:
+            return field_cell(start.x + near.x, start.y + near.y, rows, cols)
 
     return SimpleNamespace(
-        table_cell=table_cell,
+        ROUNDING_BITS=ROUNDING_BITS,
         careful_offset=careful_offset,
         whole_cells=whole_cells,
         EndPoint=EndPoint,
         end_point=end_point,
+        sure_of=sure_of,
         rounded_cell=rounded_cell,
+        table_origin=table_origin,
+        table_cell=table_cell,
     )

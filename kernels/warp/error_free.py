@@ -14,12 +14,16 @@ from .prelude import precision
 # compensating every term, at nearly the cost of none.
 BLOCK_TERMS = wp.constant(16)
 
+# A block of the beam model's sums has so many strands, each of every fourth term: a strand is added plainly, then its
+# sum to the compensated total. So work-items and lanes that share a block need not ask one another for terms.
+STRANDS = wp.constant(4)
+
 
 @functools.cache
 def functions(flags):
-    """two_sum, high_half, two_product, pair_sum, pair_product and add_term in the precision of the flags."""
+    """two_sum, high_half, two_product, pair_sum, pair_product, add_term and add_strands specialised by the flags."""
     types = precision(flags)
-    real, vec2 = types.real, types.vec2
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
     SPLITTER = real(134217729.0 if "FLOAT64" in flags else 4097.0)
 
     # a + b = sum.x + sum.y exactly.
@@ -63,6 +67,11 @@ def functions(flags):
         head = two_sum(total.x, term)
         return vec2(head.x, total.y + head.y)
 
+    # A block more, by its strands.
+    @wp.func
+    def add_strands(total: vec2, strands: vec4):
+        return add_term(add_term(add_term(add_term(total, strands[0]), strands[1]), strands[2]), strands[3])
+
     return SimpleNamespace(
         two_sum=two_sum,
         high_half=high_half,
@@ -70,4 +79,5 @@ def functions(flags):
         pair_sum=pair_sum,
         pair_product=pair_product,
         add_term=add_term,
+        add_strands=add_strands,
     )

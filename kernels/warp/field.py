@@ -13,7 +13,7 @@ from . import end_point as end_points
 from . import error_free
 from .end_point import field_cell
 from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision, reader
+from .prelude import kernel, precision, reader, work_item
 
 # Particles of a work-group of field_blocks.
 GROUP = wp.constant(64)
@@ -125,7 +125,8 @@ def make(name, flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     reading_value = functions(flags).reading_value
     ends = end_points.functions(flags)
-    table_cell, end_point, rounded_cell = ends.table_cell, ends.end_point, ends.rounded_cell
+    end_point, rounded_cell, ROUNDING_BITS = ends.end_point, ends.rounded_cell, ends.ROUNDING_BITS
+    table_origin, table_cell, sure_of = ends.table_origin, ends.table_cell, ends.sure_of
     add_term = error_free.functions(flags).add_term
     CAREFUL = "CAREFUL" in flags
     CUBES = "CUBES" in flags
@@ -215,6 +216,8 @@ def make(name, flags):
             # A block's cells, then its look-ups. On processors the first loop becomes vectors, which takes a third of
             # the time; with points read as vec2, or a maximum in place of a count, it would not.
             lowered = from_pose - vec4(HALF, HALF, ZERO, ZERO)
+            start_cell = table_origin(origin, cols)
+            sure = sure_of(guard)
             cells = block_cells()
             while k < size:
                 first = begin + k
@@ -222,9 +225,9 @@ def make(name, flags):
                 doubtful = int(0)
                 i = int(0)
                 while i < width:
-                    cell, off = rounded_cell(lowered, point_at(point, first + i))
-                    doubtful += int(off > HALF - guard)
-                    cells[i] = field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)
+                    near, off = rounded_cell(lowered, point_at(point, first + i))
+                    doubtful += int(off > sure)
+                    cells[i] = table_cell(near, start_cell, rows, cols)
                     i += 1
                 if doubtful > 0:
                     i = int(0)
@@ -288,7 +291,7 @@ def make(name, flags):
         spread: wp.int32,
         per_scan: wp.int32,
     ):
-        item = wp.tid()
+        item = work_item(wp.tid())
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
         if n >= particles:
             return
@@ -297,7 +300,9 @@ def make(name, flags):
         low = vec4()
         if CAREFUL:
             low = pose_at(pose_low, n)
-        lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+        if QUICK:
+            lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+            start_cell = table_origin(origin, cols)
         before = int(0)
         size = readings
         guards = int(0)
@@ -313,25 +318,26 @@ def make(name, flags):
             total = real(0.0)
             own_guard = number_at(guard, guards + block)
             if QUICK:
-                sure = HALF - own_guard
+                sure = sure_of(own_guard)
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
                     for i in range(WHOLE_BLOCK):
-                        cell, off = rounded_cell(lowered, point_at(point, begin + i))
+                        near, off = rounded_cell(lowered, point_at(point, begin + i))
                         worst = wp.max(worst, off)
-                        total += number_at(table, table_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
+                        total += number_at(table, table_cell(near, start_cell, rows, cols))
                 else:
                     k = begin
                     while k < end:
-                        cell, off = rounded_cell(lowered, point_at(point, k))
+                        near, off = rounded_cell(lowered, point_at(point, k))
                         worst = wp.max(worst, off)
-                        total += number_at(table, table_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
+                        total += number_at(table, table_cell(near, start_cell, rows, cols))
                         k += 1
                 if worst > sure:
                     total = ZERO
                     k = begin
                     while k < end:
-                        cell, off = rounded_cell(lowered, point_at(point, k))
+                        near, off = rounded_cell(lowered, point_at(point, k))
+                        cell = wp.vec2i(near.x - ROUNDING_BITS, near.y - ROUNDING_BITS)
                         if off > sure:
                             to, to_low = point_at(point, k), point_at(point_low, k)
                             exact = end_point(own, low, to, to_low, ZERO, own_guard)

@@ -7,7 +7,7 @@ import functools
 import warp as wp
 
 from . import ray as ray_file
-from .prelude import kernel, precision
+from .prelude import kernel, precision, work_item
 
 # Samples of the particles; bins of rows, of columns and of headings; work-items that count starts.
 SAMPLES = wp.constant(256)
@@ -45,7 +45,7 @@ def order_fill(
     order: wp.array(dtype=wp.int32),
     particles: wp.int32,
 ):
-    n = wp.tid()
+    n = work_item(wp.tid())
     if n >= particles:
         return
     order[wp.atomic_add(bins, bin_of[n], 1)] = n
@@ -79,7 +79,7 @@ def make(name, flags):
         bins: wp.array(dtype=wp.int32),
         particles: wp.int32,
     ):
-        bin = wp.tid()
+        bin = work_item(wp.tid())
         if bin >= ALL_BINS:
             return
         bins[bin] = 0
@@ -112,7 +112,7 @@ def make(name, flags):
         bin_of: wp.array(dtype=wp.int32),
         particles: wp.int32,
     ):
-        n = wp.tid()
+        n = work_item(wp.tid())
         if n >= particles:
             return
         row = part_of(pose_cell[n].y, -bounds[0], bounds[1])

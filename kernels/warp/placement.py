@@ -8,7 +8,7 @@ import functools
 import warp as wp
 
 from . import heading
-from .prelude import kernel, precision
+from .prelude import kernel, precision, work_item
 
 # Cells farther off than this are as good as here: no range reaches them, and sums of two stay within int32.
 FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
@@ -56,7 +56,7 @@ def make(name, flags):
         cols: wp.int32,
         particles: wp.int32,
     ):
-        particle = wp.tid()
+        particle = work_item(wp.tid())
         if particle >= particles:
             return
         x = wp.float64(poses[3 * particle])

@@ -30,6 +30,17 @@ def precision(flags):
     return SimpleNamespace(real=wp.float32, vec2=wp.vec2f, vec4=wp.vec4f)
 
 
+# The work-item of a launch of one dimension, given wp.tid(): there Warp divides by a number that is 1, of 64 bits.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return blockIdx.x * blockDim.x + threadIdx.x;
+#else
+return tid;
+#endif
+""")
+def work_item(tid: wp.int32) -> wp.int32: ...
+
+
 _C_TYPES = {wp.float32: "float", wp.float64: "double", wp.int32: "int", wp.uint16: "unsigned short"}
 
 
@@ -73,3 +84,13 @@ def writer(dtype):
     def write(values: wp.array(dtype=dtype), i: wp.int32, value: dtype): ...
 
     return write
+
+
+@functools.cache
+def fused(real):
+    """A function of (a, b, c): a b + c, on GPUs with one rounding; only where a bound covers either."""
+
+    @wp.func_native("#if defined(__CUDA_ARCH__)\nreturn fma(a, b, c);\n#else\nreturn a * b + c;\n#endif\n")
+    def multiply_add(a: real, b: real, c: real) -> real: ...
+
+    return multiply_add

@@ -6,7 +6,7 @@ import warp as wp
 
 from . import bresenham, cddt, dda, lookup, march, raycast
 from . import ray as ray_file
-from .prelude import kernel, precision, reader, writer
+from .prelude import kernel, precision, reader, work_item, writer
 from .tiles import tile_place, tile_ray, tile_step
 
 CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
@@ -86,7 +86,7 @@ def make(name, flags):
         range_max: real,
         spread: wp.int32,
     ):
-        item = wp.tid()
+        item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:
             return

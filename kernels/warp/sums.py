@@ -5,27 +5,30 @@ import functools
 import warp as wp
 
 from . import error_free
-from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision, reader
+from .error_free import BLOCK_TERMS, STRANDS
+from .prelude import kernel, precision, reader, work_item
 
 
 @functools.cache
 def make(name, flags):
     """The kernel sum_parts specialised by the flags."""
     types = precision(flags)
-    real, vec2 = types.real, types.vec2
-    add_term = error_free.functions(flags).add_term
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    exact = error_free.functions(flags)
+    add_term, add_strands = exact.add_term, exact.add_strands
     number_at = reader(real)
     block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=real)
     ORDERED = "ORDERED" in flags
     CUBES = "CUBES" in flags
+    STRANDED = "STRANDED" in flags
     SCANS = "SCANS" in flags
     ZERO = real(0.0)
 
-    # One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. A block
-    # of them, 1 or BLOCK_TERMS, is added plainly, then its sum to a compensated total. BLOCK_TERMS numbers are read
-    # before any is added, so that a work-item waits once for all of them; what lies beyond the last counts as 0, which
-    # changes no sum. Of several scans each has a count of its own.
+    # One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. They are
+    # sums of blocks or strands, and block is 1, or single terms in blocks of BLOCK_TERMS, whose strands are added
+    # plainly first. All go to a compensated total. BLOCK_TERMS numbers are read before any is added, so that a
+    # work-item waits once for all of them; what lies beyond the last counts as 0, which changes no sum. Of several
+    # scans each has a count of its own, with STRANDED of readings, whose strands are added.
     @kernel
     def sum_parts(
         parts: wp.array(dtype=real),
@@ -42,7 +45,7 @@ def make(name, flags):
         temperature: real,
         per_scan: wp.int32,
     ):
-        place = wp.tid()
+        place = work_item(wp.tid())
         if place >= particles:
             return
         n = place
@@ -53,6 +56,8 @@ def make(name, flags):
         lead = fixed
         if SCANS:
             own = counts[n // per_scan]
+            if STRANDED:
+                own = own // BLOCK_TERMS * STRANDS + wp.min(own % BLOCK_TERMS, STRANDS)
             lead = fixed_of[n // per_scan]
         total = vec2(lead, ZERO)
         first = int(0)
@@ -65,10 +70,9 @@ def make(name, flags):
                 for i in range(BLOCK_TERMS):
                     total = add_term(total, term[i])
             else:
-                summed = real(0.0)
-                for i in range(BLOCK_TERMS):
-                    summed += term[i]
-                total = add_term(total, summed)
+                for i in range(STRANDS, BLOCK_TERMS):
+                    term[i % STRANDS] = term[i % STRANDS] + term[i]
+                total = add_strands(total, vec4(term[0], term[1], term[2], term[3]))
             first += BLOCK_TERMS
         if CUBES:
             log_p[n] = temperature * wp.log(total.x + total.y)

@@ -10,10 +10,16 @@ TILE_PARTICLES = wp.constant(16)
 TILE = wp.constant(64)
 
 
-# Place in the order of a work-item's particle, its first ray, and how many rays farther the next one is.
+# Place in the order of a work-item's particle, which of the groups of its tile of particles it belongs to, its first
+# ray, and how many rays farther the next one is.
 @wp.func
 def tile_place(item: wp.int32, spread: wp.int32):
     return ((item // TILE) >> spread) * TILE_PARTICLES + item % TILE // TILE_RAYS
+
+
+@wp.func
+def tile_group(item: wp.int32, spread: wp.int32):
+    return (item // TILE) & ((1 << spread) - 1)
 
 
 @wp.func

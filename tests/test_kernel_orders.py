@@ -7,7 +7,7 @@ import pytest
 from kernel_scenes import PRECISIONS, scene_flags
 
 from gpusense.backends import Backend, get_backend
-from gpusense.reference.order import ALL_BINS
+from gpusense.reference.order import ALL_BINS, STRETCH
 
 
 def clouds() -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -42,7 +42,7 @@ def ordered(device: Backend, cell: np.ndarray, heading: np.ndarray, real: type) 
     limits = device.download(bounds, np.empty(7, np.int32))
     device.compile("order_count", flags)((count,), at, to, bounds, bins, bin_of, count)
     counts = device.download(bins, np.empty(ALL_BINS, np.int32))
-    device.compile("order_starts", flags)((ALL_BINS // 32,), bounds, bins)
+    device.compile("order_starts", flags)((ALL_BINS // STRETCH,), bounds, bins)
     device.compile("order_fill", flags)((count,), bin_of, bins, order, count)
     each = {"bin_of": device.download(bin_of, np.empty(count, np.int32)), "counts": counts, "bounds": limits}
     return each | {"order": device.download(order, np.empty(count, np.int32))}

@@ -13,7 +13,7 @@ from gpusense.reference.ray import turn_of
 SAMPLES = 256
 BINS = 32
 ALL_BINS = BINS**3
-STRETCH = 32
+STRETCH = 16
 TURN = 65536
 
 

@@ -204,7 +204,8 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
 #if STRANDED
     const int strand = item % TILE_RAYS;
     real sum = 0;
-    for (int r = tile_group(item, spread) * BLOCK_TERMS + strand; r < size;) {
+    int r = tile_group(item, spread) * BLOCK_TERMS + strand, last = r - strand + BLOCK_TERMS;
+    while (r < size) {
 #else
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
@@ -231,10 +232,11 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
 #if STRANDED
             sum += term;
             r += STRANDS;
-            if (r >= size || r % BLOCK_TERMS == strand) {
-                parts[place * across + ((r - STRANDS) / BLOCK_TERMS * STRANDS + strand) * along] = sum;
+            if (r >= min(last, size)) {
+                parts[place * across + ((last / BLOCK_TERMS - 1) * STRANDS + strand) * along] = sum;
                 sum = 0;
-                r += ((1 << spread) - 1) * BLOCK_TERMS;
+                r = last + ((1 << spread) - 1) * BLOCK_TERMS + strand;
+                last += BLOCK_TERMS << spread;
             }
 #else
             parts[place * across + k * along] = term;

@@ -6,7 +6,7 @@
 #define SAMPLES 256
 #define BINS 32
 #define ALL_BINS (BINS * BINS * BINS)
-#define STRETCH 32
+#define STRETCH 16
 // Parts of a turn.
 #define TURN ((real)65536)
 
@@ -60,13 +60,17 @@ kernel void order_starts(global int *bounds, global int *bins) {
     const int stretch = get_global_id(0);
     if (stretch >= ALL_BINS / STRETCH) return;
     global int *own = bins + stretch * STRETCH;
-    int sum = 0;
-    for (int i = 0; i < STRETCH; ++i) sum += own[i];
+    // All are read before any is added, so that a work-item waits once for them.
+    int counts[STRETCH], sum = 0;
+#pragma unroll
+    for (int i = 0; i < STRETCH; ++i) counts[i] = own[i];
+#pragma unroll
+    for (int i = 0; i < STRETCH; ++i) sum += counts[i];
     int start = atomic_add(&bounds[6], sum);
+#pragma unroll
     for (int i = 0; i < STRETCH; ++i) {
-        const int count = own[i];
         own[i] = start;
-        start += count;
+        start += counts[i];
     }
 }
 

@@ -4,7 +4,7 @@
 // One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. They are sums
 // of blocks or strands, and block is 1, or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first.
 // All go to a compensated total. With STRANDED counts are of readings, and what is added are their strands. BLOCK_TERMS numbers are read before any is added, so that a work-item waits once for all
-// of them; what lies beyond the last counts as 0, which changes no sum.
+// of them; what lies beyond the last counts as 0, which changes no sum. There are fewer than 2^31 numbers.
 kernel void sum_parts(global const real *parts, global const int *order, global const int *counts,
                       global const real *fixed_of, global real *log_p, const int particles, const int count,
                       const int block, const int across, const int along, const real fixed, const real temperature,
@@ -27,20 +27,22 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
     const int own = count;
     const real lead = fixed;
 #endif
-    global const real *part = parts + (long)place * across;
+    const int begin = place * across;
     real2 total = (real2)(lead, 0);
     for (int first = 0; first < own; first += BLOCK_TERMS) {
         real term[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? part[(long)(first + i) * along] : 0;
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? parts[begin + (first + i) * along] : 0;
+        if (block == 1) {
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) {
-            if (block == 1)
-                total = add_term(total, term[i]);
-            else if (i >= STRANDS)
-                term[i % STRANDS] += term[i];
+            for (int i = 0; i < BLOCK_TERMS; ++i) total = add_term(total, term[i]);
+        } else {
+            real4 strands = (real4)(term[0], term[1], term[2], term[3]);
+#pragma unroll
+            for (int i = STRANDS; i < BLOCK_TERMS; i += STRANDS)
+                strands += (real4)(term[i], term[i + 1], term[i + 2], term[i + 3]);
+            total = add_strands(total, strands);
         }
-        if (block != 1) total = add_strands(total, (real4)(term[0], term[1], term[2], term[3]));
     }
 #if CUBES
     log_p[n] = temperature * log(total.x + total.y);

@@ -241,6 +241,7 @@ def make(name, flags):
         summed = real(0.0)
         if STRANDED:
             r = tile_group(item, spread) * BLOCK_TERMS + strand
+            last = int(r - strand + BLOCK_TERMS)
         else:
             r = tile_ray(item, spread)
         while r < size:
@@ -273,11 +274,12 @@ def make(name, flags):
                 k += 1
             if STRANDED:
                 r += STRANDS
-                if r >= size or r % BLOCK_TERMS == strand:
-                    q = (r - STRANDS) // BLOCK_TERMS * STRANDS + strand
+                if r >= wp.min(last, size):
+                    q = (last // BLOCK_TERMS - 1) * STRANDS + strand
                     put(parts, place * across + q * along, summed)
                     summed = ZERO
-                    r += ((1 << spread) - 1) * BLOCK_TERMS
+                    r = last + ((1 << spread) - 1) * BLOCK_TERMS + strand
+                    last += BLOCK_TERMS << spread
             else:
                 r += tile_step(spread)
 

@@ -13,28 +13,30 @@ from .prelude import kernel, precision, work_item
 SAMPLES = wp.constant(256)
 BINS = wp.constant(32)
 ALL_BINS = wp.constant(32768)
-STRETCH = wp.constant(32)
+STRETCH = wp.constant(16)
+# The same, for loops that Warp shall unroll.
+EACH = 16
+stretch_counts = wp.types.vector(length=16, dtype=wp.int32)
 
 
 # One work-item a stretch of bins, which lie together: from how many particles each has to where they begin.
 @kernel
 def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
-    stretch = wp.tid()
+    stretch = work_item(wp.tid())
     if stretch >= ALL_BINS // STRETCH:
         return
     own = stretch * STRETCH
+    # All are read before any is added, so that a work-item waits once for them.
+    counts = stretch_counts()
+    for i in range(EACH):
+        counts[i] = bins[own + i]
     total = int(0)
-    i = int(0)
-    while i < STRETCH:
-        total += bins[own + i]
-        i += 1
+    for i in range(EACH):
+        total += counts[i]
     start = int(wp.atomic_add(bounds, 6, total))
-    i = int(0)
-    while i < STRETCH:
-        count = bins[own + i]
+    for i in range(EACH):
         bins[own + i] = start
-        start += count
-        i += 1
+        start += counts[i]
 
 
 # One work-item a particle: it takes the next place of its bin.

@@ -20,7 +20,7 @@ bytes/s of copies, up and down. With E particle-beams, N particles and L launche
     launches >= max(L * launch, round trip, operations / issue, look-ups / nearest, bytes / copy)
     call     >= max(launches, bytes up / upload + bytes down / download)
 
-    operations  field 22 E + 60 N;   rays (46 + 41 steps) E + 60 N;   beam model (46 + 41 steps + 42) E + 60 N
+    operations  field 17 E + 60 N;   rays (46 + 41 steps) E + 60 N;   beam model (46 + 41 steps + 42) E + 60 N
     look-ups    field E;             rays and beam model reads * E
     bytes       24 N in, 4 N out (rays 4 E); these alone go up and down
 
@@ -32,8 +32,8 @@ far as the probes are good: where a time is below it the report says so.
 Operations are counted in kernels/opencl, as the fewest instructions: a multiplication is not merged with an addition
 (ranges have the same bits everywhere), sizes and signs are free, a rounded division is 8, exp 8, log 15.
 
-    end_point.cl, rounded_cell and table_cell: 8 of the rotation, 2 of rounding, 4 of the distance from the middle,
-        2 maxima, 2 of the cell, 1 of the index, 1 address, 1 load, 1 addition                                      22
+    end_point.cl, rounded_cell and table_cell: 4 of the rotation (fused), 2 of rounding, 4 of the distance from the
+        middle, 2 maxima, 2 of the index, 1 address, 1 load, 1 addition                                             17
     raycast.cl, a step: 4 of the two counts and 2 of the index, 1 load, 1 branch; 8 of the sides; 4 of the crossing
         distances, 2 to choose, 2 of the limit; 3 selections, 10 of crossed, 4 of the new counts                    41
     raycast.cl and ray.cl, a ray: 6 of the rotation, 4 of TINY, 16 of two divisions, 4 of a_x and a_y, 2 signs,
@@ -65,7 +65,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.prepare import sectors_of
 
-OPERATIONS = {"field": 22, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
+OPERATIONS = {"field": 17, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
 
 
 @dataclass(frozen=True)

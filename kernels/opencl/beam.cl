@@ -202,10 +202,8 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     const int size = rays, begin = 0;
 #endif
 #if STRANDED
-    const int strand = item % TILE_RAYS;
     real sum = 0;
-    int r = tile_group(item, spread) * BLOCK_TERMS + strand, last = r - strand + BLOCK_TERMS;
-    while (r < size) {
+    for (int r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS; r < size;) {
 #else
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
@@ -232,11 +230,12 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
 #if STRANDED
             sum += term;
             r += STRANDS;
-            if (r >= min(last, size)) {
-                parts[place * across + ((last / BLOCK_TERMS - 1) * STRANDS + strand) * along] = sum;
+            if (r >= size || (r & (BLOCK_TERMS - STRANDS)) == 0) {
+                // Past a block's or the scan's end.
+                const int block = (r - STRANDS) / BLOCK_TERMS;
+                parts[place * across + (block * STRANDS + (r & (STRANDS - 1))) * along] = sum;
                 sum = 0;
-                r = last + ((1 << spread) - 1) * BLOCK_TERMS + strand;
-                last += BLOCK_TERMS << spread;
+                r += ((1 << spread) - 1) * BLOCK_TERMS;
             }
 #else
             parts[place * across + k * along] = term;

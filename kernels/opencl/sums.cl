@@ -32,7 +32,11 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
     for (int first = 0; first < own; first += BLOCK_TERMS) {
         real term[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? parts[begin + (first + i) * along] : 0;
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[begin + min(first + i, own - 1) * along];
+        if (first + BLOCK_TERMS > own) {
+#pragma unroll
+            for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? term[i] : 0;
+        }
         if (block == 1) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) total = add_term(total, term[i]);

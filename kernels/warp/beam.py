@@ -237,11 +237,9 @@ def make(name, flags):
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-        strand = item % TILE_RAYS
         summed = real(0.0)
         if STRANDED:
-            r = tile_group(item, spread) * BLOCK_TERMS + strand
-            last = int(r - strand + BLOCK_TERMS)
+            r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS
         else:
             r = tile_ray(item, spread)
         while r < size:
@@ -274,12 +272,12 @@ def make(name, flags):
                 k += 1
             if STRANDED:
                 r += STRANDS
-                if r >= wp.min(last, size):
-                    q = (last // BLOCK_TERMS - 1) * STRANDS + strand
+                # Past a block's or the scan's end.
+                if r >= size or (r & (BLOCK_TERMS - STRANDS)) == 0:
+                    q = (r - STRANDS) // BLOCK_TERMS * STRANDS + (r & (STRANDS - 1))
                     put(parts, place * across + q * along, summed)
                     summed = ZERO
-                    r = last + ((1 << spread) - 1) * BLOCK_TERMS + strand
-                    last += BLOCK_TERMS << spread
+                    r += ((1 << spread) - 1) * BLOCK_TERMS
             else:
                 r += tile_step(spread)
 

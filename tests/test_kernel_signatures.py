@@ -94,7 +94,7 @@ def test_warp_kernels_have_the_arguments_of_their_row(
     }
     assert list(found.items()) == list(expected.items())
     # The last thread index runs fastest in Warp, the first axis of the row everywhere else.
-    (indices,) = re.findall(r"^ *(.*) = wp\.tid\(\)$", inspect.getsource(made.func), re.MULTILINE)
+    (indices,) = re.findall(r"^ *(.*) = (?:work_item\()?wp\.tid\(\)\)?$", inspect.getsource(made.func), re.MULTILINE)
     assert len(indices.split(",")) == len(row.launch)
 
 

@@ -126,6 +126,18 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert all(row["error"] < 1e-2 for row in report["rows"] if row["error"] is not None)
 
 
+def test_launches_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "64", "--beams", "8", "--repeats", "2", "--size", "20"]
+    report = run_script("launches.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "launches")
+    assert [row["what"] for row in report["rows"]] == [
+        f"{what}, {cloud}" for cloud in ("global", "tracking") for what in ("rays", "beam model", "field")
+    ]
+    names = [[name for name, _ in row["launches"]] for row in report["rows"]]
+    assert names == 2 * [["place_poses", main] for main in ("cast_ranges", "score_beams", "score_field")]
+    for row in report["rows"]:
+        assert all(seconds > 0 for _, seconds in row["launches"]) and row["together_s"] > 0 and row["row_s"] > 0
+
+
 @pytest.mark.parametrize("selection", ["numpy", "opencl"])
 def test_landmarks_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--repeats", "1", "--seconds", "0.01"]

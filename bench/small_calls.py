@@ -7,9 +7,9 @@ Times are of whole calls of ``log_likelihood``: NumPy arrays in and out, and pos
 arrays (Warp's CUDA); for several scans in one call see ``several_scans.py``. Each is taken beside the plain way (copies
 by commands, each launch started on its own), in turns, so that their ratio holds on a busy machine; results of both
 must have the same bits. Bound calls (``bind``) are taken beside ``log_likelihood`` with the same arrays, with a wait
-after each call and after many: poses, readings and result are on the device where it has arrays, and in host memory
-elsewhere, where a bound call is the ordinary one. "Kernels" are the launches of an ordinary call, started one after the
-other with everything on the device.
+after each call and after many: with NumPy arrays (on CUDA one graph with its copies, elsewhere the ordinary call), and
+on the device where it has arrays. "Kernels" are the launches of an ordinary call, started one after the other with
+everything on the device.
 """
 
 from __future__ import annotations
@@ -161,7 +161,10 @@ class Bench:
                     self.add(f"{size}, on the device, out={what}", into, into, kernels, calls)
                     call_there = functools.partial(call, poses=there)
                     self.add(f"{size}, on the device{what}", call_there, call_there, kernels, calls)
-                self.bound(f"{size}, bound", model, poses, kernels)
+                self.bound(f"{size}, bound", model, poses, kernels, np.array)
+                if self.cuda:
+                    there = functools.partial(on_device, self.device)
+                    self.bound(f"{size}, bound, on the device", model, poses, kernels, there)
         graphs = getattr(self.device, "_graphs", None)
         if graphs is not None and self.device._gathers:
             refused = ", and the driver refused one" if graphs.failed else ""
@@ -172,10 +175,11 @@ class Bench:
         """Whether the device has arrays of its own."""
         return self.device.info.selection.startswith("warp:cuda")
 
-    def bound(self, what: str, model: Any, poses: np.ndarray, kernels: float) -> None:
+    def bound(
+        self, what: str, model: Any, poses: np.ndarray, kernels: float, there: Callable[[np.ndarray], Any]
+    ) -> None:
         """A bound call against an ordinary one with the same arrays, of which the readings come from the host."""
         result, scan, calls = np.zeros(len(poses), np.float32), self.scans[0], self.arguments.calls
-        there = functools.partial(on_device, self.device) if self.cuda else np.array
         given, own, other = there(poses), there(result), there(result)
         call = model.bind(given, there(scan), out=own)
 

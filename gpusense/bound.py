@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from gpusense import _checks, arrays
+from gpusense import arrays
 from gpusense.backends.base import Buffer, Gathering
 from gpusense.cloud import Cloud, Placed, finish
 from gpusense.reference.error_free import BLOCK_TERMS
@@ -35,7 +35,7 @@ class BoundCall(ABC):
 
     Attributes:
         out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.
-        waits: Whether a call takes the ordinary way, and has ended when it returns.
+        waits: Whether a call has ended when it returns.
     """
 
     out: Any
@@ -114,62 +114,12 @@ class PlacedScan:
 Scorer = Callable[[Placed, frozenset[str], int, PlacedScan, Buffer], None]
 
 
-def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
-    """See ``ScanModel.bind``."""
-    for name, given in (("poses", poses), ("ranges", ranges)):
-        if not (isinstance(given, np.ndarray) or hasattr(given, "__dlpack__") or arrays.on_device(given)):
-            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {_checks.show(given)}")
-        if type(given).__module__.startswith("jax"):
-            raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
-    there = arrays.on_device(poses) and arrays.on_device(ranges)
-    # Readings as other programs see them are made on the host.
-    return (_DeviceCall if there and model.compat is None else _HostCall)(model, poses, ranges, out)
-
-
-class _HostCall(BoundCall):
-    """The ordinary way."""
-
-    waits = True
-
-    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
-        backend, beams = model._backend, model.scanner.count
-        if arrays.on_device(poses):
-            count = arrays.adopt_poses(poses, backend, "poses")[1]
-        else:
-            count = _shape_of("poses", poses, ("N", 3))[0]
-        if arrays.on_device(ranges):
-            arrays.adopt_readings(ranges, backend, beams)
-        else:
-            _shape_of("ranges", ranges, (beams,))
-        arrays.check_out(out, (count,), model._real, poses, backend)
-        if out is None and arrays.on_device(poses):
-            out = arrays.result_for(poses, arrays.blank(backend, count, model._real))
-        elif out is None:
-            out = arrays.like(poses, np.empty(count, model._real))
-        self.out, self._model, self._given = out, model, (poses, ranges)
-
-    def __call__(self, stream: Any = None) -> Any:
-        """See BoundCall.__call__."""
-        if stream is not None:
-            raise TypeError(f"stream: must be None for a call that waits, got {_checks.show(stream)}")
-        return self._model.log_likelihood(*self._given, out=self.out)
-
-    def check(self) -> None:
-        """See BoundCall.check."""
-
-
-def _shape_of(name: str, given: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
-    """The shape of an array in host memory; its numbers are looked at by each call."""
-    found = np.shape(cast(Any, arrays.to_host(given, name)))
-    if len(found) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, found, strict=True)):
-        raise ValueError(f"{name}: shape must be {_checks.shape_text(shape)}, got {_checks.shape_text(found)}")
-    return found
-
-
-class _DeviceCall(BoundCall):
+class DeviceCall(BoundCall):
     """One start of launches that were recorded."""
 
     waits = False
+    # Launches that were gathered once.
+    _kept: object | None = None
 
     def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
         backend, real = model._backend, model._real
@@ -192,16 +142,38 @@ class _DeviceCall(BoundCall):
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""
+        self._look_at_map()
+        self._replay(stream)
+        return self.out
+
+    def gather(self, gathering: Gathering) -> None:
+        """Have this thread gather a call's launches, in place of starting them."""
+        self._look_at_map()
+        if self._kept is not None:
+            gathering.repeat(self._kept)
+            return
+        mark = gathering.mark()
+        self._start(*self._scored)
+        self._kept = gathering.kept(mark)
+
+    def _look_at_map(self) -> None:
         if self._scene.map.version != self._version:
             # The map has changed, or its table is another one.
             self._replay.wait()
             self._record()
-        self._replay(stream)
-        return self.out
 
     def check(self) -> None:
         """See BoundCall.check."""
         self._replay.wait()
+        self.finish()
+
+    @property
+    def result(self) -> Buffer:
+        """Where the log-likelihoods are."""
+        return self._result
+
+    def finish(self) -> None:
+        """Wait for what this thread has started or gathered, and see that all poses were finite."""
         finish(self._space, on_device=True)
 
     def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Callable[[], None], bool]:
@@ -259,6 +231,7 @@ class _DeviceCall(BoundCall):
             self._table, region, _ = cloud.ensure(scene.map, 0, cloud.count)
             score = model._bound_scorer(self._table, region)
             self._version = scene.map.version
+            self._scored, self._kept = (score, region), None
             self._replay = cast(Gathering, self._backend).record(lambda: self._start(score, region))
         # Other streams may come first to what was made just now.
         self._backend.synchronize()

@@ -15,6 +15,7 @@ from conftest import BACKENDS
 from test_small_calls import BEAMS, COUNT, GRID, MODELS, RANGE, cloud, gathering, to_device
 
 import gpusense as gs
+from gpusense import binding
 from gpusense.models import scan_model
 from gpusense.tolerances import TOLERANCES, differing
 
@@ -271,6 +272,56 @@ def test_a_stream_that_is_none(gathering):
 
 
 # ---- arrays of the host, and of the host and the device
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_short_calls_of_the_host_are_one_graph(case, gathering, monkeypatch):
+    """Copies there and back and all launches; the bits are those of the ordinary call."""
+    device, started = gathering
+    model = CASES[case](backend=device)
+    beams = model.scanner.count
+    for real in (np.float32, np.float64):
+        poses, ranges = cloud(0).astype(real), np.zeros(beams, real)
+        call = model.bind(poses, ranges)
+        assert type(call) is binding._StagedCall and call.waits
+        for seed, scan in enumerate(SCANS):
+            poses[...], ranges[...] = cloud(seed), scan[:beams]
+            expected = model.log_likelihood(poses, ranges)
+            before = len(started)
+            found = call()
+            assert found is call.out and len(started) - before == int(seed > 0), "not one graph"
+            if "," in case and model.temperature < 1 and not np.isfinite(scan).any():
+                assert np.allclose(found, expected, rtol=2e-7)
+            else:
+                assert differing(found, expected) == 0, (seed, real)
+    model.update_map(np.full((2, 3), 100), (5, 6))
+    for _ in range(3):
+        assert differing(call(), model.log_likelihood(poses, ranges)) == 0
+    poses[3, 1] = np.nan
+    for _ in range(2):
+        with pytest.raises(ValueError, match="poses: every value must be finite, got nan at index"):
+            call()
+    poses[3, 1] = 1.0
+    assert differing(call(), model.log_likelihood(poses, ranges)) == 0
+
+
+def test_what_is_not_short_takes_the_ordinary_way(gathering, monkeypatch):
+    device, _ = gathering
+    model = FIELD(GRID, NEAR, backend=device)
+    integers = np.zeros((COUNT, 3), np.int64)
+    for poses, ranges in ((integers, mixed(1)), (np.zeros((20_000, 3)), mixed(1))):
+        call = model.bind(poses, ranges)
+        assert type(call) is binding._HostCall
+        assert differing(np.asarray(call()), model.log_likelihood(poses, ranges)) == 0
+    for name, value in (("_MOST_CELLS", 10), ("DeviceCall", refuse_memory)):
+        with monkeypatch.context() as patch:
+            patch.setattr(binding, name, value)
+            assert type(model.bind(cloud(1), mixed(1))) is binding._HostCall
+    assert type(BEAM(GRID, NEAR, backend=device, compat="beluga").bind(cloud(1), mixed(1))) is binding._HostCall
+
+
+def refuse_memory(*arguments: Any) -> Any:
+    raise MemoryError("no room for a table")
 
 
 @pytest.mark.parametrize("kind", MODELS)

@@ -13,7 +13,8 @@ from gpusense import _checks
 from gpusense import compat as compat_module
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
-from gpusense.bound import BoundCall, Scene, Scorer, bind
+from gpusense.binding import bind
+from gpusense.bound import BoundCall, Scene, Scorer
 from gpusense.cloud import Cloud, finish
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
@@ -264,8 +265,9 @@ class ScanModel(ABC):
 
         Every call reads what the arrays hold then, and writes ``out``. Where poses and ranges are on the model's device
         (``warp:cuda``), a call is one start of a CUDA graph: it checks nothing, allocates nothing, copies nothing and
-        does not wait; ``check`` waits, and says whether a pose was not finite. Everywhere else it is the ordinary call,
-        so that the same program runs on every backend.
+        does not wait; ``check`` waits, and says whether a pose was not finite. NumPy arrays of few particles go to such
+        a device and back in the same graph; everywhere else it is the ordinary call, so that the same program runs on
+        every backend.
 
         Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
         repeat or, with a temperature below 1, no range depends on the pose: these agree to rounding.

@@ -1,0 +1,137 @@
+"""``bind`` of a model: which way a bound call goes, and the ways of arrays in host memory.
+
+A call that waits is the ordinary one, but for NumPy arrays of few particles on a CUDA device: copies to and from the
+device and the launches of ``bound.DeviceCall`` are gathered and become one graph, so that readings are classed there
+and nothing is looked at on the host.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from gpusense import _checks, arrays
+from gpusense.backends.base import Gathering
+from gpusense.bound import BoundCall, DeviceCall
+from gpusense.cloud import LEAST_ORDERED
+from gpusense.workspace import Workspace
+
+if TYPE_CHECKING:
+    from gpusense.models.scan_model import ScanModel
+
+# Cells of a map whose table is made as a whole for them.
+_MOST_CELLS = 1 << 22
+# Bytes of an array that is copied with the launches; larger ones have copies of their own.
+_LARGEST = 256 << 10
+
+
+def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
+    """See ``ScanModel.bind``."""
+    for name, given in (("poses", poses), ("ranges", ranges)):
+        if not (isinstance(given, np.ndarray) or hasattr(given, "__dlpack__") or arrays.on_device(given)):
+            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {_checks.show(given)}")
+        if type(given).__module__.startswith("jax"):
+            raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
+    there = arrays.on_device(poses) and arrays.on_device(ranges)
+    # Readings as other programs see them are made on the host.
+    if there and model.compat is None:
+        return DeviceCall(model, poses, ranges, out)
+    host = _HostCall(model, poses, ranges, out)
+    if model.compat is None and host.is_short():
+        try:
+            return _StagedCall(host)
+        except MemoryError:
+            # The ordinary call needs but a part of the map's table.
+            pass
+    return host
+
+
+class _HostCall(BoundCall):
+    """The ordinary way."""
+
+    waits = True
+
+    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
+        backend, beams = model._backend, model.scanner.count
+        if arrays.on_device(poses):
+            count = arrays.adopt_poses(poses, backend, "poses")[1]
+        else:
+            count = _shape_of("poses", poses, ("N", 3))[0]
+        if arrays.on_device(ranges):
+            arrays.adopt_readings(ranges, backend, beams)
+        else:
+            _shape_of("ranges", ranges, (beams,))
+        arrays.check_out(out, (count,), model._real, poses, backend)
+        if out is None and arrays.on_device(poses):
+            out = arrays.result_for(poses, arrays.blank(backend, count, model._real))
+        elif out is None:
+            out = arrays.like(poses, np.empty(count, model._real))
+        self.out, self._model, self._given = out, model, (poses, ranges)
+
+    def __call__(self, stream: Any = None) -> Any:
+        """See BoundCall.__call__."""
+        if stream is not None:
+            raise TypeError(f"stream: must be None for a call that waits, got {_checks.show(stream)}")
+        return self._model.log_likelihood(*self._given, out=self.out)
+
+    def check(self) -> None:
+        """See BoundCall.check."""
+
+    def is_short(self) -> bool:
+        """Whether arrays are NumPy's, all is small, and the device does in one go what a call starts."""
+        backend = cast(Any, self._model._backend)
+        if not hasattr(backend, "gather") or self._model.grid.cells.size > _MOST_CELLS:
+            return False
+        backend.gather()
+        gathers = backend.mark() is not None
+        backend.scatter()
+        poses, ranges = self._given
+        given, reals = (poses, ranges, self.out), (np.float32, np.float64)
+        short = all(type(a) is np.ndarray and a.dtype in reals and a.nbytes <= _LARGEST for a in given)
+        return gathers and short and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
+
+
+class _StagedCall(BoundCall):
+    """A call of few particles: arrays go to the device and back along with the launches."""
+
+    waits = True
+
+    def __init__(self, host: _HostCall) -> None:
+        self._host, self.out, (self._poses, self._ranges) = host, host.out, host._given
+        self._backend = cast(Any, host._model._backend)
+        self._poses_there = self._backend.upload(self._poses)
+        # Limits of readings are those of the host, whatever their precision.
+        self._ranges_there = self._backend.upload(self._ranges.astype(np.float64))
+        self._device = DeviceCall(host._model, self._poses_there.reshape(self._poses.shape), self._ranges_there, None)
+        self._space = Workspace(self._backend)
+        self._lock = threading.Lock()
+
+    def __call__(self, stream: Any = None) -> Any:
+        """See BoundCall.__call__."""
+        if stream is not None:
+            return self._host(stream)
+        backend, device = self._backend, self._device
+        try:
+            with self._lock, self._space:
+                backend.upload(self._poses, self._poses_there, wait=False)
+                backend.upload(self._ranges.astype(np.float64), self._ranges_there, wait=False)
+                device.gather(cast(Gathering, backend))
+                self._space.download(device.result, self.out)
+                device.finish()
+        except ValueError:
+            # It says which pose is not finite.
+            return self._host()
+        return self.out
+
+    def check(self) -> None:
+        """See BoundCall.check."""
+
+
+def _shape_of(name: str, given: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
+    """The shape of an array in host memory; its numbers are looked at by each call."""
+    found = np.shape(cast(Any, arrays.to_host(given, name)))
+    if len(found) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, found, strict=True)):
+        raise ValueError(f"{name}: shape must be {_checks.shape_text(shape)}, got {_checks.shape_text(found)}")
+    return found

@@ -16,7 +16,7 @@ from test_small_calls import BEAMS, COUNT, GRID, MODELS, RANGE, cloud, gathering
 
 import gpusense as gs
 from gpusense import binding
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.tolerances import TOLERANCES, differing
 
 __all__ = ["gathering"]
@@ -125,7 +125,7 @@ def test_out_and_pieces_and_no_particles(gathering, monkeypatch):
     model = BEAM(GRID, NEAR, backend=gathering[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     expected = model.log_likelihood(poses, ranges.numpy()).numpy()
-    monkeypatch.setattr(scan_model, "CHUNK", 77)
+    monkeypatch.setattr(chunks, "CHUNK", 77)
     out = to_device(np.full(COUNT, 7, np.float32))
     call = model.bind(Array(poses), Array(ranges), out=out)
     for _ in range(3):

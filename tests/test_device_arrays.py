@@ -13,7 +13,7 @@ from conftest import skip_or_fail
 import gpusense as gs
 from gpusense import arrays
 from gpusense.backends import get_backend
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.tolerances import differing
 from gpusense.workspace import Workspace
 
@@ -160,7 +160,7 @@ def test_scans_that_share_launches_on_the_device(kind, real, device, copies):
 def test_in_pieces_on_the_device(method, device, monkeypatch):
     call, _ = call_of(method, device)
     expected = call(POSES)
-    monkeypatch.setattr(scan_model, "CHUNK", 77)
+    monkeypatch.setattr(chunks, "CHUNK", 77)
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
@@ -204,7 +204,7 @@ def test_a_pose_that_is_not_finite_is_told_after_memory_ran_out(device, monkeypa
     poses = np.tile(POSES, (4, 1))
     model.log_likelihood(to_device(poses), SCAN)
     poses[3, 0] = np.nan
-    monkeypatch.setattr(scan_model, "CHUNK", 600)
+    monkeypatch.setattr(chunks, "CHUNK", 600)
     before, calls = Workspace.empty, []
 
     def empty(self, name, count, dtype, *, zero=False):

@@ -15,7 +15,7 @@ import pytest
 import gpusense as gs
 from gpusense import sources
 from gpusense.backends import get_backend
-from gpusense.models import scan_model
+from gpusense.models import chunks
 
 
 def room() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
@@ -246,6 +246,6 @@ def test_a_long_batch_can_be_interrupted_and_the_model_still_works(backend, tmp_
 
 def test_work_on_a_processor_is_cut_into_pieces_that_can_be_interrupted():
     device = get_backend("numpy")
-    assert scan_model.chunk_of(device, 360) == scan_model.CHUNK_WORK // 360
-    assert scan_model.chunk_of(device, 1 << 30) == 1
-    assert scan_model.chunk_of(device, 4, 8) <= scan_model.CHUNK_BYTES // 32
+    assert chunks.chunk_of(device, 360) == chunks.CHUNK_WORK // 360
+    assert chunks.chunk_of(device, 1 << 30) == 1
+    assert chunks.chunk_of(device, 4, 8) <= chunks.CHUNK_BYTES // 32

@@ -10,7 +10,7 @@ from model_world import BEARINGS, KINDS, RANGE, cloud, make, parts_of_kind, room
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.models.reachable import ReachableMap
 
 
@@ -74,7 +74,7 @@ def test_a_table_that_does_not_fit_is_told_at_once(kind, backend, monkeypatch):
     """The table is the same for fewer particles: it is tried once, and the message is the device's."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
-    monkeypatch.setattr(scan_model, "SMALLEST_CHUNK", 1)
+    monkeypatch.setattr(chunks, "SMALLEST_CHUNK", 1)
 
     def score(device: Any) -> Any:
         if kind == "caster":

@@ -12,7 +12,7 @@ from test_absolute import GRID, models, poses_around
 from test_device_arrays import copies, device, each_framework, framework, to_device  # noqa: F401
 
 import gpusense as gs
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.tolerances import differing
 
 INF = float("inf")
@@ -98,7 +98,7 @@ def test_poses_on_the_device_stay_there(name, device, copies, monkeypatch):  # n
     with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
         call(to_device(bad))
     assert call(to_device(np.empty((0, 3)))).shape == (0,)
-    monkeypatch.setattr(scan_model, "CHUNK", 23)
+    monkeypatch.setattr(chunks, "CHUNK", 23)
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 

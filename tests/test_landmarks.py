@@ -11,7 +11,7 @@ from scipy.special import ndtr
 import gpusense as gs
 from gpusense.features import check_features
 from gpusense.landmarks import make_buckets
-from gpusense.models import scan_model
+from gpusense.models import chunks
 
 NAN = scenes.NAN
 FLOAT64 = dict(precision="float64")
@@ -196,7 +196,7 @@ def test_pieces_have_the_same_bits(backend, monkeypatch):
     for options in (dict(), dict(association="sum"), dict(association="joint", negative=True)):
         model = gs.LandmarkModel(landmarks, backend=backend, **options)
         whole = model.log_likelihood(poses, features[:, :2]), *model.associate(poses, features[:, :2])
-        monkeypatch.setattr(scan_model, "CHUNK", 30)
+        monkeypatch.setattr(chunks, "CHUNK", 30)
         parts = model.log_likelihood(poses, features[:, :2]), *model.associate(poses, features[:, :2])
         monkeypatch.undo()
         for a, b in zip(whole, parts, strict=True):

@@ -9,7 +9,7 @@ import pytest
 from model_world import BEARINGS, KINDS, NAN, RANGE, cloud, make, parts_of_kind, room, same_bits, scan
 
 import gpusense as gs
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.workspace import Workspace
 
 
@@ -19,7 +19,7 @@ def test_batches_do_not_matter(kind, chunk, backend, monkeypatch):
     grid, poses, z = room(), cloud(room(), 150), scan()
     log_p, parts = make(kind, grid, backend).log_likelihood(poses, z, per_beam=True)
     ranges = gs.RayCaster(grid, RANGE, backend=backend).cast(poses, BEARINGS)
-    monkeypatch.setattr(scan_model, "CHUNK", chunk)
+    monkeypatch.setattr(chunks, "CHUNK", chunk)
     model = make(kind, grid, backend)
     again, each = model.log_likelihood(poses, z, per_beam=True)
     same_bits(log_p, again)

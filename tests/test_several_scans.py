@@ -11,7 +11,7 @@ from conftest import on_every_backend
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import scan_call, scan_model
+from gpusense.models import chunks, scan_call, scan_model
 from gpusense.scan import Batch, PreparedScan, prepare_scan
 from gpusense.scan_batch import join, part_of, prepare_batch, runs
 from gpusense.tolerances import differing
@@ -156,7 +156,7 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     model.log_likelihood(poses[5:], z[5:])
     launches(1)
     # Launches of at most 150 particles, which are three scans.
-    monkeypatch.setattr(scan_model, "CHUNK", 150)
+    monkeypatch.setattr(chunks, "CHUNK", 150)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])

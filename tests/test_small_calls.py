@@ -12,7 +12,7 @@ from array_libraries import Array, installed
 import gpusense as gs
 from gpusense import arrays
 from gpusense.backends import get_backend
-from gpusense.models import scan_model
+from gpusense.models import chunks, scan_model
 from gpusense.tolerances import differing
 
 BEAMS, COUNT, RANGE = 37, 300, 5.0
@@ -179,7 +179,7 @@ def test_graphs_with_arrays_on_the_device(kind, gathering, monkeypatch):
 def test_scans_and_pieces_are_gathered_in_their_order(gathering, monkeypatch):
     """Buffers serve one piece after the other, so that an order lost would show."""
     device, started = gathering
-    monkeypatch.setattr(scan_model, "CHUNK", 77)
+    monkeypatch.setattr(chunks, "CHUNK", 77)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     poses, scans = np.stack([cloud(1), cloud(2)]), np.stack([scan(1), scan(2)])
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(poses, scans))

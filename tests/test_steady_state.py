@@ -8,7 +8,7 @@ from conftest import on_every_backend
 
 import gpusense as gs
 from gpusense import cloud
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.tolerances import differing
 
@@ -169,7 +169,7 @@ def test_out_spares_the_host_an_array_but_changes_no_copy(gpu, as_gpu, monkeypat
 @pytest.mark.parametrize("gpu", [False, True])
 def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
-    monkeypatch.setattr(scan_model, "CHUNK", 128)
+    monkeypatch.setattr(chunks, "CHUNK", 128)
     watch = Watch(device, monkeypatch)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     # Each piece has all corners of the box.

@@ -16,7 +16,7 @@ from kernel_scenes import assert_near
 
 import gpusense as gs
 from gpusense import cloud
-from gpusense.models import scan_model
+from gpusense.models import chunks
 from gpusense.tolerances import differing, per_beam, per_scan
 
 RANGE, BEAMS, COUNT = 5.0, 53, 150
@@ -161,7 +161,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
 
     whole = results()
     for size in (16, 33, 117):
-        monkeypatch.setattr(scan_model, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
+        monkeypatch.setattr(chunks, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
         for found, right in zip(results(), whole, strict=True):
             assert differing(found, right) == 0
 

@@ -19,8 +19,9 @@ from gpusense.frames import Mount, ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
 from gpusense.lookup_files import describe, write_lookup
+from gpusense.models.arguments import check_scene, real_dtype
+from gpusense.models.chunks import chunk_of, in_chunks
 from gpusense.models.reachable import ReachableMap, TableMemoryError
-from gpusense.models.scan_model import check_scene, chunk_of, in_chunks, real_dtype
 from gpusense.normals import normal_table
 from gpusense.plan import Omission
 from gpusense.region import Region

@@ -13,7 +13,8 @@ from gpusense import _checks, arrays
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud, finish
-from gpusense.models.scan_model import chunk_of, in_chunks, real_dtype
+from gpusense.models.arguments import real_dtype
+from gpusense.models.chunks import chunk_of, in_chunks
 from gpusense.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.reference import relative
 from gpusense.workspace import Workspace

@@ -18,7 +18,8 @@ from gpusense.bound import BoundCall, Scene, Scorer
 from gpusense.cloud import Cloud, finish
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
-from gpusense.models.reachable import TableMemoryError
+from gpusense.models.arguments import check_scene, real_dtype
+from gpusense.models.chunks import chunk_of, in_chunks
 from gpusense.models.scan_call import TOGETHER, ScanCall, call_of
 from gpusense.models.terms import log_weight
 from gpusense.plan import Omission, Plan, share
@@ -28,90 +29,6 @@ from gpusense.scan import Batch, Beams, PreparedScan, check_beams, prepare_scan
 from gpusense.scan_batch import part_of, prepare_batch, runs
 from gpusense.scanner import Scanner
 from gpusense.workspace import Workspace
-
-# Particles of one launch: enough to fill a device, few enough for its memory (44 bytes each).
-CHUNK = 1 << 20
-# Most bytes of a result with a number per particle and beam.
-CHUNK_BYTES = 320 << 20
-# Most particle-beams of one launch on a processor: it can be interrupted between launches, a few seconds apart.
-CHUNK_WORK = 1 << 24
-# A launch that does not fit is tried with half the particles down to this.
-SMALLEST_CHUNK = 256
-# Up to this many cells float32 knows the place of a crossing to 5/16 of a cell; from half a cell on, neighbouring
-# boundaries could be confused.
-_MOST_CELLS_PER_RANGE = 1 << 20
-
-
-def check_poses(poses: object, name: str = "poses") -> np.ndarray:
-    """(N, 3) finite float64 poses.
-
-    Raises:
-        TypeError: not numbers.
-        ValueError: another shape, or a value that is not finite.
-    """
-    return _checks.array(name, poses, ("N", 3))
-
-
-def check_scene(grid: object, range_max: float) -> OccupancyGrid:
-    """The map, whose cells must not be absurdly small against the range.
-
-    Raises:
-        TypeError: not an OccupancyGrid.
-        ValueError: more than 1 048 576 cells per range_max.
-    """
-    if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {_checks.show(grid)}")
-    cells = range_max / grid.resolution
-    if cells > _MOST_CELLS_PER_RANGE:
-        raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.15g}")
-    return grid
-
-
-def real_dtype(precision: str, backend: Backend) -> np.dtype:
-    """NumPy dtype of a precision on a device.
-
-    Raises:
-        TypeError, ValueError: an unknown precision, or float64 on a device without it.
-    """
-    dtype = np.dtype(_checks.choice("precision", precision, ("float32", "float64")))
-    if dtype == np.float64 and not backend.info.float64:
-        raise ValueError(f"precision: must be 'float32' on {backend.info.name}, which has no float64, got 'float64'")
-    return dtype
-
-
-def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
-    """Particles of one launch of so many beams, with a result of ``itemsize`` bytes per particle-beam."""
-    chunk = CHUNK
-    if itemsize:
-        chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
-    if backend.info.kind == "cpu":
-        chunk = min(chunk, CHUNK_WORK // beams)
-    return max(chunk, 1)
-
-
-def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, int], None]) -> None:
-    """Call ``run(begin, end)`` over [0, count) in pieces; pieces that do not fit into memory are halved.
-
-    Raises:
-        MemoryError: not even the smallest piece fits, or not the map's table, which is tried only once. The model still
-            works for smaller calls.
-    """
-    begin = 0
-    while begin < count:
-        try:
-            run(begin, min(begin + chunk, count))
-            begin += chunk
-        except TableMemoryError:
-            workspace.release()
-            raise
-        except MemoryError:
-            tried = min(chunk, count - begin)
-            if tried <= SMALLEST_CHUNK:
-                workspace.release()
-                raise
-            # What is known of the poses of earlier pieces stays.
-            workspace.release(keep="verdict")
-            chunk = max(tried // 2, SMALLEST_CHUNK)
 
 
 class ScanModel(ABC):

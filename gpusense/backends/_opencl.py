@@ -67,8 +67,8 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
 def _lanes(device: cl.Device) -> int:
     """Lanes of kernels that have bodies in vectors.
 
-    PoCL compiles loops in kernels as they are written. Intel's driver makes vectors of neighbouring work-items; explicit
-    ones were up to three times as fast there, too. Other drivers for processors were not measured.
+    PoCL compiles loops in kernels as they are written. Intel's driver makes vectors of neighbouring work-items, but
+    explicit ones were up to three times as fast there, too. Other drivers for processors were not measured.
     """
     known = _pocl.is_pocl(device) or device.platform.name.startswith("Intel")
     if not known or not device.type & cl.device_type.CPU:

@@ -241,7 +241,7 @@ _ENOUGH = 1 << 21
 ENOUGH_SHORT = 1 << 19
 
 
-def spread_of(items: int, groups: int, enough: int = _ENOUGH) -> int:
+def spread_of(items: int, groups: int, enough: int) -> int:
     """By how many powers of two to split the work of some work-items, each with so many groups of readings or rays."""
     spread = 0
     while items << spread < enough and 1 << spread < groups:
@@ -257,5 +257,5 @@ def stranded(rays: int, spread: int) -> bool:
 def tiles_of(count: int, rays: int) -> tuple[int, int]:
     """Work-items of a launch in tiles of particles and rays, and its spread."""
     tiles = -(-count // TILE_PARTICLES)
-    spread = spread_of(tiles * TILE, -(-rays // TILE_RAYS))
+    spread = spread_of(tiles * TILE, -(-rays // TILE_RAYS), _ENOUGH)
     return (tiles << spread) * TILE, spread

@@ -16,6 +16,7 @@ from test_small_calls import BEAMS, COUNT, GRID, MODELS, RANGE, cloud, gathering
 
 import gpusense as gs
 from gpusense import binding
+from gpusense import cloud as places
 from gpusense.models import chunks
 from gpusense.tolerances import TOLERANCES, differing
 
@@ -81,6 +82,18 @@ def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, gathering):
                 assert differing(found.numpy(), expected.numpy()) == 0, (seed, real)
     # The first call starts its launches one by one, the others a graph.
     assert len(started) >= 2 * len(SCANS) - 2
+
+
+def test_bound_calls_that_add_up_strands(gathering, monkeypatch):
+    """Where particles fill the device, work-items add up strands; the bits are the same."""
+    poses, ranges = to_device(cloud(1)), to_device(mixed(1))
+    found = []
+    for enough in (1 << 21, 1):
+        monkeypatch.setattr(places, "_ENOUGH", enough)
+        call = BEAM(GRID, NEAR, backend=gathering[0]).bind(poses, ranges)
+        assert (call._scan.block == 1) == (enough == 1)
+        found.append(call().numpy().copy())
+    assert differing(*found) == 0
 
 
 @pytest.mark.parametrize("kind", MODELS)

@@ -166,6 +166,26 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
             assert differing(found, right) == 0
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
+    """Many particles, and few enough rays: alone, in scans of other lengths together, and with impossible readings."""
+    grid, scanner, z = world()
+    several = np.stack([poses_of("all over"), poses_of("inside"), poses_of("inside") + 0.1])
+    scans = np.stack([z, np.where(np.arange(BEAMS) % 3 == 0, z, np.nan), np.full(BEAMS, np.nan)])
+    for parameters in (*BEAM.values(), gs.BeamParameters(1.0, 0.0, 0.0, 0.0, sigma_hit=0.001)):
+        found = []
+        for enough in (1 << 21, 1):
+            monkeypatch.setattr(cloud, "_ENOUGH", enough)
+            model = gs.BeamModel(grid, scanner, parameters, backend=as_gpu(), precision=precision)
+            alone = model.log_likelihood(several[0], z)
+            assert ("STRANDED" in code_of(model)) == (enough == 1)
+            found.append(np.concatenate([[alone], model.log_likelihood(several, scans)]))
+        assert differing(*found) == 0
+    shared = gs.BeamModel(grid, gs.Scanner(np.repeat(scanner.bearings[:4], 5), RANGE), backend=as_gpu())
+    shared.log_likelihood(several[0], np.linspace(0.5, 1.5, 20))
+    assert "STRANDED" not in code_of(shared)
+
+
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_batches(kind, ordered, as_gpu):
     grid, scanner, z = world()

@@ -146,16 +146,17 @@ def functions(flags):
     @wp.func
     def table_origin(origin: wp.vec2i, cols: wp.int32):
         if INSIDE:
-            stride = cols + 2 * FIELD_RING
-            more = FIELD_RING - ROUNDING_BITS
-            return wp.vec2i((origin.y + more) * stride + origin.x + more, stride)
+            stride = wp.uint32(cols + 2 * FIELD_RING)
+            more = wp.uint32(FIELD_RING - ROUNDING_BITS)
+            first = (wp.uint32(origin.y) + more) * stride + (wp.uint32(origin.x) + more)
+            return wp.vec2i(wp.int32(first), wp.int32(stride))
         else:
             return wp.vec2i(origin.x - ROUNDING_BITS, origin.y - ROUNDING_BITS)
 
     @wp.func
     def table_cell(near: wp.vec2i, start: wp.vec2i, rows: wp.int32, cols: wp.int32):
         if INSIDE:
-            return near.y * start.y + (near.x + start.x)
+            return wp.int32(wp.uint32(near.y) * wp.uint32(start.y) + (wp.uint32(near.x) + wp.uint32(start.x)))
         else:
             return field_cell(start.x + near.x, start.y + near.y, rows, cols)
 

@@ -17,11 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, publish, started_together
+from speed import Recorder, publish, scene_of, started_together
 
-import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose
 
 IN_A_ROW = 10
 
@@ -69,31 +67,15 @@ def least(device: Any, start: Callable[[], None], times: int, repeats: int) -> f
 
 def rows_of(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """All rows of one device."""
-    device, rng = get_backend(backend), np.random.default_rng(arguments.seed)
-    count, beams = arguments.particles, arguments.beams
-    grid = building(0, (arguments.size,) * 2)
-    pose = free_pose(grid, rng, 0.3)
-    clouds = {"global": cloud_uniform(grid, count, rng), "tracking": cloud_around(pose, count, 0.3, 0.1, rng)}
-    scanner = gs.Scanner(np.linspace(-np.pi, np.pi, beams, endpoint=False), 30.0)
-    z = np.minimum(gs.RayCaster(grid, 30.0, backend="numpy").cast(pose[None], scanner.bearings)[0], 29.9)
-    out = np.empty((count, beams), np.float32)
+    device, scene = get_backend(backend), scene_of(arguments)
     rows = []
-    for name, poses in clouds.items():
-        for what, kind in (("rays", None), ("beam model", gs.BeamModel), ("field", gs.LikelihoodFieldModel)):
-            recorder = Recorder(device)
-            model: Any = kind(grid, scanner, backend=recorder) if kind else gs.RayCaster(grid, 30.0, backend=recorder)
-
-            def run(model: Any = model, poses: np.ndarray = poses) -> None:
-                if isinstance(model, gs.RayCaster):
-                    model.cast(poses, scanner.bearings, out=out)
-                else:
-                    model.log_likelihood(poses, z)
-
-            run()
-            launches = recorder.launches_of(run)
+    for name, poses in scene.clouds.items():
+        for what in ("rays", "beam model", "field"):
+            launches = scene.launches(Recorder(device), what, poses)
             start = started_together(device, launches)
             row = {"backend": device.info.selection, "device": device.info.name, "what": f"{what}, {name}"}
-            row |= {"particles": count, "beams": beams, "together_s": least(device, start, 1, arguments.repeats)}
+            row |= {"particles": len(poses), "beams": scene.scanner.count}
+            row["together_s"] = least(device, start, 1, arguments.repeats)
             row["row_s"] = least(device, start, IN_A_ROW, arguments.repeats)
             each = [by_events(device, launches) for _ in range(arguments.repeats)]
             names = [name.removeprefix("forward kernel ").removeprefix("make__locals__") for name, _ in each[0]]

@@ -19,8 +19,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -83,6 +84,47 @@ def started_together(device: Any, launches: list[Callable[[], None]]) -> Callabl
     replay()
     device.synchronize()
     return replay
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The built-in building with a cloud over all of it and one around a pose, and a scan taken there."""
+
+    grid: gs.OccupancyGrid
+    clouds: dict[str, np.ndarray]
+    scanner: gs.Scanner
+    scan: np.ndarray
+
+    def launches(self, device: Recorder, what: str, poses: np.ndarray) -> list[Callable[[], None]]:
+        """The launches of a call for ``what``: rays, beam model or field."""
+        if what == "rays":
+            caster = gs.RayCaster(self.grid, 30.0, backend=cast(Any, device))
+            out = np.empty((len(poses), self.scanner.count), np.float32)
+
+            def run() -> Any:
+                return caster.cast(poses, self.scanner.bearings, out=out)
+
+        else:
+            kind = gs.BeamModel if what == "beam model" else gs.LikelihoodFieldModel
+            model = kind(self.grid, self.scanner, backend=cast(Any, device))
+
+            def run() -> Any:
+                return model.log_likelihood(poses, self.scan)
+
+        run()
+        return device.launches_of(run)
+
+
+def scene_of(arguments: argparse.Namespace) -> Scene:
+    """The scene of --particles, --beams, --size and --seed."""
+    rng = np.random.default_rng(arguments.seed)
+    grid = building(0, (arguments.size,) * 2)
+    pose = free_pose(grid, rng, 0.3)
+    count = arguments.particles
+    clouds = {"global": cloud_uniform(grid, count, rng), "tracking": cloud_around(pose, count, 0.3, 0.1, rng)}
+    scanner = gs.Scanner(np.linspace(-np.pi, np.pi, arguments.beams, endpoint=False), 30.0)
+    scan = np.minimum(gs.RayCaster(grid, 30.0, backend="numpy").cast(pose[None], scanner.bearings)[0], 29.9)
+    return Scene(grid, clouds, scanner, scan)
 
 
 def best(run: Callable[[], Any], repeats: int, longest: float) -> tuple[float, float]:

@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import Recorder, publish
+from speed import Recorder, publish, scene_of
 
-import gpusense as gs
 from gpusense import cloud
 from gpusense.backends import get_backend
 from gpusense.models import field
-from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose
 
 AGAIN = 4
 
@@ -39,36 +37,14 @@ def seconds(device: Any, run: Callable[[], Any]) -> float:
 
 def rows_of(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """All rows of one device."""
-    device, rng = get_backend(backend), np.random.default_rng(arguments.seed)
-    count, beams = arguments.particles, arguments.beams
-    grid = building(0, (arguments.size,) * 2)
-    pose = free_pose(grid, rng, 0.3)
-    clouds = {"global": cloud_uniform(grid, count, rng), "tracking": cloud_around(pose, count, 0.3, 0.1, rng)}
-    scanner = gs.Scanner(np.linspace(-np.pi, np.pi, beams, endpoint=False), 30.0)
-    z = np.minimum(gs.RayCaster(grid, 30.0, backend="numpy").cast(pose[None], scanner.bearings)[0], 29.9)
-    out = np.empty((count, beams), np.float32)
+    device, scene = get_backend(backend), scene_of(arguments)
     rows = []
-    for name, poses in clouds.items():
+    for name, poses in scene.clouds.items():
         for what in ("rays", "beam model", "field"):
             jobs = []
             for power in arguments.power:
                 cloud._ENOUGH = field.ENOUGH_SHORT = 1 << power
-                recorder = Recorder(device)
-                if what == "rays":
-                    caster = gs.RayCaster(grid, 30.0, backend=recorder)
-
-                    def run(caster: Any = caster, poses: np.ndarray = poses) -> Any:
-                        return caster.cast(poses, scanner.bearings, out=out)
-
-                else:
-                    kind = gs.BeamModel if what == "beam model" else gs.LikelihoodFieldModel
-                    model = kind(grid, scanner, backend=recorder)
-
-                    def run(model: Any = model, poses: np.ndarray = poses) -> Any:
-                        return model.log_likelihood(poses, z)
-
-                run()
-                launches = recorder.launches_of(run)
+                launches = scene.launches(Recorder(device), what, poses)
                 jobs.append((power, launches, launches[-1 if what == "rays" or len(launches) == 2 else -2]))
             best = {power: [np.inf, np.inf] for power, *_ in jobs}
             for _ in range(arguments.repeats):
@@ -78,7 +54,9 @@ def rows_of(backend: str, arguments: argparse.Namespace) -> list[dict[str, Any]]
                     best[power] = [min(best[power][0], everything), min(best[power][1], alone)]
             for power, (everything, alone) in best.items():
                 row = {"backend": device.info.selection, "device": device.info.name, "what": f"{what}, {name}"}
-                rows.append({**row, "power": power, "all_s": everything, "main_s": alone, "work": count * beams})
+                rows.append(
+                    {**row, "power": power, "all_s": everything, "main_s": alone, "work": len(poses) * arguments.beams}
+                )
                 print(to_markdown(rows[-1:]).splitlines()[-1], file=sys.stderr, flush=True)
     return rows
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import defaultdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,3 +146,23 @@ def test_only_scenes_that_have_such_kernels_get_them():
     assert widened(wide, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
     assert widened(wide, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
     assert widened(wide, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
+
+
+@pytest.mark.parametrize(
+    ("platform", "kind", "width", "lanes"),
+    [
+        ("Portable Computing Language", "CPU", 16, 16), ("Portable Computing Language", "CPU", 8, 8),
+        ("Intel(R) OpenCL", "CPU", 16, 16), ("Intel(R) OpenCL", "CPU", 8, 8), ("Intel(R) OpenCL Graphics", "GPU", 16, 1),
+        ("Another", "CPU", 16, 1), ("NVIDIA CUDA", "GPU", 1, 1),
+    ],
+)  # fmt: skip
+def test_which_devices_are_asked_for_lanes(platform, kind, width, lanes, needs):
+    needs("opencl")
+    import pyopencl as cl
+
+    from gpusense.backends._opencl import _lanes
+
+    device = SimpleNamespace(
+        platform=SimpleNamespace(name=platform), type=getattr(cl.device_type, kind), native_vector_width_float=width
+    )
+    assert _lanes(device) == lanes

@@ -10,8 +10,8 @@ import pickle
 import numpy as np
 import pytest
 from conftest import on_every_backend
+from incidence_world import EDGES, INCIDENCE, KINDS, P, place
 from scipy.ndimage import distance_transform_edt
-from test_incidence import EDGES, INCIDENCE, KINDS, P, place
 
 import gpusense as gs
 from gpusense import cloud

@@ -152,8 +152,8 @@ def test_only_scenes_that_have_such_kernels_get_them():
     ("platform", "kind", "width", "lanes"),
     [
         ("Portable Computing Language", "CPU", 16, 16), ("Portable Computing Language", "CPU", 8, 8),
-        ("Intel(R) OpenCL", "CPU", 16, 16), ("Intel(R) OpenCL", "CPU", 8, 8), ("Intel(R) OpenCL Graphics", "GPU", 16, 1),
-        ("Another", "CPU", 16, 1), ("NVIDIA CUDA", "GPU", 1, 1),
+        ("Intel(R) OpenCL", "CPU", 16, 16), ("Intel(R) OpenCL", "CPU", 8, 8),
+        ("Intel(R) OpenCL Graphics", "GPU", 16, 1), ("Another", "CPU", 16, 1), ("NVIDIA CUDA", "GPU", 1, 1),
     ],
 )  # fmt: skip
 def test_which_devices_are_asked_for_lanes(platform, kind, width, lanes, needs):

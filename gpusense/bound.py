@@ -17,7 +17,7 @@ import numpy as np
 
 from gpusense import arrays
 from gpusense.backends.base import Buffer, Gathering
-from gpusense.cloud import Cloud, Placed, finish
+from gpusense.cloud import Cloud, Placed, Readings, finish
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.region import Region
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from gpusense.models.scan_model import ScanModel
 
 _INT = np.dtype(np.int32)
+# Readings are placed by whole groups of so many work-items, so that those of poses begin with a group.
+_GROUP = 64
 
 
 class BoundCall(ABC):
@@ -87,7 +89,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class PlacedScan:
-    """Readings on the device, as the kernel ``place_readings`` leaves them.
+    """Readings on the device, as the kernel ``place_inputs`` leaves them.
 
     Attributes:
         places: Places of readings; those at the end may be missing (nan).
@@ -136,7 +138,7 @@ class DeviceCall(BoundCall):
         self._space = Workspace(backend)
         self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
-        self._scan, self._place, self._fixed = self._placing_of(found)
+        self._scan, self._readings, self._fixed = self._placing_of(found)
         self._counts = backend.upload(np.array([self._scan.parts], _INT))
         self._record()
 
@@ -176,8 +178,8 @@ class DeviceCall(BoundCall):
         """Wait for what this thread has started or gathered, and see that all poses were finite."""
         finish(self._space, on_device=True)
 
-    def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Callable[[], None], bool]:
-        """Where readings are placed, what starts that, and whether those without a place add something."""
+    def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Readings, bool]:
+        """Where readings are placed, what does that, and whether those without a place add something."""
         model, backend, real, space = self._model, self._backend, self._real, self._space
         z_max, scanner, end_points = model._z_max, model.scanner, model._end_points
         beams = np.arange(scanner.count)
@@ -210,17 +212,17 @@ class DeviceCall(BoundCall):
         flags = model._scene_flags() & {"FLOAT64", "ALL_READINGS"}
         flags |= {"END_POINTS"} if end_points else set()
         flags |= {"RANGES_FLOAT32"} if dtype == np.float32 else set()
-        arguments = (
+        flags |= set() if np.array_equal(beams, np.arange(scanner.count)) else {"SOME_BEAMS"}
+        buffers = (
             ranges, backend.upload(beams.astype(_INT)), backend.upload(vectors), scan.point, scan.low, scan.reading,
-            scan.guard, scan.fixed, len(beams), each, places, chosen, kind, int(possible), float(nearest),
-            float(farthest), float(np.log(z_max)) if kind == MAX_FIXED else 0.0, model.grid.resolution,
-            self._scene.top, self._scene.guard_scale,
+            scan.guard, scan.fixed,
         )  # fmt: skip
-
-        def place() -> None:
-            backend.compile("place_readings", frozenset(flags))((max(len(beams), 1),), *arguments)
-
-        return scan, place, kind == MAX_FIXED or not possible
+        numbers = (
+            len(beams), each, places, chosen, kind, int(possible), float(nearest), float(farthest),
+            float(np.log(z_max)) if kind == MAX_FIXED else 0.0, self._scene.top, self._scene.guard_scale,
+        )  # fmt: skip
+        head = -(-max(len(beams), 1) // _GROUP) * _GROUP
+        return scan, Readings(head, frozenset(flags), buffers, numbers), kind == MAX_FIXED or not possible
 
     def _record(self) -> None:
         """Make the table where there is none, and keep the launches of a call; nothing is started."""
@@ -244,12 +246,16 @@ class DeviceCall(BoundCall):
         flags |= {"SCANS"} if self._fixed else set()
         counts, chunk = self._counts, model._bound_chunk(scan.places)
         frame = (region, model.grid, model.scanner.mount)
-        self._place()
+        readings: Readings | None = self._readings
         for begin in range(0, cloud.count, chunk):
             part = (begin, min(begin + chunk, cloud.count))
             count = part[1] - begin
             given = cloud.given(backend, space, part)
-            placed = cloud.place(backend, space, given, part, frame, self._real, careful=self._scene.careful)
+            placed = cloud.place(
+                backend, space, given, part, frame, self._real, careful=self._scene.careful,
+                readings=readings,
+            )  # fmt: skip
+            readings = None
             parts = space.empty("parts", count * scan.parts, self._real)
             if scan.places:
                 score(placed, cloud.headings(), count, scan, parts)

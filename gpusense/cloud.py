@@ -42,6 +42,23 @@ class Placed:
     low: Buffer
 
 
+@dataclass(frozen=True)
+class Readings:
+    """Readings on the device that the launch which places poses places too; see the kernel file ``scan``.
+
+    Attributes:
+        head: Work-items for them.
+        flags: What they change of the kernel's code.
+        arrays: Its arguments from ``ranges`` to ``fixed``.
+        numbers: Its arguments from ``beams`` to ``guard_scale``.
+    """
+
+    head: int
+    flags: frozenset[str]
+    arrays: tuple[Buffer, ...]
+    numbers: tuple[float, ...]
+
+
 class Cloud:
     """(N, 3) poses.
 
@@ -121,8 +138,9 @@ class Cloud:
         real: np.dtype,
         *,
         careful: bool,
+        readings: Readings | None = None,
     ) -> Placed:
-        """Poses part[0] to part[1] - 1, which are ``given``, in the frame of a window."""
+        """Poses part[0] to part[1] - 1, which are ``given``, in the frame of a window, and readings along with them."""
         (begin, end), (region, grid, mount) = part, frame
         count = end - begin
         if given is None:
@@ -131,10 +149,15 @@ class Cloud:
         cell, pose = space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real)
         low = space.empty("pose_low", 4 * count if careful else 4, real)
         verdict = space.empty("verdict", 2, _INT, zero=True)
-        window = (region.col, region.row, region.rows, region.cols)
-        backend.compile("place_poses", flags)(
-            (count,), given, cell, pose, low, verdict, *frame_scalars(grid, mount), *window, count
-        )
+        buffers = (given, cell, pose, low, verdict)
+        numbers = (*frame_scalars(grid, mount), region.col, region.row, region.rows, region.cols, count)
+        if readings is None:
+            backend.compile("place_poses", flags)((count,), *buffers, *numbers)
+        else:
+            head = readings.head
+            backend.compile("place_inputs", flags | readings.flags)(
+                (head + count,), *buffers, *readings.arrays, *numbers, head, *readings.numbers
+            )
         return Placed(cell, pose, low)
 
     def _place_on_host(

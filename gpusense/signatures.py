@@ -2,7 +2,7 @@
 
 A kernel has three bodies (NumPy reference, OpenCL, Warp) with the same name and the same arguments; a test holds the
 three to this table. ``real`` stands for the precision of a model, float32 or float64; ``double`` is always float64, and
-``coordinate`` is float64, or float32 with POSES_FLOAT32 (poses) or RANGES_FLOAT32 (readings).
+``coordinate`` (poses) and ``measured`` (readings) are float64, or float32 with POSES_FLOAT32 and RANGES_FLOAT32.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ FLAGS = {
     "LOG_TABLE": "the field's table holds log densities, not distances",
     "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
     "RANGES_FLOAT32": "readings on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "SOME_BEAMS": "readings on the device are those of more beams than are used",
     "END_POINTS": "readings on the device become end points of beams, not rays with ranges",
     "RANGE": "some feature has a range",
     "BEARING": "some feature has a bearing",
@@ -162,6 +163,15 @@ _CHANGED = (
 _PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
 _RANGE = ("real limit", "real resolution", "real range_max")
 _LANDMARKS = ("real4 landmark [landmarks]", "real4 signature [landmarks]")
+# Poses on their way into a window of the grid.
+_GIVEN = (
+    "coordinate poses [particles * 3]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
+    "out real4 pose_low [particles]", "out int verdict [2]",
+)  # fmt: skip
+_FRAME = (
+    "double origin_x", "double origin_y", "double resolution", "double mount_x", "double mount_y", "double yaw_cos",
+    "double yaw_sin", "int first_col", "int first_row", *_MAP, "int particles",
+)  # fmt: skip
 _PLACED = (*_POSES, "real4 pose_low [particles]")
 _FEATURES = ("real feature [28 * features]",)
 _MIXTURE = ("real terms [4]", "real2 arcs [11]")
@@ -213,17 +223,12 @@ KERNELS: dict[str, Kernel] = {
     "rectangles_scan": _kernel(
         "rectangles", "col row quadrant", "uchar runs [2 * band * cols]", f"out {_PLANES}", *_CHANGED,
     ),
-    "place_poses": _kernel(
-        "placement", "particle", "coordinate poses [particles * 3]", "out int2 pose_cell [particles]",
-        "out real4 pose [particles]", "out real4 pose_low [particles]", "out int verdict [2]", "double origin_x",
-        "double origin_y", "double resolution", "double mount_x", "double mount_y", "double yaw_cos", "double yaw_sin",
-        "int first_col", "int first_row", *_MAP, "int particles",
-    ),
-    "place_readings": _kernel(
-        "scan", "place", "coordinate ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
+    "place_poses": _kernel("placement", "particle", *_GIVEN, *_FRAME),
+    "place_inputs": _kernel(
+        "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
         "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
-        "out real guard [blocks]", "out real fixed [1]", "int beams", "int each", "int places", "int chosen",
-        "int max_readings", "int possible", "double nearest", "double farthest", "double log_max", "double resolution",
+        "out real guard [blocks]", "out real fixed [1]", *_FRAME, "int head", "int beams", "int each", "int places",
+        "int chosen", "int max_readings", "int possible", "double nearest", "double farthest", "double log_max",
         "double top", "double guard_scale",
     ),
     "cast_ranges": _kernel(

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kernel_scenes import on_both, scene_flags
+from kernel_scenes import PRECISIONS, on_both, scene_flags
 
 import gpusense as gs
 from gpusense.backends import Backend
-from gpusense.frames import ray_vectors, split
+from gpusense.frames import frame_scalars, ray_vectors, split
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED, is_chosen
 from gpusense.scan import choose_beams, prepare_scan
@@ -33,18 +33,26 @@ def scans(real: type, count: int) -> list[np.ndarray]:
     return [one.astype(real) for one in (plain, mixed, np.full(count, np.nan), np.full(count, np.inf))]
 
 
-def placed(device: Backend, flags: frozenset[str], ranges: np.ndarray, vectors: np.ndarray, *numbers: Any) -> Any:
-    """What place_readings writes, by the reference and by a device; what it does not write stays 77."""
+def placed(
+    device: Backend, flags: frozenset[str], ranges: np.ndarray, vectors: np.ndarray, *numbers: Any, some: bool = False
+) -> Any:
+    """What place_inputs writes of readings, by the reference and by a device; what it does not write stays 77."""
     real = np.float64 if "FLOAT64" in flags else np.float32
     beams, each = vectors.shape[:2]
     places, chosen, kind, possible, nearest, log_max, top = numbers
     blocks = max(-(-places // BLOCK_TERMS), 1)
     room = [np.full(max(size, 1), 77, real) for size in (2 * each * places, 2 * places, places, blocks, 1)]
-    beam = np.arange(beams, dtype=np.int32)
+    beam, head = np.arange(beams, dtype=np.int32), max(beams, places, 1)
     flags |= {"RANGES_FLOAT32"} if ranges.dtype == np.float32 else frozenset()
+    if some:
+        # The same readings among others.
+        flags, beam = flags | {"SOME_BEAMS"}, 1 + 2 * beam
+        ranges = np.insert(ranges, np.arange(beams), ranges.dtype.type(1.5))
+    poses = [np.zeros(3), np.zeros(2, np.int32), np.zeros(4, real), np.zeros(4, real), np.zeros(2, np.int32)]
+    frame = (0.0, 0.0, RESOLUTION, 0.0, 0.0, 1.0, 0.0, 0, 0, 10, 10, 0)
     call = (
-        "place_readings", flags, (max(beams, places, 1),), ranges, beam, vectors, *room, beams, each, places, chosen,
-        kind, possible, nearest, RANGE, log_max, RESOLUTION, top, GUARD,
+        "place_inputs", flags, (head,), *poses, ranges, beam, vectors, *room, *frame, head, beams, each, places,
+        chosen, kind, possible, nearest, RANGE, log_max, top, GUARD,
     )  # fmt: skip
     reference, found = on_both(device, *call)
     for name in reference:
@@ -70,7 +78,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
             scan = prepare_scan(ranges, scanner, vectors, z_max, chosen, True, max_depends=kind == MAX_PLACED)
             flags = scene_flags(precision, *(["END_POINTS"] if end_points else []))
             numbers = (chosen, chosen, kind, 1, nearest, np.log(z_max) if z_max else 0.0, np.inf)
-            found = placed(device, flags, ranges, vectors[:, None], *numbers)
+            found = placed(device, flags, ranges, vectors[:, None], *numbers, some=chosen == 7)
             some = len(scan.readings)
             assert found["fixed"][0] == real.type(scan.constant)
             point = found["point"][: 2 * chosen].reshape(chosen, 2)
@@ -122,3 +130,24 @@ def test_an_even_choice_is_that_of_the_host() -> None:
         kinds = np.full(informative, Reading.HIT)
         expected = choose_beams(kinds, chosen, True)
         assert (is_chosen(np.arange(informative), informative, chosen) == expected).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_poses_are_placed_along_with_readings(precision: type, device: Backend) -> None:
+    """As place_poses and the reference place them, whatever work-items readings take before."""
+    rng, count, beams, grid = np.random.default_rng(5), 150, 53, gs.OccupancyGrid(np.zeros((9, 12), np.int8), 0.5)
+    poses = np.stack([rng.uniform(-1, 7, count), rng.uniform(-1, 5, count), rng.uniform(-4, 4, count)], axis=-1)
+    poses[7, 1] = np.nan
+    frame = (*frame_scalars(grid, (0.1, -0.2, 0.0)), 0, 0, *grid.shape, count)
+    outputs = [np.full((count, 2), 77, np.int32), *np.full((2, count, 4), 77, precision), np.zeros(2, np.int32)]
+    flags = scene_flags(precision, "CAREFUL")
+    alone, _ = on_both(device, "place_poses", flags, (count,), poses, *outputs, *frame)
+    room = [np.zeros(2 * beams, precision) for _ in range(5)]
+    readings = (rng.uniform(0, RANGE, beams), np.arange(beams, dtype=np.int32), np.ones((beams, 2)))
+    for head in (64, 128):
+        call = (*outputs, *readings, *room, *frame, head, beams, 1, beams, beams, MAX_FIXED, 1, NEAREST, RANGE, -1.0)
+        both = on_both(device, "place_inputs", flags, (head + count,), poses, *call, np.inf, GUARD)
+        for found in both:
+            for name in ("pose_cell", "pose", "pose_low", "verdict"):
+                assert differing(found[name], alone[name]) == 0, name
+        assert both[1]["verdict"].all() and differing(both[1]["reading"], both[0]["reading"]) == 0

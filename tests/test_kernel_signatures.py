@@ -84,7 +84,7 @@ def test_warp_kernels_have_the_arguments_of_their_row(
     real = {np.float32: (wp.float32, wp.vec2f, wp.vec4f), np.float64: (wp.float64, wp.vec2d, wp.vec4d)}[precision]
     types = dict(zip(("real", "real2", "real4"), real, strict=True))
     types |= {"int": wp.int32, "int2": wp.vec2i, "uchar": wp.uint8, "ushort": wp.uint16, "entry": wp.uint16}
-    types |= {"double": wp.float64, "coordinate": wp.float64}
+    types |= {"double": wp.float64, "coordinate": wp.float64, "measured": wp.float64}
     row = KERNELS[kernel]
     made = warp_module(row.file).make(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
     expected = {a.name: (types[a.type], a.shape is not None) for a in row.arguments}

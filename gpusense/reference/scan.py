@@ -1,5 +1,6 @@
-"""Readings that are on the device: which of them count and where they go, as ``gpusense.scan`` finds it on the host.
+"""Poses and readings that are on the device.
 
+Which readings count and where they go is as ``gpusense.scan`` finds it on the host.
 Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
 is left at the end are missing readings (nan), which add nothing.
 """
@@ -9,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.placement import place_poses
 
 # What max readings are: left out, in the constant, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
@@ -24,7 +26,12 @@ def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:
     return nearest * informative // chosen == rank
 
 
-def place_readings(
+def reading_of(flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, beams: int) -> np.ndarray:
+    """(beams,) readings, of some beams, in float64."""
+    return ranges[beam[:beams] if "SOME_BEAMS" in flags else slice(beams)].astype(np.float64)
+
+
+def place_reading(
     flags: frozenset[str],
     ranges: np.ndarray,
     beam: np.ndarray,
@@ -34,6 +41,7 @@ def place_readings(
     reading: np.ndarray,
     guard: np.ndarray,
     fixed: np.ndarray,
+    resolution: float,
     beams: int,
     each: int,
     places: int,
@@ -43,7 +51,6 @@ def place_readings(
     nearest: float,
     farthest: float,
     log_max: float,
-    resolution: float,
     top: float,
     guard_scale: float,
 ) -> None:
@@ -54,7 +61,7 @@ def place_readings(
     guard_scale (longest + 2 cells) of a block of places. ``fixed`` is what max readings add that have no place; -inf
     where a range is there and none is ``possible``.
     """
-    z = ranges[beam[:beams]].astype(np.float64)
+    z = reading_of(flags, ranges, beam, beams)
     hit, far = (z >= nearest) & (z < farthest), z >= farthest
     informative = hit | (far & (max_readings != MAX_LEFT_OUT))
     rank = np.cumsum(informative) - 1
@@ -85,3 +92,54 @@ def place_readings(
     fixed[0] = np.count_nonzero(used & far) * log_max if max_readings == MAX_FIXED else 0.0
     if not possible and (used & hit).any():
         fixed[0] = -np.inf
+
+
+def place_inputs(
+    flags: frozenset[str],
+    poses: np.ndarray,
+    pose_cell: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    verdict: np.ndarray,
+    ranges: np.ndarray,
+    beam: np.ndarray,
+    vector: np.ndarray,
+    point: np.ndarray,
+    point_low: np.ndarray,
+    reading: np.ndarray,
+    guard: np.ndarray,
+    fixed: np.ndarray,
+    origin_x: float,
+    origin_y: float,
+    resolution: float,
+    mount_x: float,
+    mount_y: float,
+    yaw_cos: float,
+    yaw_sin: float,
+    first_col: int,
+    first_row: int,
+    rows: int,
+    cols: int,
+    particles: int,
+    head: int,
+    beams: int,
+    each: int,
+    places: int,
+    chosen: int,
+    max_readings: int,
+    possible: int,
+    nearest: float,
+    farthest: float,
+    log_max: float,
+    top: float,
+    guard_scale: float,
+) -> None:
+    """Poses and readings in their places; the first ``head`` work-items of a device are for readings."""
+    place_reading(
+        flags, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each, places, chosen,
+        max_readings, possible, nearest, farthest, log_max, top, guard_scale,
+    )  # fmt: skip
+    place_poses(
+        flags, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y, yaw_cos,
+        yaw_sin, first_col, first_row, rows, cols, particles,
+    )  # fmt: skip

@@ -28,17 +28,14 @@ double whole_below(const double position) {
     return whole > position ? whole - 1.0 : whole;
 }
 
-// One work-item a particle: the pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low
-// takes what rounding took from pose. verdict, which the caller clears, becomes 1 where (0) a pose is not finite, (1) a
-// sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading (1, 0): it
-// sees nothing, and no index made of it is out of bounds.
-kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                        global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
-                        const double resolution, const double mount_x, const double mount_y, const double yaw_cos,
-                        const double yaw_sin, const int first_col, const int first_row, const int rows, const int cols,
-                        const int particles) {
-    const int particle = get_global_id(0);
-    if (particle >= particles) return;
+// A pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low takes what rounding took from
+// pose. verdict, which the caller clears, becomes 1 where (0) a pose is not finite, (1) a sensor is outside the window. A
+// pose that is not finite becomes the farthest cell, fraction 0 and heading (1, 0): it sees nothing, and no index made of
+// it is out of bounds.
+void place_pose(const int particle, global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
+                global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
+                const double resolution, const double mount_x, const double mount_y, const double yaw_cos,
+                const double yaw_sin, const int first_col, const int first_row, const int rows, const int cols) {
     const long first = 3 * (long)particle;
     double x = poses[first], y = poses[first + 1];
     const double theta = poses[first + 2];
@@ -82,4 +79,16 @@ kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, 
     pose_low[particle] = (real4)((real)(x - rounded.x), (real)(y - rounded.y), (real)(cosine - rounded.z),
                                  (real)(sine - rounded.w));
 #endif
+}
+
+// One work-item a particle.
+kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
+                        global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
+                        const double resolution, const double mount_x, const double mount_y, const double yaw_cos,
+                        const double yaw_sin, const int first_col, const int first_row, const int rows, const int cols,
+                        const int particles) {
+    const int particle = get_global_id(0);
+    if (particle >= particles) return;
+    place_pose(particle, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
+               yaw_cos, yaw_sin, first_col, first_row, rows, cols);
 }

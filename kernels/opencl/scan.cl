@@ -1,12 +1,13 @@
-// Readings that are on the device: which of them count and where they go, as gpusense/scan.py finds it on the host.
+// Poses and readings that are on the device. Which readings count and where they go is as gpusense/scan.py finds it on the
+// host.
 // Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits;
 // what is left at the end are missing readings (nan), which add nothing.
-// requires: error_free
+// requires: error_free placement
 
 #if RANGES_FLOAT32
-typedef float coordinate;
+typedef float measured;
 #else
-typedef double coordinate;
+typedef double measured;
 #endif
 
 // What max readings are: left out, in the constant, or evaluated like others.
@@ -22,23 +23,35 @@ int is_chosen(const int rank, const int informative, const int chosen) {
     return nearest * informative / chosen == rank;
 }
 
-// One work-item a beam and place: it looks at all readings, of which 16 are read before any is looked at, finds the place
-// of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam, each of them; with
-// END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A max reading is inf. The
-// guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings add that have no place; -inf
-// where a range is there and none is possible.
-kernel void place_readings(global const coordinate *ranges, global const int *beam, global const double *vector,
-                           global real2 *point, global real2 *point_low, global real *reading, global real *guard,
-                           global real *fixed, const int beams, const int each, const int places, const int chosen,
-                           const int max_readings, const int possible, const double nearest, const double farthest,
-                           const double log_max, const double resolution, const double top, const double guard_scale) {
-    const int own = get_global_id(0);
-    if (own >= max(max(beams, places), 1)) return;
+// The reading with a number among so many, of some beams; nan beyond the last.
+double reading_of(const int k, global const measured *ranges, global const int *beam, const int beams) {
+    if (k >= beams) return NAN;
+#if SOME_BEAMS
+    return ranges[beam[k]];
+#else
+    return ranges[k];
+#endif
+}
+
+// A reading's and a place's own part: it looks at all readings, of which 16 are read before any is looked at, finds the
+// place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam, each of
+// them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A max reading is
+// inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings add that have no
+// place; -inf where a range is there and none is possible.
+void place_reading(const int own, global const measured *ranges, global const int *beam, global const double *vector,
+                   global real2 *point, global real2 *point_low, global real *reading, global real *guard,
+                   global real *fixed, const double resolution, const int beams, const int each, const int places,
+                   const int chosen, const int max_readings, const int possible, const double nearest,
+                   const double farthest, const double log_max, const double top, const double guard_scale) {
+    // What is needed last is read first, so that nothing waits for it.
+    const long from = 2 * (long)min(own, beams - 1) * each;
+    const double z_own = reading_of(own, ranges, beam, beams);
+    const double vector_x = own < beams ? vector[from] : 1, vector_y = own < beams ? vector[from + 1] : 0;
     int informative = beams;
     if (chosen < beams) {
         informative = 0;
         for (int k = 0; k < beams; ++k) {
-            const double z = ranges[beam[k]];
+            const double z = reading_of(k, ranges, beam, beams);
             informative += z >= nearest && (z < farthest || max_readings != MAX_LEFT_OUT);
         }
     }
@@ -48,35 +61,52 @@ kernel void place_readings(global const coordinate *ranges, global const int *be
     for (int first = 0; first < beams; first += BLOCK_TERMS) {
         double several[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) several[i] = first + i < beams ? ranges[beam[first + i]] : NAN;
+        for (int i = 0; i < BLOCK_TERMS; ++i) several[i] = reading_of(first + i, ranges, beam, beams);
+        // Sets of readings: bit i is reading first + i.
+        uint hits = 0, fars = 0;
 #pragma unroll
         for (int i = 0; i < BLOCK_TERMS; ++i) {
-            const int k = first + i;
-            const double z = several[i];
-            const int hit = z >= nearest && z < farthest, far = z >= farthest;
-            const int told = hit || (far && max_readings != MAX_LEFT_OUT);
-            const int used = told && is_chosen(rank, informative, chosen);
-            const int as_range = used && hit && possible, as_far = used && far && max_readings == MAX_PLACED;
-            rank += told;
-            far_count += used && far;
-            impossible += used && hit && !possible;
-#if ALL_READINGS
-            const int placed = k < beams;
-#else
-            const int placed = as_range || as_far;
-#endif
-            if (placed && k == own) {
-                own_place = place;
-                own_value = as_range ? z : as_far ? INFINITY : NAN;
-            }
-            if (as_range && place >= own_place && place < own_place + BLOCK_TERMS) longest = z > longest ? z : longest;
-            place += placed;
+            hits |= (uint)(several[i] >= nearest && several[i] < farthest) << i;
+            fars |= (uint)(several[i] >= farthest) << i;
         }
+        const uint told = max_readings == MAX_LEFT_OUT ? hits : hits | fars;
+        uint used = told;
+        if (chosen < informative) {
+            for (int i = 0; i < BLOCK_TERMS; ++i) {
+                const int its_rank = rank + popcount(told & ((1u << i) - 1));
+                if (!is_chosen(its_rank, informative, chosen)) used &= ~(1u << i);
+            }
+        }
+        const uint as_range = possible ? used & hits : 0, as_far = max_readings == MAX_PLACED ? used & fars : 0;
+#if ALL_READINGS
+        const uint placed = first + BLOCK_TERMS <= beams ? (1u << BLOCK_TERMS) - 1 : (1u << (beams - first)) - 1;
+#else
+        const uint placed = as_range | as_far;
+#endif
+        const int i_own = own - first;
+        if (i_own >= 0 && i_own < BLOCK_TERMS && (placed >> i_own & 1)) {
+            own_place = place + popcount(placed & ((1u << i_own) - 1));
+            own_value = as_range >> i_own & 1 ? z_own : as_far >> i_own & 1 ? INFINITY : NAN;
+        }
+#if END_POINTS
+        if (own_place < places && own_place % BLOCK_TERMS == 0 && place < own_place + BLOCK_TERMS) {
+#pragma unroll
+            for (int i = 0; i < BLOCK_TERMS; ++i) {
+                const int other = place + popcount(placed & ((1u << i) - 1));
+                const int beside = other >= own_place && other < own_place + BLOCK_TERMS;
+                if ((as_range >> i & 1) && beside) longest = several[i] > longest ? several[i] : longest;
+            }
+        }
+#endif
+        rank += popcount(told);
+        far_count += popcount(used & fars);
+        impossible |= !possible && (used & hits);
+        place += popcount(placed);
     }
 #if END_POINTS
     if (own_place < places) {
         const double cells = own_value / resolution, length = isfinite(cells) ? cells : 0;
-        const double x = vector[2 * (long)own * each] * length, y = vector[2 * (long)own * each + 1] * length;
+        const double x = vector_x * length, y = vector_y * length;
         const real2 high = (real2)((real)x, (real)y);
         point[own_place] = isfinite(cells) ? high : (real2)((real)cells);
         point_low[own_place] = (real2)((real)(x - high.x), (real)(y - high.y));
@@ -89,9 +119,9 @@ kernel void place_readings(global const coordinate *ranges, global const int *be
     }
 #else
     if (own_place < places) {
-        for (int j = 0; j < each; ++j) {
-            const long from = (long)own * each + j;
-            point[(long)own_place * each + j] = (real2)((real)vector[2 * from], (real)vector[2 * from + 1]);
+        point[(long)own_place * each] = (real2)((real)vector_x, (real)vector_y);
+        for (int j = 1; j < each; ++j) {
+            point[(long)own_place * each + j] = (real2)((real)vector[from + 2 * j], (real)vector[from + 2 * j + 1]);
         }
         const real rounded = (real)own_value;
         reading[own_place] = rounded > (real)top && !isinf(rounded) ? (real)top : rounded;
@@ -105,4 +135,28 @@ kernel void place_readings(global const coordinate *ranges, global const int *be
         fixed[0] = max_readings == MAX_FIXED ? (real)(far_count * log_max) : 0;
         if (impossible > 0) fixed[0] = -INFINITY;
     }
+}
+
+// One work-item a beam and place, in whole groups, and after these one a particle.
+kernel void place_inputs(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
+                         global real4 *pose_low, global int *verdict, global const measured *ranges,
+                         global const int *beam, global const double *vector, global real2 *point,
+                         global real2 *point_low, global real *reading, global real *guard, global real *fixed,
+                         const double origin_x, const double origin_y, const double resolution, const double mount_x,
+                         const double mount_y, const double yaw_cos, const double yaw_sin, const int first_col,
+                         const int first_row, const int rows, const int cols, const int particles, const int head,
+                         const int beams, const int each, const int places, const int chosen, const int max_readings,
+                         const int possible, const double nearest, const double farthest, const double log_max,
+                         const double top, const double guard_scale) {
+    const int item = get_global_id(0);
+    if (item < head) {
+        if (item < max(max(beams, places), 1)) {
+            place_reading(item, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each,
+                          places, chosen, max_readings, possible, nearest, farthest, log_max, top, guard_scale);
+        }
+        return;
+    }
+    if (item - head >= particles) return;
+    place_pose(item - head, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
+               yaw_cos, yaw_sin, first_col, first_row, rows, cols);
 }

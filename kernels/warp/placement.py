@@ -4,6 +4,7 @@ Only +, -, *, /, floor and comparisons are used, so that every device places a p
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -23,8 +24,8 @@ def within_reach(position: wp.float64):
 
 
 @functools.cache
-def make(name, flags):
-    """The kernel place_poses specialised by the flags."""
+def functions(flags):
+    """The functions of this file specialised by the flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
@@ -32,12 +33,13 @@ def make(name, flags):
     CAREFUL = "CAREFUL" in flags
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
 
-    # One work-item a particle: the pose times the scanner's mount, without its yaw, which belongs to the bearings.
-    # pose_low takes what rounding took from pose. verdict, which the caller clears, becomes 1 where (0) a pose is not
-    # finite, (1) a sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and
-    # heading (1, 0): it sees nothing, and no index made of it is out of bounds.
-    @kernel
-    def place_poses(
+    # A pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low takes what rounding
+    # took from pose. verdict, which the caller clears, becomes 1 where (0) a pose is not finite, (1) a sensor is
+    # outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading (1, 0): it sees
+    # nothing, and no index made of it is out of bounds.
+    @wp.func
+    def place_pose(
+        particle: wp.int32,
         poses: wp.array(dtype=coordinate),
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
@@ -54,11 +56,7 @@ def make(name, flags):
         first_row: wp.int32,
         rows: wp.int32,
         cols: wp.int32,
-        particles: wp.int32,
     ):
-        particle = work_item(wp.tid())
-        if particle >= particles:
-            return
         x = wp.float64(poses[3 * particle])
         y = wp.float64(poses[3 * particle + 1])
         theta = wp.float64(poses[3 * particle + 2])
@@ -104,5 +102,43 @@ def make(name, flags):
                 real(cosine - wp.float64(rounded.z)),
                 real(sine - wp.float64(rounded.w)),
             )
+
+    return SimpleNamespace(place_pose=place_pose, coordinate=coordinate)
+
+
+@functools.cache
+def make(name, flags):
+    """The kernel place_poses specialised by the flags."""
+    vec4, own = precision(flags).vec4, functions(flags)
+    place_pose, coordinate = own.place_pose, own.coordinate
+
+    # One work-item a particle.
+    @kernel
+    def place_poses(
+        poses: wp.array(dtype=coordinate),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        verdict: wp.array(dtype=wp.int32),
+        origin_x: wp.float64,
+        origin_y: wp.float64,
+        resolution: wp.float64,
+        mount_x: wp.float64,
+        mount_y: wp.float64,
+        yaw_cos: wp.float64,
+        yaw_sin: wp.float64,
+        first_col: wp.int32,
+        first_row: wp.int32,
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+    ):
+        particle = work_item(wp.tid())
+        if particle >= particles:
+            return
+        place_pose(
+            particle, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
+            yaw_cos, yaw_sin, first_col, first_row, rows, cols,
+        )  # fmt: skip
 
     return {"place_poses": place_poses}[name]

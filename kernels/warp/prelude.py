@@ -94,3 +94,14 @@ def fused(real):
     def multiply_add(a: real, b: real, c: real) -> real: ...
 
     return multiply_add
+
+
+# How many bits are set.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __popc(bits);
+#else
+return __builtin_popcount(bits);
+#endif
+""")
+def popcount(bits: wp.int32) -> wp.int32: ...

@@ -1,5 +1,6 @@
-"""Readings that are on the device: which of them count and where they go, as gpusense/scan.py finds it on the host.
+"""Poses and readings that are on the device.
 
+Which readings count and where they go is as gpusense/scan.py finds it on the host.
 Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
 is left at the end are missing readings (nan), which add nothing.
 """
@@ -9,8 +10,9 @@ import math
 
 import warp as wp
 
+from . import placement
 from .error_free import BLOCK_TERMS
-from .prelude import kernel, precision
+from .prelude import kernel, popcount, precision, work_item
 
 # What max readings are: left out, in the constant, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = wp.constant(0), wp.constant(1), wp.constant(2)
@@ -33,24 +35,38 @@ def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
 
 @functools.cache
 def make(name, flags):
-    """A kernel of this file specialised by the flags."""
-    types = precision(flags)
-    real, vec2 = types.real, types.vec2
-    coordinate = wp.float32 if "RANGES_FLOAT32" in flags else wp.float64
+    """The kernel place_inputs specialised by the flags."""
+    types, place = precision(flags), placement.functions(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    coordinate, place_pose = place.coordinate, place.place_pose
+    measured = wp.float32 if "RANGES_FLOAT32" in flags else wp.float64
     block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=wp.float64)
+    SOME_BEAMS = "SOME_BEAMS" in flags
     ALL_READINGS = "ALL_READINGS" in flags
     END_POINTS = "END_POINTS" in flags
     NOTHING, NEVER = real(0.0), real(-math.inf)
     NO_READING, AHEAD = real(math.nan), vec2(1.0, 0.0)
 
-    # One work-item a beam and place: it looks at all readings, of which 16 are read before any is looked at, finds the
-    # place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam, each
-    # of them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A max
-    # reading is inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings add
-    # that have no place; -inf where a range is there and none is possible.
-    @kernel
-    def place_readings(
-        ranges: wp.array(dtype=coordinate),
+    # The reading with a number among so many, of some beams; nan beyond the last.
+    @wp.func
+    def reading_of(k: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), beams: wp.int32):
+        z = wp.float64(MISSING)
+        if k < beams:
+            if SOME_BEAMS:
+                z = wp.float64(ranges[beam[k]])
+            else:
+                z = wp.float64(ranges[k])
+        return z
+
+    # A reading's and a place's own part: it looks at all readings, of which 16 are read before any is looked at, finds
+    # the place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam,
+    # each of them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A
+    # max reading is inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings
+    # add that have no place; -inf where a range is there and none is possible.
+    @wp.func
+    def place_reading(
+        own: wp.int32,
+        ranges: wp.array(dtype=measured),
         beam: wp.array(dtype=wp.int32),
         vector: wp.array(dtype=wp.float64),
         point: wp.array(dtype=vec2),
@@ -58,6 +74,7 @@ def make(name, flags):
         reading: wp.array(dtype=real),
         guard: wp.array(dtype=real),
         fixed: wp.array(dtype=real),
+        resolution: wp.float64,
         beams: wp.int32,
         each: wp.int32,
         places: wp.int32,
@@ -67,18 +84,22 @@ def make(name, flags):
         nearest: wp.float64,
         farthest: wp.float64,
         log_max: wp.float64,
-        resolution: wp.float64,
         top: wp.float64,
         guard_scale: wp.float64,
     ):
-        own = wp.tid()
-        if own >= wp.max(wp.max(beams, places), 1):
-            return
-        informative = beams
+        # What is needed last is read first, so that nothing waits for it.
+        source = 2 * own * each
+        z_own = reading_of(own, ranges, beam, beams)
+        vector_x = wp.float64(1.0)
+        vector_y = wp.float64(0.0)
+        if own < beams:
+            vector_x = vector[source]
+            vector_y = vector[source + 1]
+        informative = int(beams)
         if chosen < beams:
             informative = int(0)
             for k in range(beams):
-                z = wp.float64(ranges[beam[k]])
+                z = reading_of(k, ranges, beam, beams)
                 if z >= nearest and (z < farthest or max_readings != MAX_LEFT_OUT):
                     informative += 1
         rank = int(0)
@@ -93,39 +114,60 @@ def make(name, flags):
         while first < beams:
             several = block_terms()
             for i in range(BLOCK_TERMS):
-                several[i] = MISSING
-                if first + i < beams:
-                    several[i] = wp.float64(ranges[beam[first + i]])
+                several[i] = reading_of(first + i, ranges, beam, beams)
+            # Sets of readings: bit i is reading first + i.
+            hits = int(0)
+            fars = int(0)
             for i in range(BLOCK_TERMS):
-                k = first + i
-                z = several[i]
-                hit = z >= nearest and z < farthest
-                far = z >= farthest
-                told = hit or (far and max_readings != MAX_LEFT_OUT)
-                used = told and is_chosen(rank, informative, chosen)
-                as_range = used and hit and possible != 0
-                as_far = used and far and max_readings == MAX_PLACED
-                rank += int(told)
-                far_count += int(used and far)
-                if used and hit and possible == 0:
-                    impossible = True
-                placed = as_range or as_far
-                if ALL_READINGS:
-                    placed = k < beams
-                if placed and k == own:
-                    own_place = place
-                    own_value = wp.where(as_range, z, wp.where(as_far, FAR, MISSING))
-                if as_range and place >= own_place and place < own_place + BLOCK_TERMS:
-                    longest = wp.max(longest, z)
-                place += int(placed)
+                hits = hits | (int(several[i] >= nearest and several[i] < farthest) << i)
+                fars = fars | (int(several[i] >= farthest) << i)
+            told = int(hits)
+            if max_readings != MAX_LEFT_OUT:
+                told = hits | fars
+            used = int(told)
+            if chosen < informative:
+                for i in range(BLOCK_TERMS):
+                    its_rank = rank + popcount(told & ((1 << i) - 1))
+                    if not is_chosen(its_rank, informative, chosen):
+                        used = used & ~(1 << i)
+            as_range = int(0)
+            if possible != 0:
+                as_range = used & hits
+            as_far = int(0)
+            if max_readings == MAX_PLACED:
+                as_far = used & fars
+            placed = as_range | as_far
+            if ALL_READINGS:
+                placed = (1 << wp.min(beams - first, BLOCK_TERMS)) - 1
+            i_own = own - first
+            if i_own >= 0 and i_own < BLOCK_TERMS:
+                if (placed >> i_own) & 1 != 0:
+                    own_place = place + popcount(placed & ((1 << i_own) - 1))
+                    if (as_range >> i_own) & 1 != 0:
+                        own_value = z_own
+                    if (as_far >> i_own) & 1 != 0:
+                        own_value = wp.float64(FAR)
+            if END_POINTS:
+                begins = own_place < places and own_place % BLOCK_TERMS == 0
+                if begins and place < own_place + BLOCK_TERMS:
+                    for i in range(BLOCK_TERMS):
+                        other = place + popcount(placed & ((1 << i) - 1))
+                        beside = other >= own_place and other < own_place + BLOCK_TERMS
+                        if (as_range >> i) & 1 != 0 and beside:
+                            longest = wp.max(longest, several[i])
+            rank += popcount(told)
+            far_count += popcount(used & fars)
+            if possible == 0 and (used & hits) != 0:
+                impossible = True
+            place += popcount(placed)
             first += BLOCK_TERMS
         left_over = own >= place and own < places
         if END_POINTS:
             if own_place < places:
                 cells = own_value / resolution
                 length = wp.where(wp.isfinite(cells), cells, ZERO)
-                x = vector[2 * own * each] * length
-                y = vector[2 * own * each + 1] * length
+                x = vector_x * length
+                y = vector_y * length
                 high = vec2(real(x), real(y))
                 point_low[own_place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
                 if not wp.isfinite(cells):
@@ -140,9 +182,9 @@ def make(name, flags):
                     guard[own // BLOCK_TERMS] = real(guard_scale * wp.float64(2.0))
         else:
             if own_place < places:
-                for j in range(each):
-                    source = 2 * (own * each + j)
-                    point[own_place * each + j] = vec2(real(vector[source]), real(vector[source + 1]))
+                point[own_place * each] = vec2(real(vector_x), real(vector_y))
+                for j in range(1, each):
+                    point[own_place * each + j] = vec2(real(vector[source + 2 * j]), real(vector[source + 2 * j + 1]))
                 rounded = real(own_value)
                 if rounded > real(top) and not wp.isinf(rounded):
                     rounded = real(top)
@@ -159,4 +201,58 @@ def make(name, flags):
                 constant = NEVER
             fixed[0] = constant
 
-    return {"place_readings": place_readings}[name]
+    # One work-item a beam and place, in whole groups, and after these one a particle.
+    @kernel
+    def place_inputs(
+        poses: wp.array(dtype=coordinate),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        verdict: wp.array(dtype=wp.int32),
+        ranges: wp.array(dtype=measured),
+        beam: wp.array(dtype=wp.int32),
+        vector: wp.array(dtype=wp.float64),
+        point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2),
+        reading: wp.array(dtype=real),
+        guard: wp.array(dtype=real),
+        fixed: wp.array(dtype=real),
+        origin_x: wp.float64,
+        origin_y: wp.float64,
+        resolution: wp.float64,
+        mount_x: wp.float64,
+        mount_y: wp.float64,
+        yaw_cos: wp.float64,
+        yaw_sin: wp.float64,
+        first_col: wp.int32,
+        first_row: wp.int32,
+        rows: wp.int32,
+        cols: wp.int32,
+        particles: wp.int32,
+        head: wp.int32,
+        beams: wp.int32,
+        each: wp.int32,
+        places: wp.int32,
+        chosen: wp.int32,
+        max_readings: wp.int32,
+        possible: wp.int32,
+        nearest: wp.float64,
+        farthest: wp.float64,
+        log_max: wp.float64,
+        top: wp.float64,
+        guard_scale: wp.float64,
+    ):
+        item = work_item(wp.tid())
+        particle = item - head
+        if particle >= 0 and particle < particles:
+            place_pose(
+                particle, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
+                yaw_cos, yaw_sin, first_col, first_row, rows, cols,
+            )  # fmt: skip
+        if item < head and item < wp.max(wp.max(beams, places), 1):
+            place_reading(
+                item, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each, places,
+                chosen, max_readings, possible, nearest, farthest, log_max, top, guard_scale,
+            )  # fmt: skip
+
+    return {"place_inputs": place_inputs}[name]

@@ -159,6 +159,15 @@ def array(
     return given.astype(dtype, copy=False)
 
 
+def check_gradients(array: object, name: str, error: Exception) -> None:
+    """Say why an array is not exported where its library records its gradients, which are not computed here."""
+    if getattr(array, "requires_grad", False) is True:
+        raise TypeError(
+            f"{name}: must not require gradients, which are not computed here, got a "
+            f"{type(array).__module__}.{type(array).__name__} that does: pass {name}.detach()"
+        ) from error
+
+
 def path(name: str, value: object) -> Path:
     """A path from a string or path object.
 

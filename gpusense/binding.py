@@ -1,8 +1,8 @@
 """``bind`` of a model: which way a bound call goes, and the ways of arrays in host memory.
 
-A call that waits is the ordinary one, but for NumPy arrays of few particles on a CUDA device: copies to and from the
-device and the launches of ``bound.DeviceCall`` are gathered and become one graph, so that readings are classed there
-and nothing is looked at on the host.
+A call that waits is the ordinary one, but for NumPy arrays of few particles on a GPU: they are copied to the device and
+the launches of ``bound.DeviceCall`` follow, so that readings are classed there and nothing is looked at on the host.
+With CUDA copies and launches are one graph.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends.base import Gathering
+from gpusense.backends.base import Buffer
 from gpusense.bound import BoundCall, DeviceCall
 from gpusense.cloud import LEAST_ORDERED
 from gpusense.workspace import Workspace
@@ -35,8 +35,9 @@ def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
         if type(given).__module__.startswith("jax"):
             raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
     there = arrays.on_device(poses) and arrays.on_device(ranges)
-    # Readings as other programs see them are made on the host.
-    if there and model.compat is None:
+    # Readings as other programs see them are made on the host, and poses are placed there where float64 is missing. On
+    # processors, scans prepared on the host are scored by kernels in vectors.
+    if there and model.compat is None and model.device.float64 and model.device.kind == "gpu":
         return DeviceCall(model, poses, ranges, out)
     host = _HostCall(model, poses, ranges, out)
     if model.compat is None and host.is_short():
@@ -60,12 +61,12 @@ class _HostCall(BoundCall):
         else:
             count = _shape_of("poses", poses, ("N", 3))[0]
         if arrays.on_device(ranges):
-            arrays.adopt_readings(ranges, backend, beams)
+            arrays.adopt_readings(ranges, backend, beams, in_place=False)
         else:
             _shape_of("ranges", ranges, (beams,))
         arrays.check_out(out, (count,), model._real, poses, backend)
         if out is None and arrays.on_device(poses):
-            out = arrays.result_for(poses, arrays.blank(backend, count, model._real))
+            out = arrays.lent(poses, backend, arrays.blank(backend, count, model._real), (count,), model._real)
         elif out is None:
             out = arrays.like(poses, np.empty(count, model._real))
         self.out, self._model, self._given = out, model, (poses, ranges)
@@ -80,17 +81,14 @@ class _HostCall(BoundCall):
         """See BoundCall.check."""
 
     def is_short(self) -> bool:
-        """Whether arrays are NumPy's, all is small, and the device does in one go what a call starts."""
-        backend = cast(Any, self._model._backend)
-        if not hasattr(backend, "gather") or self._model.grid.cells.size > _MOST_CELLS:
+        """Whether arrays are NumPy's, all is small, and the device gains by starting launches that it knows."""
+        backend = self._model._backend
+        if not getattr(backend, "stages", False) or not backend.info.float64:
             return False
-        backend.gather()
-        gathers = backend.mark() is not None
-        backend.scatter()
         poses, ranges = self._given
         given, reals = (poses, ranges, self.out), (np.float32, np.float64)
         short = all(type(a) is np.ndarray and a.dtype in reals and a.nbytes <= _LARGEST for a in given)
-        return gathers and short and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
+        return short and self._model.grid.cells.size <= _MOST_CELLS and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
 
 
 class _StagedCall(BoundCall):
@@ -101,12 +99,17 @@ class _StagedCall(BoundCall):
     def __init__(self, host: _HostCall) -> None:
         self._host, self.out, (self._poses, self._ranges) = host, host.out, host._given
         self._backend = cast(Any, host._model._backend)
-        self._poses_there = self._backend.upload(self._poses)
+        self._poses_there = self._blank(self._poses, self._poses.dtype)
         # Limits of readings are those of the host, whatever their precision.
-        self._ranges_there = self._backend.upload(self._ranges.astype(np.float64))
-        self._device = DeviceCall(host._model, self._poses_there.reshape(self._poses.shape), self._ranges_there, None)
+        self._ranges_there = self._blank(self._ranges, np.dtype(np.float64))
+        self._device = DeviceCall(host._model, self._poses_there[1], self._ranges_there[1], None)
         self._space = Workspace(self._backend)
         self._lock = threading.Lock()
+
+    def _blank(self, array: np.ndarray, dtype: np.dtype) -> tuple[Buffer, Any]:
+        """Room for an array on the device, as a buffer and as an array there."""
+        buffer = self._backend.blank(array.size, dtype)
+        return buffer, self._backend.lend(buffer, array.shape, dtype)
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""
@@ -115,9 +118,10 @@ class _StagedCall(BoundCall):
         backend, device = self._backend, self._device
         try:
             with self._lock, self._space:
-                backend.upload(self._poses, self._poses_there, wait=False)
-                backend.upload(self._ranges.astype(np.float64), self._ranges_there, wait=False)
-                device.gather(cast(Gathering, backend))
+                ranges = np.ascontiguousarray(self._ranges, np.float64)
+                backend.upload(self._poses, self._poses_there[0], wait=False)
+                backend.upload(ranges, self._ranges_there[0], wait=False)
+                device.begin()
                 self._space.download(device.result, self.out)
                 device.finish()
         except ValueError:

@@ -2,7 +2,8 @@
 
 What a call of few particles takes beside its kernels is what the host does: checks, the scan's preparation, a start for
 each launch. Where poses and readings are on the device, all of that is done once: readings are classed and placed there
-by the kernel file ``scan``, and the launches become a CUDA graph (``Gathering.record``).
+by the kernel file ``scan``, and the launches are kept with their arguments (``Recording.record``), with CUDA as a
+graph.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from gpusense import arrays
-from gpusense.backends.base import Buffer, Gathering
+from gpusense.backends.base import Buffer, Gathering, Recording
 from gpusense.cloud import Cloud, Placed, Readings, finish
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
@@ -126,19 +127,19 @@ class DeviceCall(BoundCall):
     def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
         backend, real = model._backend, model._real
         self._model, self._backend, self._real = model, backend, real
-        self._cloud = Cloud(poses, backend)
+        self._cloud = Cloud(poses, backend, in_place=True)
         count = self._cloud.count
-        found = arrays.adopt_readings(ranges, backend, model.scanner.count)
+        found = arrays.adopt_readings(ranges, backend, model.scanner.count, in_place=True)
         result = arrays.check_out(out, (count,), real, poses, backend)
         self._result = arrays.blank(backend, count, real) if result is None else result
-        self.out = arrays.result_for(poses, self._result) if out is None else out
+        self.out = arrays.lent(poses, backend, self._result, (count,), real) if out is None else out
         # What owns the memory of what is read and written.
         self._given = (poses, ranges, found, self.out)
         # Buffers of its own: other calls of the model may come between.
         self._space = Workspace(backend)
         self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
-        self._scan, self._readings, self._fixed = self._placing_of(found)
+        self._scan, self._readings, self._fixed = self._placing_of(found.buffer, found.dtype)
         self._counts = backend.upload(np.array([self._scan.parts], _INT))
         self._record()
 
@@ -148,9 +149,13 @@ class DeviceCall(BoundCall):
         self._replay(stream)
         return self.out
 
-    def gather(self, gathering: Gathering) -> None:
-        """Have this thread gather a call's launches, in place of starting them."""
+    def begin(self) -> None:
+        """Start a call's launches, or gather them where this thread gathers what it starts."""
         self._look_at_map()
+        if not hasattr(self._backend, "gather"):
+            self._replay()
+            return
+        gathering = cast(Gathering, self._backend)
         if self._kept is not None:
             gathering.repeat(self._kept)
             return
@@ -178,7 +183,7 @@ class DeviceCall(BoundCall):
         """Wait for what this thread has started or gathered, and see that all poses were finite."""
         finish(self._space, on_device=True)
 
-    def _placing_of(self, ranges: Any) -> tuple[PlacedScan, Readings, bool]:
+    def _placing_of(self, ranges: Buffer, dtype: np.dtype) -> tuple[PlacedScan, Readings, bool]:
         """Where readings are placed, what does that, and whether those without a place add something."""
         model, backend, real, space = self._model, self._backend, self._real, self._space
         z_max, scanner, end_points = model._z_max, model.scanner, model._end_points
@@ -189,7 +194,6 @@ class DeviceCall(BoundCall):
         if isinstance(model.beams, (int, np.integer)):
             chosen = min(int(model.beams), chosen)
         places = chosen if model._specialize else len(beams)
-        dtype = np.dtype(ranges.dtype.__name__)
         with np.errstate(over="ignore"):
             nearest, farthest = dtype.type(scanner.range_min), dtype.type(scanner.range_max)
         if scanner.range_min > 0:
@@ -234,7 +238,7 @@ class DeviceCall(BoundCall):
             score = model._bound_scorer(self._table, region)
             self._version = scene.map.version
             self._scored, self._kept = (score, region), None
-            self._replay = cast(Gathering, self._backend).record(lambda: self._start(score, region))
+            self._replay = cast(Recording, self._backend).record(lambda: self._start(score, region))
         # Other streams may come first to what was made just now.
         self._backend.synchronize()
 
@@ -260,6 +264,6 @@ class DeviceCall(BoundCall):
             if scan.places:
                 score(placed, cloud.headings(), count, scan, parts)
             backend.compile("sum_parts", flags)(
-                (count,), parts, self._none, counts, scan.fixed, backend.part(self._result, begin, count), count,
-                scan.parts, scan.block, 1, count, 0.0, model.temperature, count,
+                (count,), parts, self._none, counts, scan.fixed, backend.part(self._result, begin, count, self._real),
+                count, scan.parts, scan.block, 1, count, 0.0, model.temperature, count,
             )  # fmt: skip

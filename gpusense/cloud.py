@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Backend, Buffer, Sharing
 from gpusense.frames import Cells, Mount, frame_scalars, place_poses
 from gpusense.grid import OccupancyGrid
 from gpusense.models.reachable import ReachableMap
@@ -24,6 +25,7 @@ from gpusense.region import Corners, Region, extent
 from gpusense.workspace import Workspace
 
 _INT = np.dtype(np.int32)
+_SINGLE_TYPE, _DOUBLE_TYPE = np.dtype(np.float32), np.dtype(np.float64)
 _PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
 _SINGLE = _HUGE | {"POSES_FLOAT32"}
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
@@ -67,17 +69,21 @@ class Cloud:
         backend: The device.
         name: What messages call them.
         several: An array on the device is (S, N, 3), the poses of S scans one after the other.
+        in_place: An array on the device must be used where it is, now and later.
 
     Raises:
         TypeError: not numbers, or an array that this device cannot read.
         ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
     """
 
-    def __init__(self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False) -> None:
+    def __init__(
+        self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False, in_place: bool = False
+    ) -> None:
         self.host: np.ndarray | None = None
         self.on_device = arrays.on_device(poses)
         if self.on_device:
-            self._buffer, self.count, self._single, self._owner = arrays.adopt_poses(poses, backend, name, several)
+            found = arrays.adopt_poses(poses, backend, name, several, in_place=in_place)
+            self._buffer, self.count, self._single, self._owner = found
             return
         given = arrays.to_host(poses, name)
         if isinstance(given, np.ndarray) and given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == 3:
@@ -115,8 +121,17 @@ class Cloud:
         """Poses part[0] to part[1] - 1 on the device, as they were given; None where the host is to place them."""
         begin, count = part[0], part[1] - part[0]
         if self.host is None:
-            return backend.part(self._buffer, 3 * begin, 3 * count)
+            return self._part_on_device(backend, space, 3 * begin, 3 * count)
         return space.upload("poses", self.host[begin : part[1]]) if backend.info.float64 else None
+
+    def _part_on_device(self, backend: Backend, space: Workspace, first: int, count: int) -> Buffer:
+        """Some numbers of poses on the device; a copy where it cannot begin with them."""
+        sharing, dtype = cast(Sharing, backend), _SINGLE_TYPE if self._single else _DOUBLE_TYPE
+        if first * dtype.itemsize % sharing.alignment == 0:
+            return backend.part(self._buffer, first, count, dtype)
+        copied = space.empty("given", count, dtype)
+        sharing.copy(self._buffer, copied, count * dtype.itemsize, begin=first * dtype.itemsize)
+        return copied
 
     def code(self) -> frozenset[str]:
         """The flags of ``place_poses`` that these poses need."""

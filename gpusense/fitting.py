@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense import _checks
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.grid import OccupancyGrid
 from gpusense.logs import Scan
 from gpusense.models.beam import BeamModel
@@ -78,7 +78,7 @@ def data_of_log(
     grid: OccupancyGrid,
     scans: Sequence[tuple[int, Scan]],
     *,
-    backend: str | Backend = "auto",
+    backend: Selection = "auto",
     range_min: float = 0.0,
     block: int = 1,
     incidence: bool = False,

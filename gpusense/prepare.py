@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpusense import _checks
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend, Selection, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.region import LONGEST_SIDE, Region
 
@@ -156,7 +156,7 @@ def _bytes(obstacles: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(obstacles, dtype=bool).view(_BYTE)
 
 
-def distance_transform(obstacles: Any, *, backend: str | Backend = "auto") -> np.ndarray:
+def distance_transform(obstacles: Any, *, backend: Selection = "auto") -> np.ndarray:
     """Exact squared Euclidean distance transform.
 
     Args:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend, Selection, get_backend
 from gpusense.grid import OccupancyGrid
 from gpusense.models.beam import BeamModel
 from gpusense.models.caster import RayCaster
@@ -88,7 +88,7 @@ class Densities:
         return np.asarray(naive_log_mixture(self.z, self.expected, range_max=RANGE_MAX, **self.parameters))
 
 
-def density_grid(backend: str | Backend, precision: str) -> Densities:
+def density_grid(backend: Selection, precision: str) -> Densities:
     """Evaluate the density grid in the kernel ``score_beams``.
 
     The world is one row of cells with a wall. Eight particles look at it along the row from distances that the cells
@@ -294,7 +294,7 @@ def _truth(launch: Launch, parameters: Any) -> Floats:
     return np.where(np.isnan(z), 0.0, log_mixture(z, expected, range_max=top, **parameters.to_dict()))
 
 
-def run(backend: str | Backend, precision: str) -> list[Row]:
+def run(backend: Selection, precision: str) -> list[Row]:
     """Every row of the catalogue on a backend, in ``"float32"`` or ``"float64"``."""
     device = get_backend(backend)
     return [*_grid_rows(device, precision), *(row for case in cases() for row in _case_rows(case, device, precision))]

@@ -110,7 +110,9 @@ class Workspace:
         if parts is None:
             if len(self._parts) >= _MOST_KEPT:
                 self._parts.clear()
-            parts = [self._backend.part(buffer, first, size) for first, size in zip(firsts, sizes, strict=True)]
+            parts = [
+                self._backend.part(buffer, first, size, packed.dtype) for first, size in zip(firsts, sizes, strict=True)
+            ]
             self._parts[key] = parts
         return parts
 

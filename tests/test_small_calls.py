@@ -44,7 +44,7 @@ def two_ways(needs, monkeypatch):
     shared = get_backend(selection)
     if not shared._shared:
         pytest.skip("the device does not share its memory with the host")
-    monkeypatch.setattr(_opencl, "_shares_memory", lambda device: False)
+    monkeypatch.setattr(_opencl, "shares_memory", lambda device: False)
     return shared, _opencl.OpenCLBackend(shared.info, shared._device)
 
 

@@ -1,7 +1,8 @@
 """Where kernels run: the devices of this machine, and a backend for each.
 
 Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (platform and device number),
-``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``.
+``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``. A queue of pyopencl
+selects its device, and a backend that works on that queue.
 """
 
 from __future__ import annotations
@@ -10,14 +11,23 @@ import functools
 import importlib.util
 import os
 import re
+import sys
 import threading
+import weakref
 from dataclasses import dataclass
 from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from gpusense._checks import show
 from gpusense.backends.base import Backend, BackendInfo, ProcessBound
 
-__all__ = ["Backend", "BackendInfo", "Device", "devices", "get_backend"]
+__all__ = ["Backend", "BackendInfo", "Device", "Selection", "devices", "get_backend"]
+
+if TYPE_CHECKING:
+    import pyopencl
+
+# What ``backend=`` may be.
+Selection: TypeAlias = "str | Backend | pyopencl.CommandQueue"
 
 # Measured speed classes, best first, of (backend, kind): see bench/RESULTS.md. A GPU beats any processor here; of the
 # two ways to drive one, OpenCL starts launches sooner. Warp has no vectors on processors.
@@ -93,21 +103,25 @@ def _module(backend: str) -> tuple[ModuleType | None, str]:
         return None, f"{library} does not load ({error})"
 
 
-def get_backend(selection: str | Backend = "auto") -> Backend:
+def get_backend(selection: Selection = "auto") -> Backend:
     """The backend of a selection string; one and the same object for one device.
 
     Args:
         selection: See the module's docstring; a backend is returned as it is.
 
     Raises:
-        TypeError: the selection is not a string.
-        ValueError: the selection names nothing, or a device that is absent. Nothing falls back in silence.
+        TypeError: the selection is neither a string nor a queue.
+        ValueError: the selection names nothing, or a device that is absent, or is a queue that does not do commands in
+            their order. Nothing falls back in silence.
         RuntimeError: the device was opened before this process was forked.
     """
     if not isinstance(selection, str):
         if hasattr(selection, "compile") and hasattr(selection, "info"):
-            return selection
-        raise TypeError(f"backend: must be a selection string, got {show(selection)}")
+            return cast(Backend, selection)
+        opencl = sys.modules.get("pyopencl")
+        if opencl is None or not isinstance(selection, opencl.CommandQueue):
+            raise TypeError(f"backend: must be a selection string or a queue of pyopencl, got {show(selection)}")
+        return _of_queue(selection)
     with _LOCK:
         # Before any driver is asked: in a forked child even listing devices may hang.
         for opened in _OPENED:
@@ -119,7 +133,19 @@ def get_backend(selection: str | Backend = "auto") -> Backend:
     return backend
 
 
+def _of_queue(queue: Any) -> Backend:
+    from gpusense.backends._opencl import backend_of
+
+    with _LOCK:
+        found = _OF_QUEUES.get(queue.int_ptr)
+        if found is None:
+            found = _OF_QUEUES[queue.int_ptr] = backend_of(queue)
+    return found
+
+
 _LOCK = threading.Lock()
+# By the address of a queue, which its backend keeps.
+_OF_QUEUES: weakref.WeakValueDictionary[int, Backend] = weakref.WeakValueDictionary()
 _OPENED: list[ProcessBound] = []
 
 

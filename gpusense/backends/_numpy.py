@@ -46,7 +46,7 @@ class NumpyBackend:
         out.reshape(-1)[...] = buffer[: out.size]
         return out
 
-    def part(self, buffer: np.ndarray, first: int, count: int) -> np.ndarray:
+    def part(self, buffer: np.ndarray, first: int, count: int, dtype: np.dtype) -> np.ndarray:
         """See Backend.part."""
         return buffer[first : first + count]
 

@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends import _pocl
-from gpusense.backends.base import BackendInfo, Buffer, Launcher, ProcessBound
+from gpusense.backends import _opencl_arrays, _pocl
+from gpusense.backends._opencl_devices import info_of, is_simulator, list_devices, shares_memory
+from gpusense.backends._opencl_replay import KeptLaunch, Repeated
+from gpusense.backends.base import Adopted, BackendInfo, Buffer, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS, Kernel, lanes_of
 from gpusense.sources import assemble, relevant, uses_double, with_places
 
-# Devices that check or emulate: correct, but no one wants to wait for them unasked.
-SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
+__all__ = ["OpenCLBackend", "backend_of", "is_simulator", "list_devices"]
+
 _LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
 _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
 # One driver's own clearing hangs beyond 2 GiB.
@@ -29,53 +31,6 @@ _ALIGNMENT = 128
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
-def is_simulator(name: str) -> bool:
-    """Whether a device of that name only imitates hardware."""
-    return any(word in name.lower() for word in SIMULATORS)
-
-
-def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
-    """All OpenCL devices of this machine, simulators included, in the order of the platforms."""
-    found = []
-    try:
-        platforms = cl.get_platforms()
-    except cl.LogicError:
-        return []
-    for p, platform in enumerate(platforms):
-        try:
-            devices = platform.get_devices()
-        except cl.Error:
-            continue
-        found += [(_describe(f"opencl:{p}:{d}", device), device) for d, device in enumerate(devices)]
-    return found
-
-
-def _describe(selection: str, device: cl.Device) -> BackendInfo:
-    return BackendInfo(
-        selection=selection,
-        backend="opencl",
-        name=device.name.strip(),
-        kind="gpu" if device.type & cl.device_type.GPU else "cpu",
-        driver=f"{device.platform.name.strip()} {device.driver_version.strip()}",
-        memory=int(device.global_mem_size),
-        max_buffer=int(device.max_mem_alloc_size),
-        float64=bool(device.double_fp_config),
-        lanes=_lanes(device),
-    )
-
-
-def _lanes(device: cl.Device) -> int:
-    """Lanes of kernels that have bodies in vectors.
-
-    PoCL compiles loops in kernels as they are written. Intel's driver makes vectors of neighbouring work-items, but
-    explicit ones were up to three times as fast there, too. Other drivers for processors were not measured.
-    """
-    known = _pocl.is_pocl(device) or device.platform.name.startswith("Intel")
-    if not known or not device.type & cl.device_type.CPU:
-        return 1
-    return 16 if device.native_vector_width_float >= 16 else 8
-
-
 def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
     """Where programs are kept; None for PoCL, which keeps them itself.
 
@@ -83,16 +38,6 @@ def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
     takes three times as long as all it does unasked.
     """
     return None if _pocl.is_pocl(device) else ProgramCache(info)
-
-
-def _shares_memory(device: cl.Device) -> bool:
-    """Whether host and device may look at the same memory between commands, and neither is far from it: a processor."""
-    try:
-        if not device.type & cl.device_type.CPU or not device.host_unified_memory:
-            return False
-        return bool(device.svm_capabilities & cl.device_svm_capabilities.FINE_GRAIN_BUFFER)
-    except cl.Error:
-        return False
 
 
 class _Buffer(cl.Buffer):
@@ -124,17 +69,20 @@ class OpenCLBackend(ProcessBound):
     NumPy's instead: they wait for all commands before them, and are done when they return.
     """
 
-    def __init__(self, info: BackendInfo, device: cl.Device) -> None:
+    def __init__(self, info: BackendInfo, device: cl.Device, queue: cl.CommandQueue | None = None) -> None:
         super().__init__()
         self.info = info
         self._device = device
         _pocl.mend(device)
-        self._context = cl.Context([device])
-        self._queue = cl.CommandQueue(self._context)
-        self._shared = _shares_memory(device)
+        self._queue = cl.CommandQueue(cl.Context([device])) if queue is None else queue
+        self._context = self._queue.context
+        self._shared = shares_memory(device)
         # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
         self._count = threading.RLock()
         self._queued = self._ended = 0
+        # The launches that a thread records, if it does.
+        self._thread = threading.local()
+        self.alignment = _opencl_arrays.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
         self._cache = _program_cache(info, device)
@@ -145,6 +93,7 @@ class OpenCLBackend(ProcessBound):
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
         self.check_process()
+        self._check_recording()
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             array = np.ascontiguousarray(array)
@@ -159,10 +108,7 @@ class OpenCLBackend(ProcessBound):
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """See Backend.empty."""
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
-        if size > self.info.max_buffer:
-            raise MemoryError(
-                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
-            )
+        self._check_size(size)
         with _driver_errors():
             if self._shared:
                 shared = _Shared(self._context, size, self._settle)
@@ -173,6 +119,12 @@ class OpenCLBackend(ProcessBound):
             if zero:
                 self._clear(buffer, size)
         return buffer
+
+    def _check_size(self, size: int) -> None:
+        if size > self.info.max_buffer:
+            raise MemoryError(
+                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
+            )
 
     def _clear(self, buffer: cl.Buffer, size: int) -> None:
         if size <= 4 * _CLEARED_WORDS:
@@ -185,6 +137,7 @@ class OpenCLBackend(ProcessBound):
 
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
+        self._check_recording()
         if out.size:
             if isinstance(buffer, _Shared):
                 self._settle()
@@ -194,9 +147,51 @@ class OpenCLBackend(ProcessBound):
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
 
-    def part(self, buffer: Buffer, first: int, count: int) -> Buffer:
+    def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.part."""
-        raise TypeError("buffer: parts of OpenCL buffers are not used")
+        size = np.dtype(dtype).itemsize
+        return _opencl_arrays.part_of(buffer, first * size, count * size, self.alignment)
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """See Sharing.adopt."""
+        return _opencl_arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
+
+    def blank(self, count: int, dtype: np.dtype) -> Buffer:
+        """See Sharing.blank; not memory that is shared, of which arrays may not outlive the backend's launches."""
+        size = max(count, 1) * np.dtype(dtype).itemsize
+        self._check_size(size)
+        with _driver_errors():
+            return _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+
+    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """See Sharing.copy."""
+        if not size:
+            return
+        with _driver_errors():
+            if isinstance(target, _Shared):
+                self._settle()
+                cl.enqueue_copy(self._queue, target.bytes[to : to + size], source, src_offset=begin)
+            else:
+                cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
+
+    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+        """See Sharing.lend."""
+        return _opencl_arrays.lent(buffer, self._queue, shape, dtype)
+
+    @property
+    def stages(self) -> bool:
+        """See Recording.stages."""
+        return self.info.kind == "gpu"
+
+    def record(self, run: Callable[[], None]) -> Repeated:
+        """See Recording.record."""
+        kept: list[KeptLaunch] = []
+        self._thread.kept = kept
+        try:
+            run()
+        finally:
+            self._thread.kept = None
+        return Repeated(self._queue, kept, self._counted)
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""
@@ -215,6 +210,14 @@ class OpenCLBackend(ProcessBound):
         with self._count:
             self._ended = max(self._ended, queued)
 
+    def _check_recording(self) -> None:
+        if self.recording() is not None:
+            raise RuntimeError("only launches can be recorded")
+
+    def recording(self) -> list[KeptLaunch] | None:
+        """Where this thread keeps launches in place of starting them, if it does."""
+        return getattr(self._thread, "kept", None)
+
     def _settle(self) -> None:
         """Wait until no command of this thread can be under way."""
         if self._ended != self._queued:
@@ -223,8 +226,11 @@ class OpenCLBackend(ProcessBound):
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
         """Queue a launch of a kernel whose arguments are set."""
         cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+        self._counted(1)
+
+    def _counted(self, launches: int) -> None:
         with self._count:
-            self._queued += 1
+            self._queued += launches
 
     def _launcher(self, kernel: str, flags: frozenset[str]) -> _Launch:
         row = KERNELS[kernel]
@@ -281,15 +287,32 @@ class _Launch:
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # Told the types, pyopencl sets all arguments in 1 us; a single number without takes it 6 us.
-        kernel.set_arg_types([a.dtype(real).type if a.shape is None else None for a in row.arguments])
+        self._types = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
+        kernel.set_arg_types(self._types)
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         group = (self._group, *(1 for _ in size[1:]))
         rounded = (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:])
         # Arguments belong to the kernel object, so two threads must not interleave here.
+        kept = self._backend.recording()
+        if kept is not None:
+            own = cl.Kernel(self._kernel.program, self._kernel.function_name)
+            own.set_arg_types(self._types)
+            own.set_args(*arguments)
+            kept.append(KeptLaunch(own, rounded, group, arguments))
+            return
         with self._lock, _driver_errors():
             self._kernel.set_args(*arguments)
             self._backend.enqueue(self._kernel, rounded, group)
+
+
+def backend_of(queue: cl.CommandQueue) -> OpenCLBackend:
+    """A backend that works on a user's queue, and so on the arrays that were made with it.
+
+    Raises:
+        ValueError: the queue does not do commands in their order.
+    """
+    return OpenCLBackend(info_of(queue.device), queue.device, _opencl_arrays.queue_of(queue))
 
 
 class _driver_errors:

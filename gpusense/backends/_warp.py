@@ -19,10 +19,11 @@ import warp as wp
 
 from gpusense._kernel_files import warp_module
 from gpusense.backends._numpy import _memory
+from gpusense.backends._warp_arrays import adopted
 from gpusense.backends._warp_launch import SCALARS, Launch, LaunchStep, host_view
 from gpusense.backends._warp_pieces import shared
 from gpusense.backends._warp_queue import Graphs, Group, Queue, Recording, Repeated, Step
-from gpusense.backends.base import BackendInfo, Launcher, ProcessBound
+from gpusense.backends.base import Adopted, BackendInfo, Launcher, ProcessBound
 from gpusense.backends.cache import cache_folder
 from gpusense.signatures import KERNELS, Kernel
 from gpusense.sources import relevant
@@ -59,6 +60,8 @@ def _describe(device: wp.Device) -> BackendInfo:
 
 class WarpBackend(ProcessBound):
     """One Warp device: flat arrays of numbers as buffers, launches on the device's current stream."""
+
+    alignment = 1
 
     def __init__(self, info: BackendInfo, device: str) -> None:
         super().__init__()
@@ -121,9 +124,30 @@ class WarpBackend(ProcessBound):
                 self._wait()
         return out
 
-    def part(self, buffer: wp.array, first: int, count: int) -> wp.array:
+    def part(self, buffer: wp.array, first: int, count: int, dtype: np.dtype) -> wp.array:
         """See Backend.part."""
         return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """See Sharing.adopt; all that lies on the device can be used in place."""
+        return adopted(array, self._device, name)
+
+    def blank(self, count: int, dtype: np.dtype) -> wp.array:
+        """See Sharing.blank."""
+        return self.part(self.empty(count, dtype), 0, count, dtype)
+
+    def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """See Sharing.copy; parts may begin anywhere, so that nothing needs it."""
+        raise NotImplementedError
+
+    def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
+        """See Sharing.lend."""
+        return buffer if buffer.shape == shape else buffer.reshape(shape)
+
+    @property
+    def stages(self) -> bool:
+        """See Recording.stages."""
+        return self._gathers
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""
@@ -206,7 +230,7 @@ class WarpBackend(ProcessBound):
         return int(buffer.ptr or 0)
 
     def record(self, run: Callable[[], None]) -> Repeated:
-        """See Gathering.record."""
+        """See Recording.record."""
         before, recording = self.gathering(), Recording()
         self._thread.queue = recording
         try:

@@ -73,6 +73,56 @@ class Launcher(Protocol):
         """Start one launch; buffers and scalars in the order of the signature table."""
 
 
+@dataclass(frozen=True)
+class Adopted:
+    """An array of another library that lies in a device's memory, without a copy.
+
+    Attributes:
+        buffer: Its numbers; only of a C-contiguous array.
+        shape: Its shape.
+        dtype: Type of its numbers.
+        strides: Bytes from one number to the next along each axis.
+        contiguous: Whether it is C-contiguous.
+        to_host: Copies it, after all that was started before.
+        owner: What keeps the memory alive.
+    """
+
+    buffer: Buffer
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    strides: tuple[int, ...]
+    contiguous: bool
+    to_host: Callable[[], np.ndarray]
+    owner: object
+
+
+class Sharing(Protocol):
+    """What a backend may have besides, where other libraries have arrays in its memory.
+
+    Attributes:
+        alignment: Parts of buffers begin at multiples of so many bytes.
+    """
+
+    alignment: int
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """An array of another library as it is; one that the device cannot begin with is copied unless ``in_place``.
+
+        Raises:
+            TypeError: it is not in this device's memory, or does not hold numbers.
+            ValueError: it must be used in place, and cannot.
+        """
+
+    def blank(self, count: int, dtype: np.dtype) -> Buffer:
+        """A buffer of exactly ``count`` numbers, or none, that can be lent."""
+
+    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """Start to copy ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
+
+    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+        """A buffer as an array of the library that the backend is made with."""
+
+
 class Replay(Protocol):
     """Launches that are started again and again, with the same memory and numbers."""
 
@@ -110,8 +160,16 @@ class Gathering(Protocol):
     def address(self, buffer: Buffer) -> int:
         """Where a buffer lies."""
 
+
+class Recording(Protocol):
+    """What a backend has besides that can start launches again without binding their arguments anew."""
+
+    @property
+    def stages(self) -> bool:
+        """Whether calls of few particles gain by it although their arrays must be copied to the device and back."""
+
     def record(self, run: Callable[[], None]) -> Replay:
-        """The launches of ``run``, which starts nothing else, kept and not started. They keep no buffer alive."""
+        """The launches of ``run``, which starts nothing else, kept and not started; buffers are kept by who calls."""
 
 
 class Backend(Protocol):
@@ -140,8 +198,12 @@ class Backend(Protocol):
         Without ``wait`` the array must live, and is not filled, until ``synchronize`` has returned.
         """
 
-    def part(self, buffer: Buffer, first: int, count: int) -> Buffer:
-        """``count`` numbers of a buffer from number ``first`` on, without a copy."""
+    def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
+        """``count`` numbers of a buffer from number ``first`` on, without a copy.
+
+        Raises:
+            ValueError: the device cannot begin there; see Sharing.alignment.
+        """
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """The kernel of that name, specialised by flags; compiled once and kept."""

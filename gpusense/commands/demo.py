@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gpusense import plots, worlds
-from gpusense.backends import Backend
+from gpusense.backends import Backend, Selection
 from gpusense.commands import _common
 from gpusense.commands._common import grouped
 from gpusense.grid import OccupancyGrid
@@ -166,7 +166,7 @@ def make_scene(seed: int, particles: int, beams: int) -> Scene:
     return Scene(grid, scanner, ranges, np.concatenate([around, anywhere, truth[None]]), beams)
 
 
-def make_model(scene: Scene, name: str, backend: str | Backend, precision: str = PRECISION) -> Model:
+def make_model(scene: Scene, name: str, backend: Selection, precision: str = PRECISION) -> Model:
     """The model of that name with its default parameters."""
     kind: Any = BeamModel if name == BEAM else LikelihoodFieldModel
     return kind(scene.grid, scene.scanner, backend=backend, precision=precision, beams=scene.beams)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense import _checks
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.learning.book import climb_book
 from gpusense.learning.device_sums import DeviceSums
 from gpusense.learning.em import Climb, Watch, climb_em
@@ -32,7 +32,7 @@ def fit_beam_parameters(
     method: str = "em",
     range_min: float = 0.0,
     initial: BeamParameters | None = None,
-    backend: str | Backend = "auto",
+    backend: Selection = "auto",
     precision: str | None = None,
     max_iterations: int | None = None,
     tolerance: float = 1e-8,

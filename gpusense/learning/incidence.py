@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense import _checks
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.learning.device_sums import DeviceSums
 from gpusense.learning.fit import fit_pairs
 from gpusense.learning.options import Callback, check_options, make_bounds, open_device, start_of
@@ -106,7 +106,7 @@ def fit_incidence_parameters(
     method: str = "em",
     range_min: float = 0.0,
     initial: BeamParameters | None = None,
-    backend: str | Backend = "auto",
+    backend: Selection = "auto",
     precision: str | None = None,
     max_iterations: int | None = None,
     tolerance: float = 1e-8,

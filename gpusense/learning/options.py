@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpusense import _checks
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend, Selection, get_backend
 from gpusense.learning.pairs import Pairs
 from gpusense.learning.point import Bounds, Point, possible_causes
 from gpusense.parameters import BeamParameters
@@ -77,7 +77,7 @@ def check_options(
     )
 
 
-def open_device(backend: str | Backend, precision: str | None) -> tuple[Backend, np.dtype]:
+def open_device(backend: Selection, precision: str | None) -> tuple[Backend, np.dtype]:
     """The device and the precision of its kernels."""
     opened = get_backend(backend)
     if precision is None:

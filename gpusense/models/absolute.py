@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
 from gpusense.models.point_model import MISSING, Part, PointModel, rand_omission, relative_omissions
@@ -44,7 +44,7 @@ class PositionModel(PointModel):
         self,
         parameters: PositionParameters,
         *,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         temperature: float = 1.0,
     ) -> None:
@@ -148,7 +148,7 @@ class HeadingModel(PointModel):
         self,
         parameters: HeadingParameters | None = None,
         *,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         temperature: float = 1.0,
     ) -> None:

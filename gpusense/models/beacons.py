@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
 from gpusense.models.point_model import Part, PointModel, rand_omission, relative_omissions
@@ -45,7 +45,7 @@ class BeaconModel(PointModel):
         xy: object,
         parameters: BeaconParameters | None = None,
         *,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         temperature: float = 1.0,
     ) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpusense import _checks, casters
 from gpusense import compat as compat_module
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
@@ -75,7 +75,7 @@ class BeamModel(ScanModel):
         parameters: BeamParameters | DiscreteBeamModel | None = None,
         *,
         incidence: IncidenceParameters | None = None,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         caster: str | Caster | None = None,
         sensor_table: float | None = None,

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
 from gpusense.frames import split
@@ -63,7 +63,7 @@ class BumperModel(PointModel):
         parameters: BumperParameters | None = None,
         *,
         segments: object = None,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         unknown: str = "free",
         outside: str = "free",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpusense import _checks, arrays, casters
-from gpusense.backends import Backend, BackendInfo, get_backend
+from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.casters import Caster, Window
 from gpusense.cloud import Cloud, all_within, finish, ordered, tiles_of
@@ -75,7 +75,7 @@ class RayCaster:
         range_max: float,
         *,
         method: str | Caster = "exact",
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         unknown: str = "free",
         outside: str = "free",
@@ -325,7 +325,7 @@ class MapCaster:
         if out is not None:
             return out
         if cloud.on_device:
-            return arrays.result_for(poses, ranges.reshape((cloud.count, rays)))
+            return arrays.lent(poses, self.backend, ranges, (cloud.count, rays), self.real)
         return arrays.like(poses, ranges)
 
     def _cast_chunk(
@@ -337,7 +337,7 @@ class MapCaster:
         given = cloud.given(backend, space, part)
         placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
         if cloud.on_device:
-            result = backend.part(ranges, part[0] * rays, count * rays)
+            result = backend.part(ranges, part[0] * rays, count * rays, self.real)
         else:
             result = space.empty("ranges", count * rays, self.real)
         flags = self.flags | self._wide | cones.flags

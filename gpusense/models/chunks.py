@@ -16,6 +16,8 @@ CHUNK_BYTES = 320 << 20
 CHUNK_WORK = 1 << 24
 # A launch that does not fit is tried with half the particles down to this.
 SMALLEST_CHUNK = 256
+# Chunks are multiples of so many particles, unless they are smaller: every device can begin at their numbers.
+_ROUND = 256
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
@@ -25,7 +27,11 @@ def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
         chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
     if backend.info.kind == "cpu":
         chunk = min(chunk, CHUNK_WORK // beams)
-    return max(chunk, 1)
+    return _rounded(max(chunk, 1))
+
+
+def _rounded(chunk: int) -> int:
+    return chunk - chunk % _ROUND if chunk > _ROUND else chunk
 
 
 def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, int], None]) -> None:
@@ -50,4 +56,4 @@ def in_chunks(count: int, chunk: int, workspace: Workspace, run: Callable[[int, 
                 raise
             # What is known of the poses of earlier pieces stays.
             workspace.release(keep="verdict")
-            chunk = max(tried // 2, SMALLEST_CHUNK)
+            chunk = max(_rounded(tried // 2), SMALLEST_CHUNK)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense import _checks
 from gpusense import compat as compat_module
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.cloud import ENOUGH_SHORT, Cloud, Placed, all_within, spread_of
@@ -67,7 +67,7 @@ class LikelihoodFieldModel(ScanModel):
         scanner: Scanner,
         parameters: LikelihoodFieldParameters | None = None,
         *,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         unknown: str | None = None,
         outside: str | None = None,

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends import Backend
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud, Placed
 from gpusense.features import (
@@ -84,7 +84,7 @@ class LandmarkModel(PointModel):
         landmarks: LandmarkMap,
         parameters: LandmarkParameters | None = None,
         *,
-        backend: str | Backend = "auto",
+        backend: Selection = "auto",
         precision: str = "float32",
         association: str = "nearest",
         negative: bool = False,

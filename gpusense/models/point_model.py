@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends import Backend, BackendInfo, get_backend
+from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud, finish
 from gpusense.models.arguments import real_dtype
@@ -47,7 +47,7 @@ class PointModel(ABC):
 
     _specialize = True
 
-    def __init__(self, backend: str | Backend, precision: str, temperature: float) -> None:
+    def __init__(self, backend: Selection, precision: str, temperature: float) -> None:
         self.temperature = _checks.real("temperature", temperature, above=0, high=1)
         self._backend = get_backend(backend)
         self._real = real_dtype(precision, self._backend)
@@ -129,7 +129,7 @@ class PointModel(ABC):
 
         def run(begin: int, end: int) -> None:
             if cloud.on_device:
-                result = backend.part(flat, begin, end - begin)
+                result = backend.part(flat, begin, end - begin, self._real)
             else:
                 result = space.empty("log_p", end - begin, self._real)
             if launch is None:
@@ -150,7 +150,9 @@ class PointModel(ABC):
             finish(space, cloud.on_device)
         if out is not None:
             return out
-        return arrays.result_for(poses, flat) if cloud.on_device else arrays.like(poses, flat)
+        if cloud.on_device:
+            return arrays.lent(poses, backend, flat, (cloud.count,), self._real)
+        return arrays.like(poses, flat)
 
     def _launch(self, kernel: str, flags: frozenset[str], cloud: Cloud, count: int, *arguments: Any) -> None:
         """Start a kernel with a work-item for each of ``count`` particles, whose last argument is the temperature."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,7 +12,7 @@ import numpy as np
 
 from gpusense import _checks, arrays
 from gpusense.backends import Backend
-from gpusense.backends.base import Buffer
+from gpusense.backends.base import Buffer, Sharing
 from gpusense.cloud import Cloud
 from gpusense.scan import check_ranges
 from gpusense.scanner import Scanner
@@ -53,20 +55,30 @@ class ScanCall:
         """Whether the poses are in the device's memory."""
         return any(cloud.on_device for cloud in self.clouds)
 
-    def target(self, backend: Backend, begin: int, end: int) -> np.ndarray | Buffer:
-        """Where the log-likelihoods of some particles of all scans go."""
-        return backend.part(self.flat, begin, end - begin) if self.on_device else self.flat[begin:end]
+    @contextmanager
+    def target(self, backend: Backend, begin: int, end: int) -> Iterator[np.ndarray | Buffer]:
+        """Where the log-likelihoods of some particles of all scans are written by what is started within."""
+        real, count = self.parts.dtype, end - begin
+        if not self.on_device:
+            yield self.flat[begin:end]
+        elif begin * real.itemsize % (sharing := cast(Sharing, backend)).alignment == 0:
+            yield backend.part(self.flat, begin, count, real)
+        else:
+            # The device cannot begin there.
+            own = sharing.blank(count, real)
+            yield own
+            sharing.copy(own, self.flat, count * real.itemsize, to=begin * real.itemsize)
 
     def separate(self, backend: Backend) -> None:
         """Give each scan a cloud of its own."""
         self.clouds, self.together = clouds_of(self.poses, len(self.ranges), backend), False
 
-    def log_p(self) -> Any:
+    def log_p(self, backend: Backend) -> Any:
         """The log-likelihoods, in the library that the poses came from."""
         if self.out is not None:
             return self.out
         if arrays.on_device(self.poses):
-            return arrays.result_for(self.poses, self.flat if self.single else self.flat.reshape(self.shape))
+            return arrays.lent(self.poses, backend, self.flat, self.shape, self.parts.dtype)
         return arrays.like(self.poses, self.flat.reshape(self.shape))
 
 

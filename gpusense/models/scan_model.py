@@ -11,7 +11,7 @@ import numpy as np
 
 from gpusense import _checks
 from gpusense import compat as compat_module
-from gpusense.backends import Backend, BackendInfo, get_backend
+from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.binding import bind
 from gpusense.bound import BoundCall, Scene, Scorer
@@ -39,7 +39,7 @@ class ScanModel(ABC):
         grid: OccupancyGrid,
         scanner: Scanner,
         *,
-        backend: str | Backend,
+        backend: Selection,
         precision: str,
         unknown: str | None,
         outside: str | None,
@@ -138,7 +138,7 @@ class ScanModel(ABC):
         with self._lock, self._workspace:
             self._start(call)
             finish(self._workspace, call.on_device)
-        log_p = call.log_p()
+        log_p = call.log_p(self._backend)
         return (log_p, call.parts.reshape(*call.shape, call.parts.shape[-1])) if per_beam else log_p
 
     def _call(
@@ -172,8 +172,8 @@ class ScanModel(ABC):
                 self._workspace.release(keep="verdict")
                 call.separate(self._backend)
         for i, cloud in enumerate(call.clouds):
-            target = call.target(self._backend, i * call.count, (i + 1) * call.count)
-            self._score_scan(cloud, call.ranges[i], target, call.parts[i], call.parts.shape[-1] > 0)
+            with call.target(self._backend, i * call.count, (i + 1) * call.count) as target:
+                self._score_scan(cloud, call.ranges[i], target, call.parts[i], call.parts.shape[-1] > 0)
             if not call.single:
                 self._workspace.start()
 
@@ -212,12 +212,12 @@ class ScanModel(ABC):
         if per_beam and len(scan.max_columns):
             parts[:, scan.max_columns] = log_weight(self._z_max)
         if len(scan.readings) == 0:
-            self._fill(log_p, self._without_readings(scan.constant))
+            self._fill(log_p, cloud.count, self._without_readings(scan.constant))
             self._look_at(cloud, (0, cloud.count))
             return
         hits = scan.columns[np.isfinite(scan.readings)] if self._peer is None and self._impossible() else ()
         if len(hits):
-            self._fill(log_p, -np.inf)
+            self._fill(log_p, cloud.count, -np.inf)
             self._look_at(cloud, (0, cloud.count))
             if per_beam:
                 parts[:, scan.columns[np.isinf(scan.readings)]] = log_weight(self._z_max)
@@ -228,7 +228,7 @@ class ScanModel(ABC):
 
         def run(begin: int, end: int) -> None:
             if cloud.host is None:
-                result = backend.part(log_p, begin, end - begin)
+                result = backend.part(log_p, begin, end - begin, self._real)
             else:
                 result = space.empty("log_p", end - begin, self._real)
             each = launch(cloud, (begin, end), result, per_beam)
@@ -249,18 +249,27 @@ class ScanModel(ABC):
         most = max(self._chunk(max(scans.most_readings, 1) * self._rays_each) // count, 1)
         for begin, end in runs(scans, most):
             part = (begin * count, end * count)
-            target = call.target(backend, *part)
-            if scans.batch.counts[begin] == 0:
-                self._fill(target, self._without_readings(float(scans.batch.constants[begin])))
-                self._look_at(cloud, part)
-                continue
-            launch = self._prepare_launch(part_of(scans, begin, end))
-            result = target if cloud.host is None else space.empty("log_p", (end - begin) * count, self._real)
-            launch(cloud, part, result, False)
-            if cloud.host is not None:
-                space.download(result, target)
-            self._together = max(self._together, end - begin)
+            with call.target(backend, *part) as target:
+                self._score_part(scans, (begin, end), cloud, part, target)
             space.start()
+
+    def _score_part(
+        self, scans: PreparedScan, some: tuple[int, int], cloud: Cloud, part: tuple[int, int], target: Any
+    ) -> None:
+        """Start to score some of several scans by common launches."""
+        assert scans.batch is not None
+        if scans.batch.counts[some[0]] == 0:
+            constant = float(scans.batch.constants[some[0]])
+            self._fill(target, part[1] - part[0], self._without_readings(constant))
+            self._look_at(cloud, part)
+            return
+        space = self._workspace
+        launch = self._prepare_launch(part_of(scans, *some))
+        result = target if cloud.host is None else space.empty("log_p", part[1] - part[0], self._real)
+        launch(cloud, part, result, False)
+        if cloud.host is not None:
+            space.download(result, target)
+        self._together = max(self._together, some[1] - some[0])
 
     def _prepared(self, ranges: np.ndarray) -> PreparedScan:
         """Readings of one scan (K,), or of several (S, K), classed, chosen and grouped."""
@@ -293,11 +302,11 @@ class ScanModel(ABC):
             given = cloud.given(self._backend, self._workspace, part)
             cloud.place(self._backend, self._workspace, given, part, frame, self._real, careful=False)
 
-    def _fill(self, log_p: Any, value: float) -> None:
+    def _fill(self, log_p: Any, count: int, value: float) -> None:
         if isinstance(log_p, np.ndarray):
             log_p[:] = value
         else:
-            self._backend.upload(np.full(log_p.size, value, self._real), log_p)
+            self._backend.upload(np.full(count, value, self._real), log_p)
 
     @abstractmethod
     def _impossible(self) -> bool:

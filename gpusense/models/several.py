@@ -57,7 +57,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
             model._workspace.start()
         on_device = {id(model) for model, call in zip(chosen, calls, strict=True) if call.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])
-    return [call.log_p() for call in calls]
+    return [call.log_p(model._backend) for model, call in zip(chosen, calls, strict=True)]
 
 
 def _checked(models: object) -> list[ScanModel]:

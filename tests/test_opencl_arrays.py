@@ -1,0 +1,344 @@
+"""Arrays of pyopencl on a user's queue: they stay where they are, and results are such arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from test_bound import CASES, NEAR, mixed
+from test_device_arrays import GRID as PIXELS
+from test_small_calls import BEAMS, COUNT, GRID, MODELS, SCANNER, cloud, scan
+
+import gpusense as gs
+from gpusense import backends, binding
+from gpusense.backends import get_backend
+from gpusense.models import chunks
+from gpusense.tolerances import differing
+
+BEAM, FIELD = MODELS
+METHODS = ("log_likelihood", "field", "expected_ranges", "cast", "cones", "absolute", "landmarks")
+
+
+@pytest.fixture
+def queue(needs) -> Any:
+    """A queue of a context of its own on the device under test."""
+    import pyopencl as cl
+
+    return cl.CommandQueue(cl.Context([get_backend(needs("opencl"))._device]))
+
+
+@pytest.fixture
+def there(queue):
+    """What makes an array on that queue."""
+    import pyopencl.array
+
+    return lambda array: pyopencl.array.to_device(queue, np.ascontiguousarray(array))
+
+
+@pytest.fixture
+def as_gpu(queue, monkeypatch):
+    """The queue's backend, whose device counts as a GPU: bound calls keep their launches there."""
+    device = get_backend(queue)
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
+    return device
+
+
+def call_of(method: str, backend: Any) -> Any:
+    """What takes poses and out=."""
+    if method == "cast":
+        caster = gs.RayCaster(GRID, 5.0, backend=backend)
+        return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options)
+    if method == "absolute":
+        heading = gs.HeadingModel(backend=backend)
+        return lambda poses, **options: heading.log_likelihood(poses, 0.3, **options)
+    if method == "landmarks":
+        map_ = gs.LandmarkMap(np.random.default_rng(1).uniform(0, 6, (9, 2)))
+        landmarks = gs.LandmarkModel(map_, backend=backend)
+        features = [[1.0, 0.1], [2.0, 0.4]]
+        return lambda poses, **options: landmarks.log_likelihood(poses, features, **options)
+    scanner = gs.Scanner(np.linspace(-3, 3, 7), 5.0, cone=0.3, cone_rays=3) if method == "cones" else SCANNER
+    model = (FIELD if method == "field" else BEAM)(GRID, scanner, backend=backend)
+    if method in ("expected_ranges", "cones"):
+        return model.expected_ranges
+    return lambda poses, **options: model.log_likelihood(poses, scan(1), **options)
+
+
+@pytest.fixture
+def copies(monkeypatch):
+    """Bytes that models copy to the device and back."""
+    from gpusense.backends._opencl import OpenCLBackend
+
+    seen: list[tuple[str, int]] = []
+    upload, download = OpenCLBackend.upload, OpenCLBackend.download
+
+    def up(self, array, out=None, *, wait=True):
+        seen.append(("up", array.nbytes))
+        return upload(self, array, out, wait=wait)
+
+    def down(self, buffer, out, *, wait=True):
+        seen.append(("down", out.nbytes))
+        return download(self, buffer, out, wait=wait)
+
+    monkeypatch.setattr(OpenCLBackend, "upload", up)
+    monkeypatch.setattr(OpenCLBackend, "download", down)
+    return seen
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("method", METHODS)
+def test_poses_on_the_device_stay_there(method, real, queue, there, copies):
+    """Results have the bits of NumPy's poses, and are arrays on the queue; out= is filled in place."""
+    call, poses = call_of(method, queue), cloud(1).astype(real)
+    expected, given = call(poses), there(poses)
+    call(given)
+    copies.clear()
+    found = call(given)
+    assert type(found) is type(given) and found.queue == queue and found.shape == expected.shape
+    assert differing(found.get(), expected) == 0
+    assert [size for way, size in copies if way == "down"] == [8]
+    assert all(size < poses.nbytes for _, size in copies)
+    out = there(np.full_like(expected, 7))
+    assert call(given, out=out) is out and differing(out.get(), expected) == 0
+
+
+@pytest.mark.parametrize("share", [True, False], ids=["together", "apart"])
+@pytest.mark.parametrize("kind", MODELS)
+def test_several_scans(kind, share, queue, there, monkeypatch):
+    """Also where the device cannot begin with the particles of a scan, or those of a piece."""
+    model = kind(GRID, SCANNER, backend=queue)
+    monkeypatch.setattr(
+        "gpusense.models.scan_model.TOGETHER", {"gpu": 1 << 22 if share else 0} | {"cpu": 1 << 22 if share else 0}
+    )
+    for count in (COUNT, 129, 256):
+        poses = np.stack([cloud(i, count) for i in range(4)]).astype(np.float32)
+        scans = np.stack([scan(1), np.full(BEAMS, np.nan), scan(2), scan(3, 20)])
+        expected = model.log_likelihood(poses, scans)
+        assert (model._together > 1) == share
+        assert differing(model.log_likelihood(there(poses), there(scans)).get(), expected) == 0
+        out = there(np.zeros((4, count), np.float32))
+        # Poses that begin anywhere in their buffer are copied.
+        among = there(np.concatenate([np.zeros(5, np.float32), poses.ravel()]))[5:].reshape(4, count, 3)
+        assert among.offset == 20
+        assert model.log_likelihood(among, scans, out=out) is out and differing(out.get(), expected) == 0
+
+
+def test_pieces_of_calls(queue, there, monkeypatch):
+    """Pieces of other sizes than the device can begin with become multiples of 256 particles."""
+    monkeypatch.setattr(chunks, "CHUNK", 300)
+    poses = cloud(3, 1000)
+    for kind in MODELS:
+        model = kind(GRID, SCANNER, backend=queue)
+        assert differing(model.log_likelihood(there(poses), scan(1)).get(), model.log_likelihood(poses, scan(1))) == 0
+    assert differing(model.log_likelihood(there(poses[:0]), scan(1)).get(), np.zeros(0, np.float32)) == 0
+
+
+def test_what_another_queue_still_writes_is_waited_for(queue, there):
+    """Before anything is started that reads it."""
+    import pyopencl as cl
+
+    model, poses = FIELD(GRID, SCANNER, backend=queue), there(cloud(1))
+
+    class Busy:
+        """A queue that writes poses when it is waited for."""
+
+        def finish(self) -> None:
+            cl.enqueue_copy(queue, poses.base_data, cloud(2))
+
+    expected = model.log_likelihood(cloud(2), scan(1))
+    poses.queue = Busy()
+    assert differing(model.log_likelihood(poses, scan(1)).get(), expected) == 0
+    # The same of arrays whose queue has events to be waited for.
+    moved = there(cloud(1)).with_queue(cl.CommandQueue(queue.context))
+    moved += 0.25
+    assert moved.events
+    assert differing(model.log_likelihood(moved, scan(1)).get(), model.log_likelihood(cloud(1) + 0.25, scan(1))) == 0
+
+
+def test_a_pose_that_is_not_finite(queue, there):
+    model, poses = BEAM(GRID, SCANNER, backend=queue), cloud(1)
+    poses[7, 1] = np.inf
+    for _ in range(2):
+        with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device that is not"):
+            model.log_likelihood(there(poses), scan(1))
+    poses[7, 1] = 1.0
+    assert differing(model.log_likelihood(there(poses), scan(1)).get(), model.log_likelihood(poses, scan(1))) == 0
+
+
+# ---- bound calls
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bound_calls(case, as_gpu, queue, there):
+    """They have the bits of ordinary ones, whatever the arrays hold then, with the maps of then; NumPy's arrays too."""
+    model = CASES[case](backend=queue)
+    beams = model.scanner.count
+    for real in (np.float32, np.float64):
+        poses, ranges = there(cloud(0).astype(real)), there(np.zeros(beams, real))
+        host = [np.zeros((COUNT, 3), real), np.zeros(beams, real)]
+        call, staged = model.bind(poses, ranges), model.bind(*host)
+        assert not call.waits and type(call.out) is type(poses) and type(staged) is binding._StagedCall
+        for seed in (1, 2, 3):
+            host[0][...], host[1][...] = cloud(seed), mixed(seed)[:beams]
+            poses.set(host[0])
+            ranges.set(host[1])
+            if seed == 3:
+                model.update_map(np.full((2, 3), 100), (5, 6))
+            expected = model.log_likelihood(poses, host[1]).get()
+            assert call() is call.out
+            call.check()
+            assert differing(call.out.get(), expected) == 0, (seed, real)
+            assert differing(staged(), model.log_likelihood(*host)) == 0, (seed, real)
+    host[0][3, 1] = np.nan
+    with pytest.raises(ValueError, match="poses: every value must be finite, got nan at index"):
+        staged()
+    poses.set(host[0])
+    call()
+    with pytest.raises(ValueError, match="poses: must be finite"):
+        call.check()
+    poses.set(cloud(1).astype(real))
+    call()
+    call.check()
+
+
+def test_bound_calls_on_another_queue(as_gpu, queue, there):
+    import pyopencl as cl
+
+    model, other = FIELD(GRID, NEAR, backend=queue), cl.CommandQueue(queue.context)
+    poses, ranges = there(cloud(1)), there(mixed(1))
+    expected = model.log_likelihood(poses, ranges).get()
+    call = model.bind(poses, ranges, out=there(np.zeros(COUNT, np.float32)))
+    for stream in (None, other, other):
+        call.out.fill(0)
+        queue.finish()
+        call(stream)
+        call.check()
+        assert differing(call.out.get(), expected) == 0
+    stranger = cl.CommandQueue(cl.Context([queue.device]))
+    for stream in ("a stream", stranger):
+        with pytest.raises(TypeError, match=r"^stream: must be a queue of the model's context"):
+            call(stream)
+    # Nothing that a queue still works on is freed.
+    call(other)
+    del call
+    gc.collect()
+
+
+def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
+    """A call is three launches, started by kernels of its own."""
+    from gpusense.backends import _opencl_replay
+
+    model = FIELD(GRID, NEAR, backend=queue)
+    call = model.bind(there(cloud(1)), there(mixed(1)))
+    names, enqueue = [], _opencl_replay.cl.enqueue_nd_range_kernel
+    monkeypatch.setattr(
+        _opencl_replay.cl, "enqueue_nd_range_kernel",
+        lambda queue, kernel, *sizes: (names.append(kernel.function_name), enqueue(queue, kernel, *sizes))[1],
+    )  # fmt: skip
+    monkeypatch.setattr(as_gpu, "compile", None)
+    call()
+    assert names == ["place_inputs", "field_blocks", "sum_parts"]
+
+
+def test_only_launches_can_be_recorded(as_gpu):
+    buffer = as_gpu.empty(4, np.dtype(np.float32))
+    for run in (
+        lambda: as_gpu.upload(np.ones(4, np.float32), buffer),
+        lambda: as_gpu.download(buffer, np.ones(4, np.float32)),
+    ):
+        with pytest.raises(RuntimeError, match="only launches can be recorded"):
+            as_gpu.record(run)
+    as_gpu.upload(np.ones(4, np.float32), buffer)
+
+
+def test_processors_take_the_ordinary_way(queue, there):
+    """Their kernels in vectors have scans that the host prepared."""
+    if queue.device.type & 4:
+        pytest.skip("the device is a GPU")
+    model = FIELD(GRID, NEAR, backend=queue)
+    poses, ranges = there(cloud(1)), there(mixed(1))
+    call = model.bind(poses, ranges)
+    assert call.waits and call() is call.out
+    assert differing(call.out.get(), model.log_likelihood(cloud(1), mixed(1))) == 0
+
+
+# ---- what cannot be used
+
+
+def test_backends_of_queues(queue):
+    """One for each queue, for as long as somebody has it."""
+    import pyopencl as cl
+
+    device = get_backend(queue)
+    assert get_backend(queue) is device and FIELD(GRID, NEAR, backend=queue)._backend is device
+    assert device.info == get_backend(device.info.selection).info
+    other = cl.CommandQueue(queue.context)
+    assert get_backend(other) is not device
+    del device
+    gc.collect()
+    assert queue.int_ptr not in backends._OF_QUEUES
+    properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    with pytest.raises(ValueError, match="backend: must be a queue that does commands in their order"):
+        get_backend(cl.CommandQueue(queue.context, properties=properties))
+    for wrong in (queue.context, 3, None):
+        with pytest.raises(TypeError, match="backend: must be a selection string or a queue of pyopencl, got"):
+            get_backend(wrong)
+
+
+WRONG = {
+    "integers": (lambda there: there(np.zeros((5, 3), np.int32)), TypeError, "poses: must hold float32 or float64"),
+    "complex": (lambda there: there(np.zeros((5, 3), np.complex64)), TypeError, "poses: must hold real numbers, got"),
+    "a shape": (lambda there: there(np.zeros((5, 2))), ValueError, "poses: shape must be (N, 3), got (5, 2)"),
+    "columns": (lambda there: there(np.zeros((3, 5))).T, ValueError, "poses: must be C-contiguous on the device, got"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_poses_that_cannot_be_used(name, queue, there):
+    make, error, message = WRONG[name]
+    with pytest.raises(error, match=r"^" + re.escape(message)):
+        FIELD(GRID, SCANNER, backend=queue).log_likelihood(make(there), scan(1))
+
+
+def test_results_that_cannot_be_written(queue, there):
+    model, poses = FIELD(GRID, SCANNER, backend=queue), there(cloud(1))
+    among = there(np.zeros(COUNT + 1, np.float32))[1:]
+    for out, error, message in (
+        (there(np.zeros(COUNT)), TypeError, "out: must hold float32, got float64"),
+        (there(np.zeros(3, np.float32)), ValueError, f"out: shape must be ({COUNT},), got (3,)"),
+        (np.zeros(COUNT, np.float32), TypeError, "out: must be in the memory where the poses are"),
+        (among, ValueError, "out: must begin at a multiple of "),
+        (there(np.zeros(2 * COUNT, np.float32))[::2], ValueError, "out: must be C-contiguous and writable"),
+    ):
+        with pytest.raises(error, match=r"^" + re.escape(message)):
+            model.log_likelihood(poses, scan(1), out=out)
+
+
+def test_arrays_of_other_places(queue, there, needs):
+    """Each says what to do."""
+    for selection in ("numpy", needs("warp"), needs("opencl")):
+        expected = "must be of the context of" if selection.startswith("opencl") else "must be in host memory for"
+        with pytest.raises(TypeError, match=rf"^poses: {expected} .*backend=<the array's queue>"):
+            FIELD(PIXELS, SCANNER, backend=selection).log_likelihood(there(cloud(1)), scan(1))
+    with pytest.raises(TypeError, match=r"^ranges: must be in host memory for numpy"):
+        FIELD(PIXELS, SCANNER, backend="numpy").log_likelihood(cloud(1), there(scan(1)))
+
+
+def test_bound_arrays_must_begin_where_the_device_can(as_gpu, queue, there):
+    among, poses, ranges = there(np.zeros(3 * COUNT + 1)), there(cloud(1)), there(mixed(1))
+    late, model = among[1:].reshape(COUNT, 3), FIELD(GRID, NEAR, backend=queue)
+    for given in ((late, ranges), (poses, there(np.zeros(BEAMS + 1))[1:])):
+        with pytest.raises(ValueError, match=r"must begin at a multiple of \d+ bytes of its buffer .*: pass a copy"):
+            model.bind(*given)
+
+
+def test_readings_with_gaps(queue, there):
+    """Readings are copied to the host, gaps and all."""
+    model = FIELD(GRID, SCANNER, backend=queue)
+    twice = np.repeat(scan(1), 2)
+    twice[1::2] = np.nan
+    found = model.log_likelihood(there(cloud(1)), there(twice)[::2])
+    assert differing(found.get(), model.log_likelihood(cloud(1), scan(1))) == 0

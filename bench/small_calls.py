@@ -3,13 +3,13 @@
     python bench/small_calls.py --backend opencl
     python bench/small_calls.py --backend warp:cuda:0 --output bench/results/small_calls_name
 
-Times are of whole calls of ``log_likelihood``: NumPy arrays in and out, and poses and result on the device where it has
-arrays (Warp's CUDA); for several scans in one call see ``several_scans.py``. Each is taken beside the plain way (copies
-by commands, each launch started on its own), in turns, so that their ratio holds on a busy machine; results of both
-must have the same bits. Bound calls (``bind``) are taken beside ``log_likelihood`` with the same arrays, with a wait
-after each call and after many: with NumPy arrays (on CUDA one graph with its copies, elsewhere the ordinary call), and
-on the device where it has arrays. "Kernels" are the launches of an ordinary call, started one after the other with
-everything on the device.
+Times are of whole calls of ``log_likelihood``: NumPy arrays in and out, and poses and result on the device where that
+is a GPU (arrays of Warp and pyopencl); for several scans in one call see ``several_scans.py``. Each is taken beside the
+plain way (copies by commands, each launch started on its own), in turns, so that their ratio holds on a busy machine;
+results of both must have the same bits. Bound calls (``bind``) are taken beside ``log_likelihood`` with the same
+arrays, with a wait after each call and after many: with NumPy arrays (on GPUs launches that are kept go along with the
+copies, with CUDA as one graph; on processors it is the ordinary call), and on the device. "Kernels" are the launches of
+an ordinary call, started one after the other with everything on the device.
 """
 
 from __future__ import annotations
@@ -70,7 +70,11 @@ def in_turns(short: Call, plain: Call, calls: int, way: Way, each: int) -> tuple
 
 
 def on_device(device: Any, array: np.ndarray) -> Any:
-    """An array in the memory of Warp's device."""
+    """An array in the memory of a GPU, of the library that drives it."""
+    if device.info.backend == "opencl":
+        import pyopencl.array
+
+        return pyopencl.array.to_device(device.queue, array)
     import warp as wp
 
     dtype = {"float32": wp.float32, "float64": wp.float64}[array.dtype.name]
@@ -150,7 +154,7 @@ class Bench:
                     self.add(
                         f"{size}, NumPy in and out{what}", call, functools.partial(call, one=plain), kernels, calls
                     )
-                    if not self.cuda:
+                    if not self.gpu:
                         continue
                     there = on_device(self.device, poses)
                     out = on_device(self.device, np.zeros(count, np.float32))
@@ -162,7 +166,7 @@ class Bench:
                     call_there = functools.partial(call, poses=there)
                     self.add(f"{size}, on the device{what}", call_there, call_there, kernels, calls)
                 self.bound(f"{size}, bound", model, poses, kernels, np.array)
-                if self.cuda:
+                if self.gpu:
                     there = functools.partial(on_device, self.device)
                     self.bound(f"{size}, bound, on the device", model, poses, kernels, there)
         graphs = getattr(self.device, "_graphs", None)
@@ -171,9 +175,9 @@ class Bench:
             print(f"{self.device.info.selection}: {len(graphs._graphs)} graphs are kept{refused}", file=sys.stderr)
 
     @property
-    def cuda(self) -> bool:
+    def gpu(self) -> bool:
         """Whether the device has arrays of its own."""
-        return self.device.info.selection.startswith("warp:cuda")
+        return bool(self.device.info.kind == "gpu")
 
     def bound(
         self, what: str, model: Any, poses: np.ndarray, kernels: float, there: Callable[[np.ndarray], Any]
@@ -203,7 +207,7 @@ class Bench:
 
 def read(array: Any) -> np.ndarray:
     """The bits of a result, wherever it is."""
-    host = array if isinstance(array, np.ndarray) else array.numpy()
+    host = array if isinstance(array, np.ndarray) else array.get() if hasattr(array, "get") else array.numpy()
     return np.array(host).view(np.uint32)
 
 

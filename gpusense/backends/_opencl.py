@@ -90,6 +90,11 @@ class OpenCLBackend(ProcessBound):
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
 
+    @property
+    def queue(self) -> cl.CommandQueue:
+        """Where commands go: arrays of pyopencl that are made with it stay where they are."""
+        return self._queue
+
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
         self.check_process()

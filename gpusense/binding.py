@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from gpusense import _checks, arrays
-from gpusense.backends.base import Buffer
 from gpusense.bound import BoundCall, DeviceCall
 from gpusense.cloud import LEAST_ORDERED
 from gpusense.workspace import Workspace
@@ -23,8 +22,11 @@ if TYPE_CHECKING:
 
 # Cells of a map whose table is made as a whole for them.
 _MOST_CELLS = 1 << 22
-# Bytes of an array that is copied with the launches; larger ones have copies of their own.
+# Bytes of what is copied with the launches; more is copied in the ordinary way.
 _LARGEST = 256 << 10
+_DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
+# Bytes between the beginnings of arrays that are copied as one: every device can begin there.
+_ALIGNED = 1024
 
 
 def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
@@ -87,47 +89,85 @@ class _HostCall(BoundCall):
             return False
         poses, ranges = self._given
         given, reals = (poses, ranges, self.out), (np.float32, np.float64)
-        short = all(type(a) is np.ndarray and a.dtype in reals and a.nbytes <= _LARGEST for a in given)
+        short = all(type(a) is np.ndarray and a.dtype in reals for a in given)
+        short = short and _DOUBLE.itemsize * (poses.size + ranges.size) <= _LARGEST
         return short and self._model.grid.cells.size <= _MOST_CELLS and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
 
 
+class _Pack:
+    """Arrays that are copied as one, on the host and on the device.
+
+    Attributes:
+        host: What is copied.
+        there: Where it is on the device.
+        views: The arrays on the host.
+        parts: The arrays on the device.
+    """
+
+    def __init__(self, backend: Any, dtype: np.dtype, *arrays: tuple[int, np.dtype]) -> None:
+        begins, size = [], 0
+        for count, own in arrays:
+            begins.append(size)
+            size += -(-count * own.itemsize // _ALIGNED) * _ALIGNED
+        self.host = np.zeros(size // dtype.itemsize, dtype)
+        self.there = backend.upload(self.host, backend.blank(self.host.size, dtype))
+        numbers = self.host.view(np.uint8)
+        self.views, self.parts = [], []
+        for begin, (count, own) in zip(begins, arrays, strict=True):
+            self.views.append(numbers[begin : begin + count * own.itemsize].view(own))
+            self.parts.append(backend.part(self.there, begin // own.itemsize, count, own))
+
+
 class _StagedCall(BoundCall):
-    """A call of few particles: arrays go to the device and back along with the launches."""
+    """A call of few particles: what it is given goes to the device as one array, and what it finds comes back as one.
+
+    A copy of few numbers takes as long as a launch. Poses and readings are float64 on the device, which keeps float32
+    as it is; limits of readings are those of the host, whatever their precision.
+    """
 
     waits = True
 
     def __init__(self, host: _HostCall) -> None:
         self._host, self.out, (self._poses, self._ranges) = host, host.out, host._given
-        self._backend = cast(Any, host._model._backend)
-        self._poses_there = self._blank(self._poses, self._poses.dtype)
-        # Limits of readings are those of the host, whatever their precision.
-        self._ranges_there = self._blank(self._ranges, np.dtype(np.float64))
-        self._device = DeviceCall(host._model, self._poses_there[1], self._ranges_there[1], None)
-        self._space = Workspace(self._backend)
-        self._lock = threading.Lock()
-
-    def _blank(self, array: np.ndarray, dtype: np.dtype) -> tuple[Buffer, Any]:
-        """Room for an array on the device, as a buffer and as an array there."""
-        buffer = self._backend.blank(array.size, dtype)
-        return buffer, self._backend.lend(buffer, array.shape, dtype)
+        model = host._model
+        self._backend = backend = cast(Any, model._backend)
+        count, readings = len(self._poses), len(self._ranges)
+        self._inputs = _Pack(backend, _DOUBLE, (3 * count, _DOUBLE), (readings, _DOUBLE))
+        self._outputs = _Pack(backend, model._real, (count, model._real), (2, _INT))
+        poses, ranges = self._inputs.parts
+        found, verdict = self._outputs.parts
+        self._device = DeviceCall(
+            model, backend.lend(poses, (count, 3), _DOUBLE), backend.lend(ranges, (readings,), _DOUBLE),
+            backend.lend(found, (count,), model._real), verdict,
+        )  # fmt: skip
+        self._space, self._lock = Workspace(backend), threading.Lock()
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""
         if stream is not None:
             return self._host(stream)
-        backend, device = self._backend, self._device
-        try:
-            with self._lock, self._space:
-                ranges = np.ascontiguousarray(self._ranges, np.float64)
-                backend.upload(self._poses, self._poses_there[0], wait=False)
-                backend.upload(ranges, self._ranges_there[0], wait=False)
-                device.begin()
-                self._space.download(device.result, self.out)
-                device.finish()
-        except ValueError:
-            # It says which pose is not finite.
-            return self._host()
-        return self.out
+        backend, given, outputs = self._backend, self._inputs, self._outputs
+        (poses, ranges), (found, verdict) = given.views, outputs.views
+        with self._lock:
+            poses.reshape(self._poses.shape)[...] = self._poses
+            ranges[...] = self._ranges
+            with self._space:
+                backend.upload(given.host, given.there, wait=False)
+                self._device.begin()
+                backend.download(outputs.there, outputs.host, wait=not self._gathers())
+                if self._gathers():
+                    backend.synchronize()
+            if not verdict[0]:
+                self.out[...] = found
+                return self.out
+            verdict[...] = 0
+            backend.upload(verdict, outputs.parts[1])
+        # It says which pose is not finite.
+        return self._host()
+
+    def _gathers(self) -> bool:
+        """Whether copies wait for others, to be done in one go."""
+        return hasattr(self._backend, "mark") and self._backend.mark() is not None
 
     def check(self) -> None:
         """See BoundCall.check."""

@@ -124,7 +124,7 @@ class DeviceCall(BoundCall):
     # Launches that were gathered once.
     _kept: object | None = None
 
-    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
+    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any, verdict: Buffer | None = None) -> None:
         backend, real = model._backend, model._real
         self._model, self._backend, self._real = model, backend, real
         self._cloud = Cloud(poses, backend, in_place=True)
@@ -137,6 +137,9 @@ class DeviceCall(BoundCall):
         self._given = (poses, ranges, found, self.out)
         # Buffers of its own: other calls of the model may come between.
         self._space = Workspace(backend)
+        if verdict is not None:
+            # Whoever has it looks at it.
+            self._space.share("verdict", verdict, 2, _INT)
         self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
         self._scan, self._readings, self._fixed = self._placing_of(found.buffer, found.dtype)
@@ -172,15 +175,6 @@ class DeviceCall(BoundCall):
     def check(self) -> None:
         """See BoundCall.check."""
         self._replay.wait()
-        self.finish()
-
-    @property
-    def result(self) -> Buffer:
-        """Where the log-likelihoods are."""
-        return self._result
-
-    def finish(self) -> None:
-        """Wait for what this thread has started or gathered, and see that all poses were finite."""
         finish(self._space, on_device=True)
 
     def _placing_of(self, ranges: Buffer, dtype: np.dtype) -> tuple[PlacedScan, Readings, bool]:

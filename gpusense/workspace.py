@@ -86,6 +86,10 @@ class Workspace:
             self._buffers[name, dtype] = (capacity, buffer)
         return buffer
 
+    def share(self, name: str, buffer: Buffer, count: int, dtype: np.dtype) -> None:
+        """Use a buffer of ``count`` cleared numbers that somebody else has."""
+        self._buffers[name, dtype] = (count, buffer)
+
     def upload(self, name: str, array: np.ndarray) -> Buffer:
         """Start to copy a host array, which nobody may change until ``wait``, into the head of a named buffer."""
         array = np.ascontiguousarray(array)

@@ -48,7 +48,7 @@ class NumpyBackend:
 
     def part(self, buffer: np.ndarray, first: int, count: int, dtype: np.dtype) -> np.ndarray:
         """See Backend.part."""
-        return buffer[first : first + count]
+        return buffer.view(dtype)[first : first + count]
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""

@@ -126,6 +126,13 @@ class WarpBackend(ProcessBound):
 
     def part(self, buffer: wp.array, first: int, count: int, dtype: np.dtype) -> wp.array:
         """See Backend.part."""
+        kind = SCALARS[np.dtype(dtype)]
+        if kind is not buffer.dtype:
+            view = wp.array(
+                ptr=buffer.ptr + first * np.dtype(dtype).itemsize, dtype=kind, shape=(count,), device=self._device
+            )
+            view._gpusense_owner = buffer
+            return view
         return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:

@@ -199,7 +199,7 @@ class Backend(Protocol):
         """
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """``count`` numbers of a buffer from number ``first`` on, without a copy.
+        """``count`` numbers of a buffer, which may be of another type, from number ``first`` on, without a copy.
 
         Raises:
             ValueError: the device cannot begin there; see Sharing.alignment.

@@ -96,7 +96,10 @@ class Bench:
         self.pose = free_pose(self.grid, rng, 0.3)
         mixture = gs.BeamParameters()
         self.scans = np.stack(
-            [simulate_scan(self.grid, self.scanner, self.pose, mixture, rng) for _ in range(arguments.scans)]
+            [
+                simulate_scan(self.grid, self.scanner, self.pose, mixture, rng, self.device)
+                for _ in range(arguments.scans)
+            ]
         )
         self.clouds = {
             count: cloud_around(self.pose, count, 0.1, 0.1, rng).astype(np.float64) for count in arguments.particles

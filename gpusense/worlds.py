@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense import _checks
-from gpusense.backends import get_backend
+from gpusense.backends import Selection, get_backend
 from gpusense.grid import OccupancyGrid
 from gpusense.models.beam import BeamModel
 from gpusense.parameters import BeamParameters
@@ -225,7 +225,7 @@ def simulate_scan(
     pose: ArrayLike,
     parameters: BeamParameters,
     rng: Rng,
-    backend: str = "numpy",
+    backend: Selection = "numpy",
 ) -> Floats:
     """A scan drawn from the beam model: exact expected ranges, then :func:`sample_readings`.
 

@@ -274,7 +274,7 @@ def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real:
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("names", [("CAREFUL",), ("CAREFUL", "QUICK")])
+@pytest.mark.parametrize("names", [("CAREFUL",), ("CAREFUL", "QUICK"), ("CAREFUL", "QUICK", "ALL_READINGS")])
 def test_blocks_of_fields(names: tuple[str, ...], way: str, device: Backend) -> None:
     for count, readings, spread in itertools.product((1, 64, 65), (1, 16, 17, 53), SPREADS):
         found, expected, _ = field_blocks(device, "log table", np.float32, names, spread, way, readings, count)

@@ -33,7 +33,7 @@ _RING = 2
 _GROUP = 64
 # In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.
 _GUARD = 3.25
-_NO_FLAGS, _SCANS = frozenset[str](), frozenset({"SCANS"})
+_NO_FLAGS, _SCANS, _MISSING = frozenset[str](), frozenset({"SCANS"}), frozenset({"ALL_READINGS"})
 
 
 class LikelihoodFieldModel(ScanModel):
@@ -224,7 +224,7 @@ class LikelihoodFieldModel(ScanModel):
         scans = 1 if batch is None else len(batch.counts)
 
         careful = "CAREFUL" in self._flags
-        quick = careful and self._log_table and self._specialize
+        quick = self._is_quick()
         scalars = (scan.constant + self._lead, self.temperature)
         reach = longest + 2
 
@@ -274,6 +274,10 @@ class LikelihoodFieldModel(ScanModel):
 
         return launch
 
+    def _is_quick(self) -> bool:
+        """Whether GPUs find cells by rounding, and again with more digits where that is in doubt."""
+        return "CAREFUL" in self._flags and self._log_table and self._specialize
+
     def _longest_each(self, lengths: np.ndarray, scan: PreparedScan, blocks: int) -> np.ndarray:
         """The longest reading of each block, in cells; of several scans each has as many blocks as the longest."""
         if scan.batch is None:
@@ -291,8 +295,7 @@ class LikelihoodFieldModel(ScanModel):
         return -(-places // BLOCK_TERMS), 1
 
     def _bound_scorer(self, table: Buffer, region: Region) -> Scorer:
-        # Missing readings have no place in the map, so cells are not found by rounding alone.
-        blocks = self._backend.compile("field_blocks", self._flags | {"ALL_READINGS"})
+        blocks = self._backend.compile("field_blocks", (self._quick if self._is_quick() else self._flags) | _MISSING)
 
         def score(placed: Placed, headings: frozenset[str], count: int, scan: PlacedScan, parts: Buffer) -> None:
             spread = spread_of(count, -(-scan.places // BLOCK_TERMS), ENOUGH_SHORT)

@@ -82,6 +82,41 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 #endif
 }
 
+#if QUICK
+// What one reading adds whose cell is found by rounding alone; worst becomes how far a place is off its cell's centre, if
+// that is farther. A reading that is no range has no cell: the sensor's own is looked up in its place, and what a max
+// reading adds is far.
+real quick_value(global const real *table, const int2 from, const real4 lowered, const real2 point, const real far,
+                 const int rows, const int cols, real *worst) {
+    real off;
+#if ALL_READINGS
+    const int is_range = isfinite(point.x);
+    const int2 near = rounded_cell(lowered, is_range ? point : (real2)(0), &off);
+    const real value = table[table_cell(near, from, rows, cols)];
+    *worst = is_range ? fmax(*worst, off) : *worst;
+    return is_range ? value : isinf(point.x) ? far : 0;
+#else
+    const int2 near = rounded_cell(lowered, point, &off);
+    *worst = fmax(*worst, off);
+    return table[table_cell(near, from, rows, cols)];
+#endif
+}
+
+// The same where that is in doubt: the cell is found with more digits.
+real careful_value(global const real *table, const int2 origin, const real4 lowered, const real4 pose, const real4 low,
+                   const real2 point, const real2 point_low, const real far, const int rows, const int cols,
+                   const real guard, const real sure) {
+#if ALL_READINGS
+    if (isnan(point.x)) return 0;
+    if (isinf(point.x)) return far;
+#endif
+    real off;
+    int2 cell = rounded_cell(lowered, point, &off) - ROUNDING_BITS;
+    if (off > sure) cell = end_point(pose, low, point, point_low, 0, guard).cell;
+    return table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)];
+}
+#endif
+
 #if !WIDE
 // One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
@@ -156,34 +191,27 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
 #if QUICK
     const int2 from = table_origin(origin, cols);
     const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
+    const real far = terms[3];
 #endif
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
         real sum = 0;
 #if QUICK
-        real worst = 0, off;
+        real worst = 0;
         const real sure = sure_of(guard[block]);
         if (begin + BLOCK_TERMS <= size) {
 #pragma unroll
-            for (int i = 0; i < BLOCK_TERMS; ++i) {
-                const int2 near = rounded_cell(lowered, point[begin + i], &off);
-                worst = fmax(worst, off);
-                sum += table[table_cell(near, from, rows, cols)];
-            }
+            for (int i = 0; i < BLOCK_TERMS; ++i)
+                sum += quick_value(table, from, lowered, point[begin + i], far, rows, cols, &worst);
         } else {
-            for (int k = begin; k < end; ++k) {
-                const int2 near = rounded_cell(lowered, point[k], &off);
-                worst = fmax(worst, off);
-                sum += table[table_cell(near, from, rows, cols)];
-            }
+            for (int k = begin; k < end; ++k)
+                sum += quick_value(table, from, lowered, point[k], far, rows, cols, &worst);
         }
         if (worst > sure) {
             sum = 0;
-            for (int k = begin; k < end; ++k) {
-                int2 cell = rounded_cell(lowered, point[k], &off) - ROUNDING_BITS;
-                if (off > sure) cell = end_point(own, low, point[k], point_low[k], 0, guard[block]).cell;
-                sum += table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)];
-            }
+            for (int k = begin; k < end; ++k)
+                sum += careful_value(table, origin, lowered, own, low, point[k], point_low[k], far, rows, cols,
+                                     guard[block], sure);
         }
 #else
         for (int k = begin; k < end; ++k)

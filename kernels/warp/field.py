@@ -131,6 +131,7 @@ def make(name, flags):
     CAREFUL = "CAREFUL" in flags
     CUBES = "CUBES" in flags
     PER_BEAM = "PER_BEAM" in flags
+    ALL_READINGS = "ALL_READINGS" in flags
     QUICK = "QUICK" in flags
     SCANS = "SCANS" in flags
     ZERO, HALF = real(0.0), real(0.5)
@@ -138,6 +139,59 @@ def make(name, flags):
     WHOLE_BLOCK = 16
     number_at, cell_at, point_at, pose_at = reader(real), reader(wp.vec2i), reader(vec2), reader(vec4)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
+
+    # What one reading adds whose cell is found by rounding alone, and how far its place is off the cell's centre. A
+    # reading that is no range has no cell: the sensor's own is looked up in its place, and what a max reading adds is
+    # far.
+    @wp.func
+    def quick_value(
+        table: wp.array(dtype=real),
+        start_cell: wp.vec2i,
+        lowered: vec4,
+        to: vec2,
+        far: real,
+        rows: wp.int32,
+        cols: wp.int32,
+    ):
+        if ALL_READINGS:
+            is_range = wp.isfinite(to.x)
+            near, off = rounded_cell(lowered, wp.where(is_range, to, vec2(ZERO, ZERO)))
+            value = number_at(table, table_cell(near, start_cell, rows, cols))
+            if not is_range:
+                off = ZERO
+                value = wp.where(wp.isinf(to.x), far, ZERO)
+        else:
+            near, off = rounded_cell(lowered, to)
+            value = number_at(table, table_cell(near, start_cell, rows, cols))
+        return value, off
+
+    # The same where that is in doubt: the cell is found with more digits.
+    @wp.func
+    def careful_value(
+        table: wp.array(dtype=real),
+        origin: wp.vec2i,
+        lowered: vec4,
+        from_pose: vec4,
+        from_low: vec4,
+        to: vec2,
+        to_low: vec2,
+        far: real,
+        rows: wp.int32,
+        cols: wp.int32,
+        guard: real,
+        sure: real,
+    ):
+        if ALL_READINGS:
+            if wp.isnan(to.x):
+                return ZERO
+            if wp.isinf(to.x):
+                return far
+        near, off = rounded_cell(lowered, to)
+        cell = wp.vec2i(near.x - ROUNDING_BITS, near.y - ROUNDING_BITS)
+        if off > sure:
+            exact = end_point(from_pose, from_low, to, to_low, ZERO, guard)
+            cell = exact.cell
+        return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
 
     # Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
     # squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is
@@ -303,6 +357,7 @@ def make(name, flags):
         if QUICK:
             lowered = own - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, cols)
+            far = number_at(terms, 3)
         before = int(0)
         size = readings
         guards = int(0)
@@ -322,27 +377,26 @@ def make(name, flags):
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
                     for i in range(WHOLE_BLOCK):
-                        near, off = rounded_cell(lowered, point_at(point, begin + i))
+                        to = point_at(point, begin + i)
+                        value, off = quick_value(table, start_cell, lowered, to, far, rows, cols)
                         worst = wp.max(worst, off)
-                        total += number_at(table, table_cell(near, start_cell, rows, cols))
+                        total += value
                 else:
                     k = begin
                     while k < end:
-                        near, off = rounded_cell(lowered, point_at(point, k))
+                        to = point_at(point, k)
+                        value, off = quick_value(table, start_cell, lowered, to, far, rows, cols)
                         worst = wp.max(worst, off)
-                        total += number_at(table, table_cell(near, start_cell, rows, cols))
+                        total += value
                         k += 1
                 if worst > sure:
                     total = ZERO
                     k = begin
                     while k < end:
-                        near, off = rounded_cell(lowered, point_at(point, k))
-                        cell = wp.vec2i(near.x - ROUNDING_BITS, near.y - ROUNDING_BITS)
-                        if off > sure:
-                            to, to_low = point_at(point, k), point_at(point_low, k)
-                            exact = end_point(own, low, to, to_low, ZERO, own_guard)
-                            cell = exact.cell
-                        total += number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
+                        to, to_low = point_at(point, k), point_at(point_low, k)
+                        total += careful_value(
+                            table, origin, lowered, own, low, to, to_low, far, rows, cols, own_guard, sure
+                        )
                         k += 1
             else:
                 k = begin

@@ -187,8 +187,8 @@ def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(
     blocks = re.split(r"^\$L\w+:|\bbra\b.*", code.partition(".entry")[2], flags=re.MULTILINE)
     whole = max(blocks, key=len)
     loads = re.findall(r"\bld\.global\S*", whole)
-    # 16 readings, a point of two numbers and a cell each, by their addresses: no strides, no checks of signs.
-    assert sorted(loads) == ["ld.global.nc.f32"] * 16 + ["ld.global.nc.v2.f32"] * 16
+    # 16 readings, a point for two of them and a cell each, by their addresses: no strides, no checks of signs.
+    assert sorted(loads) == ["ld.global.nc.f32"] * 16 + ["ld.global.nc.v4.f32"] * 8
     assert not re.search(r"\bmul\.lo\.s64\b|\bshr\.s32\b", whole)
 
 

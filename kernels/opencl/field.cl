@@ -200,9 +200,20 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         real worst = 0;
         const real sure = sure_of(guard[block]);
         if (begin + BLOCK_TERMS <= size) {
+#if SCANS
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i)
                 sum += quick_value(table, from, lowered, point[begin + i], far, rows, cols, &worst);
+#else
+            // Points of one scan begin where two of them can be read at once.
+            global const real4 *two = (global const real4 *)(point + begin);
+#pragma unroll
+            for (int i = 0; i < BLOCK_TERMS / 2; ++i) {
+                const real4 both = two[i];
+                sum += quick_value(table, from, lowered, both.xy, far, rows, cols, &worst);
+                sum += quick_value(table, from, lowered, both.zw, far, rows, cols, &worst);
+            }
+#endif
         } else {
             for (int k = begin; k < end; ++k)
                 sum += quick_value(table, from, lowered, point[k], far, rows, cols, &worst);

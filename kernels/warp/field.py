@@ -136,8 +136,9 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     ZERO, HALF = real(0.0), real(0.5)
     # A constant for loops that Warp shall unroll.
-    WHOLE_BLOCK = 16
+    WHOLE_BLOCK, HALF_BLOCK = 16, 8
     number_at, cell_at, point_at, pose_at = reader(real), reader(wp.vec2i), reader(vec2), reader(vec4)
+    two_at = reader(vec2, 2)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
     # What one reading adds whose cell is found by rounding alone, and how far its place is off the cell's centre. A
@@ -376,11 +377,22 @@ def make(name, flags):
                 sure = sure_of(own_guard)
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
-                    for i in range(WHOLE_BLOCK):
-                        to = point_at(point, begin + i)
-                        value, off = quick_value(table, start_cell, lowered, to, far, rows, cols)
-                        worst = wp.max(worst, off)
-                        total += value
+                    if SCANS:
+                        for i in range(WHOLE_BLOCK):
+                            to = point_at(point, begin + i)
+                            value, off = quick_value(table, start_cell, lowered, to, far, rows, cols)
+                            worst = wp.max(worst, off)
+                            total += value
+                    else:
+                        # Points of one scan begin where two of them can be read at once.
+                        for i in range(HALF_BLOCK):
+                            both = two_at(point, begin + 2 * i)
+                            value, off = quick_value(table, start_cell, lowered, vec2(both.x, both.y), far, rows, cols)
+                            worst = wp.max(worst, off)
+                            total += value
+                            value, off = quick_value(table, start_cell, lowered, vec2(both.z, both.w), far, rows, cols)
+                            worst = wp.max(worst, off)
+                            total += value
                 else:
                     k = begin
                     while k < end:

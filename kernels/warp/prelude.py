@@ -45,16 +45,17 @@ _C_TYPES = {wp.float32: "float", wp.float64: "double", wp.int32: "int", wp.uint1
 
 
 @functools.cache
-def reader(dtype):
+def reader(dtype, count=1):
     """A function of (array, i) that reads numbers or vectors which the kernel does not write; i must not be negative.
 
     Arrays are contiguous and begin at multiples of 16 bytes. Warp's subscripts would add the length to a negative i,
     multiply by a stride of 64 bits and load vectors number by number: ten instructions in place of two on GPUs. There
     vectors are loaded whole; on processors they are not, whose compilers make no vectors of loops that load vectors.
+    With a count so many neighbours are read as one vector; i must be a multiple of it.
     """
-    length = getattr(dtype, "_length_", 1)
+    own = getattr(dtype, "_length_", 1)
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    one = _C_TYPES[scalar]
+    one, length = _C_TYPES[scalar], own * count
     if length == 1:
         loads, whole, single = [], "__ldg(values.data + i)", "values.data[i]"
     else:
@@ -66,12 +67,13 @@ def reader(dtype):
         ]
         numbers = ", ".join(f"part{k}.{name}" for k in range(length // width) for name in "xyzw"[:width])
         whole = f"wp::vec_t<{length}, {one}>({numbers})"
-        numbers = ", ".join(f"values.data[i].c[{k}]" for k in range(length))
+        numbers = ", ".join(f"values.data[i + {k // own}].c[{k % own}]" for k in range(length))
         single = f"wp::vec_t<{length}, {one}>({numbers})"
     lines = ["#if defined(__CUDA_ARCH__)", *loads, f"return {whole};", "#else", f"return {single};", "#endif", ""]
+    found = dtype if count == 1 else wp.types.vector(length=length, dtype=scalar)
 
     @wp.func_native("\n".join(lines))
-    def read(values: wp.array(dtype=dtype), i: wp.int32) -> dtype: ...
+    def read(values: wp.array(dtype=dtype), i: wp.int32) -> found: ...
 
     return read
 

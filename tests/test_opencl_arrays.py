@@ -243,6 +243,22 @@ def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch)
     assert names == ["place_inputs", "field_blocks", "sum_parts"]
 
 
+def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies, monkeypatch):
+    """It makes no buffer, and what it copies is poses and readings, results and the verdict on poses."""
+    for kind in MODELS:
+        call = kind(GRID, NEAR, backend=queue).bind(cloud(1).astype(np.float32), mixed(1))
+        call()
+        copies.clear()
+        with monkeypatch.context() as patch:
+            for name in ("compile", "empty", "blank"):
+                patch.setattr(as_gpu, name, None)
+            call()
+        (up, sent), (down, received) = copies
+        assert (up, down) == ("up", "down")
+        assert 8 * (3 * COUNT + BEAMS) <= sent < 8 * (3 * COUNT + BEAMS) + 2048
+        assert 4 * COUNT + 8 <= received < 4 * COUNT + 8 + 2048
+
+
 def test_only_launches_can_be_recorded(as_gpu):
     buffer = as_gpu.empty(4, np.dtype(np.float32))
     for run in (

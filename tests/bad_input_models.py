@@ -319,9 +319,10 @@ CASTER_CASES = [
     ),
 ]
 
+STRING_OR_QUEUE = "backend: must be a selection string or a queue of pyopencl"
 BACKEND_CASES = [
-    ("backend-none", beam(backend=None), TypeError, "backend: must be a selection string, got None"),
-    ("backend-number", field(backend=3), TypeError, "backend: must be a selection string, got 3"),
+    ("backend-none", beam(backend=None), TypeError, f"{STRING_OR_QUEUE}, got None"),
+    ("backend-number", field(backend=3), TypeError, f"{STRING_OR_QUEUE}, got 3"),
     ("backend-cuda", caster(backend="cuda"), ValueError, NO_SELECTION("cuda")),
     ("backend-empty", beam(backend=""), ValueError, NO_SELECTION("")),
     ("backend-capitals", beam(backend="OpenCL"), ValueError, NO_SELECTION("OpenCL")),

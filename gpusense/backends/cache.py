@@ -91,8 +91,10 @@ class ProgramCache:
 
 def _shrink(folder: Path) -> None:
     """Remove the least recently used entries beyond the bounds."""
-    entries = sorted(((e.stat().st_mtime, e.stat().st_size, e.path) for e in os.scandir(folder)
-                      if e.name.endswith(".bin")), reverse=True)  # fmt: skip
+    with os.scandir(folder) as found:
+        entries = sorted(
+            ((e.stat().st_mtime, e.stat().st_size, e.path) for e in found if e.name.endswith(".bin")), reverse=True
+        )
     total = 0
     for number, (_, size, path) in enumerate(entries, 1):
         total += size

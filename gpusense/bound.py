@@ -49,8 +49,9 @@ class BoundCall(ABC):
         """Score what the arrays hold now.
 
         Args:
-            stream: A stream of the GPU on which to work: of PyTorch, CuPy or Warp, or its address. None for Warp's
-                current stream of the device. Only for calls that do not wait.
+            stream: A stream of the GPU on which to work: of PyTorch, CuPy or Warp, or its address; with OpenCL a queue
+                of the model's context. None for Warp's current stream of the device, and the model's queue. Only for
+                calls that do not wait.
 
         Returns:
             ``out``; where ``waits`` is False, the device may yet be about to write it.

@@ -26,7 +26,7 @@ _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_H
 # One driver's own clearing hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
-# Bytes of copies to a GPU that take NVIDIA's driver 39 us in place of 22 where they are not waited for.
+# Bytes of copies to a GPU that take NVIDIA's driver nearly twice as long where they are not waited for.
 _SLOW = (64 << 10, 256 << 10)
 # Bytes: a cache line, and more than any type of a kernel asks for.
 _ALIGNMENT = 128

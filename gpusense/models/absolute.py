@@ -31,7 +31,7 @@ class PositionModel(PointModel):
 
     Args:
         parameters: Covariance, weights, region and where the antenna is.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
         temperature: In (0, 1]: multiplies log p, for errors that are not independent from fix to fix.
 
@@ -135,7 +135,7 @@ class HeadingModel(PointModel):
 
     Args:
         parameters: Kind, deviation or concentration, weights and offset.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of headings of many turns.
         temperature: In (0, 1]: multiplies log p, for errors that are not independent from reading to reading.
 

@@ -31,7 +31,7 @@ class BeaconModel(PointModel):
     Args:
         xy: (M, 2) places of the beacons in the world [m].
         parameters: Density, bias, weights and where the antenna is.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
         temperature: In (0, 1]: multiplies the sum over ranges. 1 is the plain product of densities.
 

@@ -48,7 +48,7 @@ class BeamModel(ScanModel):
             of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has its ``no_surface``, or
             those of the first range. Where ``z_max`` differs between them, max readings depend on the pose, and are
             impossible where it is 0. Needs an exact caster.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
             one of ``gpusense.casters`` with knobs of its own.

@@ -45,7 +45,7 @@ class BumperModel(PointModel):
         segments: None where the outline is one bumper. Of a circle: (B, 2) bearings from and to which bumpers reach
             counter-clockwise [rad]. Of a polygon: (P,) integers, the bumper 0 to B - 1 that the edge from each corner
             to the next is part of, or -1 for none.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.

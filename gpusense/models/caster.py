@@ -59,7 +59,7 @@ class RayCaster:
         range_max: Longest range [m], > 0; what a ray without a nearer obstacle returns.
         method: A name of ``RayCaster.methods()``, or one of ``gpusense.casters`` with knobs of its own, such as
             ``casters.March(tolerance=0.02)``.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.

@@ -46,7 +46,7 @@ class LikelihoodFieldModel(ScanModel):
         grid: The map.
         scanner: The scanner's geometry.
         parameters: Weights, deviation, cap and interpolation.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
         outside: ``"free"`` (the default), or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.

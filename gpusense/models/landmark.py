@@ -63,7 +63,7 @@ class LandmarkModel(PointModel):
     Args:
         landmarks: The map.
         parameters: Deviations, weights and limits of the sensor.
-        backend: Where it runs; see ``gpusense.devices()``.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         association: What a feature without a known landmark is: ``"nearest"`` is the likeliest landmark of each
             by itself (the book's maximum likelihood); ``"sum"`` sums over all landmarks, each with the prior 1 / M;

@@ -113,7 +113,8 @@ class ScanModel(ABC):
         """log p(z | x, m) of a scan for each particle, natural logarithm.
 
         Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy where they are: in host memory, or,
-        for ``warp:cuda`` backends, on the model's device. The result is then an array of the same library there.
+        for ``warp:cuda`` backends, on the model's device; those of pyopencl where the model's backend is their queue.
+        The result is then an array of the same library there.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
@@ -180,11 +181,11 @@ class ScanModel(ABC):
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
         """A call of ``log_likelihood`` with arrays that stay where they are, for filters that repeat it.
 
-        Every call reads what the arrays hold then, and writes ``out``. Where poses and ranges are on the model's device
-        (``warp:cuda``), a call is one start of a CUDA graph: it checks nothing, allocates nothing, copies nothing and
-        does not wait; ``check`` waits, and says whether a pose was not finite. NumPy arrays of few particles go to such
-        a device and back in the same graph; everywhere else it is the ordinary call, so that the same program runs on
-        every backend.
+        Every call reads what the arrays hold then, and writes ``out``. Where poses and ranges are on the model's GPU, a
+        call is one start of a CUDA graph, or three launches of OpenCL whose arguments stay set: it checks nothing,
+        allocates nothing, copies nothing and does not wait; ``check`` waits, and says whether a pose was not finite.
+        NumPy arrays of few particles go to a GPU and back with one copy each way; everywhere else it is the ordinary
+        call, so that the same program runs on every backend.
 
         Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
         repeat or, with a temperature below 1, no range depends on the pose: these agree to rounding.

@@ -243,6 +243,22 @@ def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch)
     assert names == ["place_inputs", "field_blocks", "sum_parts"]
 
 
+def test_a_bound_call_whose_device_is_gone(as_gpu, queue, there, monkeypatch):
+    import pyopencl as cl
+
+    call = FIELD(GRID, NEAR, backend=queue).bind(there(cloud(1)), there(mixed(1)))
+    expected = call().get()
+
+    def gone(*arguments):
+        raise cl.RuntimeError("clEnqueueNDRangeKernel failed: DEVICE_NOT_AVAILABLE")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cl, "enqueue_nd_range_kernel", gone)
+        with pytest.raises(RuntimeError, match="no longer available, make the model anew"):
+            call()
+    assert differing(call().get(), expected) == 0
+
+
 def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies, monkeypatch):
     """It makes no buffer, and what it copies is poses and readings, results and the verdict on poses."""
     for kind in MODELS:

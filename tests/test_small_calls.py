@@ -80,10 +80,10 @@ def test_what_is_started_sees_what_was_there(two_ways):
 
 def test_shared_memory_that_is_not_to_be_had(two_ways):
     """It is a MemoryError, and nothing else is said."""
-    from gpusense.backends._opencl import _driver_errors, _Shared
+    from gpusense.backends._opencl_memory import SharedBuffer, driver_errors
 
-    with pytest.raises(MemoryError, match="out of memory"), _driver_errors():
-        _Shared(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
+    with pytest.raises(MemoryError, match="out of memory"), driver_errors():
+        SharedBuffer(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
 
 
 # ---- CUDA: launches and copies that are gathered, and graphs; Warp's processor stands in for a GPU

@@ -73,18 +73,18 @@ class Watch:
         if device.info.backend == "opencl":
             from gpusense.backends import _opencl
 
-            class Counted(_opencl._Buffer):
+            class Counted(_opencl.DeviceBuffer):
                 def __init__(own, context, flags, size, **options):
                     self.allocated.append(size)
                     super().__init__(context, flags, size, **options)
 
-            class CountedShared(_opencl._Shared):
+            class CountedShared(_opencl.SharedBuffer):
                 def __init__(own, context, size, settle):
                     self.allocated.append(size)
                     super().__init__(context, size, settle)
 
-            monkeypatch.setattr(_opencl, "_Buffer", Counted)
-            monkeypatch.setattr(_opencl, "_Shared", CountedShared)
+            monkeypatch.setattr(_opencl, "DeviceBuffer", Counted)
+            monkeypatch.setattr(_opencl, "SharedBuffer", CountedShared)
         if device.info.backend == "warp":
             import warp as wp
 

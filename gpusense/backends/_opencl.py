@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import threading
 import warnings
 from collections.abc import Callable
@@ -13,23 +12,21 @@ import pyopencl as cl
 
 from gpusense.backends import _opencl_arrays, _pocl
 from gpusense.backends._opencl_devices import info_of, is_simulator, list_devices, shares_memory
+from gpusense.backends._opencl_launch import Launch
+from gpusense.backends._opencl_memory import DeviceBuffer, SharedBuffer, driver_errors
 from gpusense.backends._opencl_replay import KeptLaunch, Repeated
 from gpusense.backends.base import Adopted, BackendInfo, Buffer, Launcher, ProcessBound
 from gpusense.backends.cache import ProgramCache
-from gpusense.signatures import KERNELS, Kernel, lanes_of
+from gpusense.signatures import KERNELS
 from gpusense.sources import assemble, relevant, uses_double, with_places
 
 __all__ = ["OpenCLBackend", "backend_of", "is_simulator", "list_devices"]
 
-_LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
-_OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
 # One driver's own clearing hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
 # Bytes of copies to a GPU that take NVIDIA's driver nearly twice as long where they are not waited for.
 _SLOW = (64 << 10, 256 << 10)
-# Bytes: a cache line, and more than any type of a kernel asks for.
-_ALIGNMENT = 128
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
@@ -40,28 +37,6 @@ def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
     takes three times as long as all it does unasked.
     """
     return None if _pocl.is_pocl(device) else ProgramCache(info)
-
-
-class _Buffer(cl.Buffer):
-    """A buffer in the device's memory."""
-
-
-class _Shared(cl.SVMAllocation):
-    """Memory that host and device share."""
-
-    def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
-        flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
-        super().__init__(context, size, _ALIGNMENT, flags)
-        # By address, since a view of this object that it keeps would be a cycle.
-        self.bytes = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
-        self._settle = settle
-
-    def __del__(self) -> None:
-        # Unlike a buffer, the driver does not keep it for what was started. To free it through the queue, pyopencl's
-        # other way, ended in a corrupted heap with PoCL 3.
-        # What could not be made has nothing to wait for.
-        if (settle := getattr(self, "_settle", None)) is not None:
-            settle()
 
 
 class OpenCLBackend(ProcessBound):
@@ -85,7 +60,7 @@ class OpenCLBackend(ProcessBound):
         # The launches that a thread records, if it does.
         self._thread = threading.local()
         self.alignment = _opencl_arrays.alignment_of(device)
-        self._launchers: dict[tuple[str, frozenset[str]], _Launch] = {}
+        self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
         self._cache = _program_cache(info, device)
         # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
@@ -104,11 +79,11 @@ class OpenCLBackend(ProcessBound):
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             array = np.ascontiguousarray(array)
-            if isinstance(buffer, _Shared):
+            if isinstance(buffer, SharedBuffer):
                 self._settle()
                 buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
                 return buffer
-            with _driver_errors():
+            with driver_errors():
                 blocking = wait or _SLOW[0] < array.nbytes <= _SLOW[1]
                 cl.enqueue_copy(self._queue, buffer, array, is_blocking=blocking)
         return buffer
@@ -117,13 +92,13 @@ class OpenCLBackend(ProcessBound):
         """See Backend.empty."""
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         self._check_size(size)
-        with _driver_errors():
+        with driver_errors():
             if self._shared:
-                shared = _Shared(self._context, size, self._settle)
+                shared = SharedBuffer(self._context, size, self._settle)
                 if zero:
                     shared.bytes[:] = 0
                 return shared
-            buffer = _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+            buffer = DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
             if zero:
                 self._clear(buffer, size)
         return buffer
@@ -147,11 +122,11 @@ class OpenCLBackend(ProcessBound):
         """See Backend.download."""
         self._check_recording()
         if out.size:
-            if isinstance(buffer, _Shared):
+            if isinstance(buffer, SharedBuffer):
                 self._settle()
                 out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
                 return out
-            with _driver_errors():
+            with driver_errors():
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
 
@@ -168,15 +143,15 @@ class OpenCLBackend(ProcessBound):
         """See Sharing.blank; not memory that is shared, of which arrays may not outlive the backend's launches."""
         size = max(count, 1) * np.dtype(dtype).itemsize
         self._check_size(size)
-        with _driver_errors():
-            return _Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+        with driver_errors():
+            return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
         """See Sharing.copy."""
         if not size:
             return
-        with _driver_errors():
-            if isinstance(target, _Shared):
+        with driver_errors():
+            if isinstance(target, SharedBuffer):
                 self._settle()
                 cl.enqueue_copy(self._queue, target.bytes[to : to + size], source, src_offset=begin)
             else:
@@ -213,7 +188,7 @@ class OpenCLBackend(ProcessBound):
         """See Backend.synchronize."""
         with self._count:
             queued = self._queued
-        with _driver_errors():
+        with driver_errors():
             self._queue.finish()
         with self._count:
             self._ended = max(self._ended, queued)
@@ -240,13 +215,13 @@ class OpenCLBackend(ProcessBound):
         with self._count:
             self._queued += launches
 
-    def _launcher(self, kernel: str, flags: frozenset[str]) -> _Launch:
+    def _launcher(self, kernel: str, flags: frozenset[str]) -> Launch:
         row = KERNELS[kernel]
         flags = relevant(row.file, flags)
         program = self._programs.get((row.file, flags))
         if program is None:
             program = self._programs[row.file, flags] = self._build(row.file, flags)
-        return _Launch(self, cl.Kernel(program, kernel), row, flags)
+        return Launch(self, cl.Kernel(program, kernel), row, flags)
 
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:
@@ -284,36 +259,6 @@ class OpenCLBackend(ProcessBound):
             return program.build(self.options, [self._device])
 
 
-class _Launch:
-    """Binds arguments by the signature table and enqueues."""
-
-    def __init__(self, backend: OpenCLBackend, kernel: cl.Kernel, row: Kernel, flags: frozenset[str]) -> None:
-        self._backend, self._kernel = backend, kernel
-        self._lanes, self._group = (1, row.group)
-        if "WIDE" in flags:
-            self._lanes, self._group = (lanes_of(flags) if row.wide else 1), row.wide_group
-        self._lock = threading.Lock()
-        real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
-        # Told the types, pyopencl sets all arguments in 1 us; a single number without takes it 6 us.
-        self._types = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
-        kernel.set_arg_types(self._types)
-
-    def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
-        group = (self._group, *(1 for _ in size[1:]))
-        rounded = (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:])
-        # Arguments belong to the kernel object, so two threads must not interleave here.
-        kept = self._backend.recording()
-        if kept is not None:
-            own = cl.Kernel(self._kernel.program, self._kernel.function_name)
-            own.set_arg_types(self._types)
-            own.set_args(*arguments)
-            kept.append(KeptLaunch(own, rounded, group, arguments))
-            return
-        with self._lock, _driver_errors():
-            self._kernel.set_args(*arguments)
-            self._backend.enqueue(self._kernel, rounded, group)
-
-
 def backend_of(queue: cl.CommandQueue) -> OpenCLBackend:
     """A backend that works on a user's queue, and so on the arrays that were made with it.
 
@@ -321,18 +266,3 @@ def backend_of(queue: cl.CommandQueue) -> OpenCLBackend:
         ValueError: the queue does not do commands in their order.
     """
     return OpenCLBackend(info_of(queue.device), queue.device, _opencl_arrays.queue_of(queue))
-
-
-class _driver_errors:
-    """Turns the driver's codes into MemoryError, or a RuntimeError that says the device is gone."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if not isinstance(error, cl.Error):
-            return
-        if any(code in str(error) for code in _OUT_OF_MEMORY):
-            raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
-        if any(code in str(error) for code in _LOST):
-            raise RuntimeError(f"the OpenCL device is no longer available, make the model anew: {error}") from error

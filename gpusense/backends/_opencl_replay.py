@@ -9,6 +9,8 @@ from typing import Any
 
 import pyopencl as cl
 
+from gpusense.backends._opencl_memory import driver_errors
+
 
 @dataclass(frozen=True)
 class KeptLaunch:
@@ -33,7 +35,7 @@ class Repeated:
         """See Replay.__call__."""
         queue = self._queue if stream is None else self._checked(stream)
         # Two threads' launches must not be mixed.
-        with self._lock:
+        with self._lock, driver_errors():
             if stream is not None and queue not in self._used:
                 self._used.append(queue)
             for launch in self._launches:
@@ -51,8 +53,9 @@ class Repeated:
         """See Replay.wait."""
         with self._lock:
             used, self._used = [self._queue, *self._used], []
-        for queue in used:
-            queue.finish()
+        with driver_errors():
+            for queue in used:
+                queue.finish()
 
     def _checked(self, stream: Any) -> cl.CommandQueue:
         if not isinstance(stream, cl.CommandQueue) or stream.context != self._queue.context:

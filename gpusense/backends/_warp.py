@@ -6,12 +6,8 @@ kernels unpack ``wp.tid()`` in that order.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-import os
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,20 +19,17 @@ from gpusense.backends._warp_arrays import adopted
 from gpusense.backends._warp_launch import SCALARS, Launch, LaunchStep, host_view
 from gpusense.backends._warp_pieces import shared
 from gpusense.backends._warp_queue import Graphs, Group, Queue, Recording, Repeated, Step
+from gpusense.backends._warp_settings import LOCK, initialize, settings
 from gpusense.backends.base import Adopted, BackendInfo, Launcher, ProcessBound
-from gpusense.backends.cache import cache_folder
 from gpusense.signatures import KERNELS, Kernel
 from gpusense.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
-_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
-# Guards Warp's settings, which belong to the process.
-_LOCK = threading.RLock()
 
 
 def list_devices() -> list[tuple[BackendInfo, str]]:
     """Warp's devices of this machine and their names within Warp."""
-    _initialize()
+    initialize()
     return [(_describe(device), device.alias) for device in wp.get_devices()]
 
 
@@ -65,7 +58,7 @@ class WarpBackend(ProcessBound):
 
     def __init__(self, info: BackendInfo, device: str) -> None:
         super().__init__()
-        _initialize()
+        initialize()
         self.info = info
         self._device = wp.get_device(device)
         self._gathers = self._device.is_cuda
@@ -163,7 +156,7 @@ class WarpBackend(ProcessBound):
         if launcher is None:
             row = KERNELS[kernel]
             key = (kernel, relevant(row.file, flags))
-            with _LOCK:
+            with LOCK:
                 launcher = self._launchers.get(key)
                 if launcher is None:
                     launcher = self._launchers[key] = self._build(row, *key)
@@ -267,7 +260,7 @@ class WarpBackend(ProcessBound):
 
     def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launcher:
         group = row.group if self._device.is_cuda else 1
-        with _settings():
+        with settings():
             made = warp_module(row.file).make(kernel, flags)
             try:
                 wp.load_module(made.module, device=self._device, block_dim=group)
@@ -275,52 +268,3 @@ class WarpBackend(ProcessBound):
                 raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
         launch = Launch(self._device, made, row, group, self.gathering)
         return launch if self._device.is_cuda else shared(launch, row)
-
-
-@functools.cache
-def _initialize() -> None:
-    """Start Warp without a word; that there is no CUDA driver is told by the list of devices."""
-    with _settings(), _filtered_stderr():
-        wp.init()
-
-
-@contextlib.contextmanager
-def _settings() -> Iterator[None]:
-    """Warp without its greeting and progress, and without its cache where caches are off; then as it was before."""
-    with _LOCK, contextlib.ExitStack() as stack:
-        if hasattr(wp.config, "log_level"):
-            changed: dict[str, Any] = {"log_level": max(wp.config.log_level, wp.LOG_WARNING)}
-        else:
-            changed = {"quiet": True}
-        if cache_folder() is None and wp.config.kernel_cache_dir is not None:
-            folder = tempfile.TemporaryDirectory(prefix="gpusense_", ignore_cleanup_errors=True)
-            changed |= {"cache_kernels": False, "kernel_cache_dir": stack.enter_context(folder)}
-        before = {name: getattr(wp.config, name) for name in changed}
-        try:
-            for name, value in changed.items():
-                setattr(wp.config, name, value)
-            yield
-        finally:
-            for name, value in before.items():
-                setattr(wp.config, name, value)
-
-
-@contextlib.contextmanager
-def _filtered_stderr() -> Iterator[None]:
-    """Hold back what native code writes to standard error, and pass on all but the absence of a CUDA driver."""
-    try:
-        saved = os.dup(2)
-    except OSError:
-        yield
-        return
-    with tempfile.TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)
-            held.seek(0)
-            for line in held:
-                if _NO_DRIVER not in line:
-                    os.write(2, line)

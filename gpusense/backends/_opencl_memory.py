@@ -1,0 +1,51 @@
+"""Memory of an OpenCL device, and what its driver says where something fails."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+_LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
+_OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+# Bytes: a cache line, and more than any type of a kernel asks for.
+_ALIGNMENT = 128
+
+
+class DeviceBuffer(cl.Buffer):
+    """A buffer in the device's memory."""
+
+
+class SharedBuffer(cl.SVMAllocation):
+    """Memory that host and device share."""
+
+    def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
+        flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
+        super().__init__(context, size, _ALIGNMENT, flags)
+        # By address, since a view of this object that it keeps would be a cycle.
+        self.bytes = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
+        self._settle = settle
+
+    def __del__(self) -> None:
+        # Unlike a buffer, the driver does not keep it for what was started. To free it through the queue, pyopencl's
+        # other way, ended in a corrupted heap with PoCL 3.
+        # What could not be made has nothing to wait for.
+        if (settle := getattr(self, "_settle", None)) is not None:
+            settle()
+
+
+class driver_errors:
+    """Turns the driver's codes into MemoryError, or a RuntimeError that says the device is gone."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if not isinstance(error, cl.Error):
+            return
+        if any(code in str(error) for code in _OUT_OF_MEMORY):
+            raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
+        if any(code in str(error) for code in _LOST):
+            raise RuntimeError(f"the OpenCL device is no longer available, make the model anew: {error}") from error

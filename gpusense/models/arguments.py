@@ -1,4 +1,4 @@
-"""Arguments that the models share: the map against the range, and the precision."""
+"""Arguments of models that are checked against each other: map and range, precision and device, tables and options."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import numpy as np
 
 from gpusense import _checks
 from gpusense.backends import Backend
+from gpusense.discrete import DiscreteBeamModel
 from gpusense.grid import OccupancyGrid
+from gpusense.scanner import Scanner
 
 # Up to this many cells float32 knows the place of a crossing to 5/16 of a cell; from half a cell on, neighbouring
 # boundaries could be confused.
@@ -38,3 +40,17 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     if dtype == np.float64 and not backend.info.float64:
         raise ValueError(f"precision: must be 'float32' on {backend.info.name}, which has no float64, got 'float64'")
     return dtype
+
+
+def check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:
+    """See that nothing contradicts a discrete model.
+
+    Raises:
+        ValueError: the scanner has another range_max, or an option is given that is for the mixture.
+    """
+    for name, value in (("compat", compat), ("sensor_table", sensor_table)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {_checks.show(value)}")
+    if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
+        rule = f"must have the scanner's range_max = {scanner.range_max}"
+        raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

@@ -15,18 +15,18 @@ from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.bound import PlacedScan, Scene, Scorer
 from gpusense.casters import Caster
-from gpusense.cloud import LEAST_ORDERED, Cloud, Placed, all_within, ordered, stranded, tiles_of
+from gpusense.cloud import Cloud, Placed, all_within, ordered, stranded, tiles_of
 from gpusense.cones import bins_of, cones_of, require_exact
 from gpusense.discrete import DiscreteBeamModel
 from gpusense.frames import ray_vectors
 from gpusense.grid import OccupancyGrid
 from gpusense.lanes import widened
+from gpusense.models.arguments import check_discrete
 from gpusense.models.beam_mixture import mixture_of, peer_mixture, tabulated
+from gpusense.models.beam_plan import title_and_omissions
 from gpusense.models.caster import MapCaster
 from gpusense.models.scan_model import ScanModel
-from gpusense.models.terms import HIGH_PEAK
 from gpusense.parameters import BeamParameters, IncidenceParameters
-from gpusense.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.reference.error_free import BLOCK_TERMS, strands_in
 from gpusense.region import Region
 from gpusense.scan import Beams, PreparedScan
@@ -90,7 +90,7 @@ class BeamModel(ScanModel):
         default = BeamParameters() if peer is None else peer.beam
         self._discrete = parameters if isinstance(parameters, DiscreteBeamModel) else None
         if self._discrete is not None:
-            _check_discrete(self._discrete, scanner, compat, sensor_table)
+            check_discrete(self._discrete, scanner, compat, sensor_table)
         # Of the mixture nothing is used where there is a discrete model.
         own: object = default if parameters is None or self._discrete is not None else parameters
         if not isinstance(own, BeamParameters):
@@ -216,61 +216,7 @@ class BeamModel(ScanModel):
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
-        costs = (
-            ("z_hit", "1 exp, 2 erf and 1 division per particle-beam"),
-            ("z_short", "1 exp, 1 tanh and 2 divisions per particle-beam"),
-            ("z_rand", "1 addition per particle-beam"),
-            ("z_max", "max readings altogether"),
-        )
-        components = [(name, max(getattr(p, name) for p in self._kinds), cost) for name, cost in costs]
-        components = components if self._discrete is None else []
-        omissions = scene_omissions(
-            components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
-            precision=self.precision, ring=self._caster.method.ring,
-        )  # fmt: skip
-        scan = self._last_scan
-        if scan is not None and scan.shared:
-            spared = len(scan.readings) - len(scan.rays)
-            omissions.append(
-                Omission(
-                    "repeated bearings",
-                    f"{len(scan.readings)} readings lie on {len(scan.rays)} rays",
-                    f"{share(spared, len(scan.readings))} of the ray casts",
-                )
-            )
-        if self._last_code and "ORIGINS_OUTSIDE" not in self._last_code:
-            omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray"))
-        if self._last_code and "LINEAR" in self._last_code and self._discrete is None:
-            omissions.append(
-                Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
-            )
-        if self._peer is not None:
-            omissions.append(Omission("normalised density", f"compat='{self.compat}' sums cubes", "the likelihood"))
-        elif self._discrete is not None:
-            steps = f"{self._cells + 1} x {self._cells + 1} steps of readings and expected ranges, no return included"
-            omissions.append(Omission("mixture", f"the model is a table of {steps}", "all but 1 look-up a beam"))
-        elif self.sensor_table is not None:
-            why = f"log p is tabulated over {self._cells} x {self._cells + 1} bins of readings and expected ranges"
-            omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
-        elif "SHARP" not in self._components:
-            omissions.append(
-                Omission(
-                    "exponents in two parts", f"the hit density's peak is at most {HIGH_PEAK:g} / m", "37 operations"
-                )
-            )
-        omissions += launch_omissions(self._last_code, LEAST_ORDERED if self.device.kind == "gpu" else None)
-        if (far := self._caster.omission()) is not None:
-            omissions.append(far)
-        caster = self._caster.method
-        how = "" if caster.name == "exact" else f", ranges by {caster}"
-        how += self._cones.words(self.scanner.critical_incidence)
-        if self.incidence_parameters is not None:
-            how += f", parameters for {len(self.incidence_parameters.parameters)} ranges of the angle of incidence"
-            how += " and for none" if self.incidence_parameters.no_surface is not None else ""
-            how += " (max readings depend on it)" if self._max_depends else ""
-        name = "beam model" if self._discrete is None else "discrete beam model"
-        title = f"{name}{self._peer_note()}{how}, {self.precision}, {self.device.selection} ({self.device.name})"
-        return str(self._plan(title, omissions))
+        return str(self._plan(*title_and_omissions(self)))
 
     def _mixture(self) -> tuple[frozenset[str], np.ndarray]:
         """Flags of the components, and their numbers."""
@@ -410,17 +356,3 @@ class BeamModel(ScanModel):
             )  # fmt: skip
 
         return score
-
-
-def _check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:
-    """See that nothing contradicts a discrete model.
-
-    Raises:
-        ValueError: the scanner has another range_max, or an option is given that is for the mixture.
-    """
-    for name, value in (("compat", compat), ("sensor_table", sensor_table)):
-        if value is not None:
-            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {_checks.show(value)}")
-    if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
-        rule = f"must have the scanner's range_max = {scanner.range_max}"
-        raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

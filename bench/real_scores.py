@@ -12,19 +12,18 @@ every device but NumPy, and the first of them on NumPy too.
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import shlex
 import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from speed import publish
+
 import gpusense as gs
 from gpusense import selftest
 from gpusense.backends import get_backend
-from gpusense.commands._common import machine
 from gpusense.commands.score import summary
 from gpusense.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, logged_scans, score_log
 
@@ -61,7 +60,7 @@ def differences(data: Path, name: str) -> list[dict[str, Any]]:
     scene = selftest.scene_in(grid, scanner)
     rows: dict[tuple[str, str], dict[str, Any]] = {}
     for check in selftest.run(selftest.chosen_backends(), scene):
-        if check.right in ("SciPy", "specialize=False", "float64"):
+        if check.right in ("SciPy", "specialize=False", "per_beam=True", "float64"):
             continue
         shape = f"{grid.shape[0]} x {grid.shape[1]}"
         row = rows.setdefault((check.left, check.right), {
@@ -154,6 +153,7 @@ def main() -> int:
     parser.add_argument("--numpy-scans", type=int, default=3, help="so many of them on NumPy too")
     parser.add_argument("--particles", type=int, default=20_000)
     parser.add_argument("--temperature", type=float, default=1.0)
+    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
     parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
     arguments = parser.parse_args()
     if arguments.data is None:
@@ -167,20 +167,8 @@ def main() -> int:
         for kind in arguments.model or ("beam", "field")
     ]
     devices = [asdict(get_backend(d.selection).info) for d in gs.devices() if d.available and d.kind != "simulator"]
-    # The folder of the data is no one's business.
-    command = shlex.join(
-        ["python", "bench/real_scores.py", *(a if a != str(arguments.data) else "DATA" for a in sys.argv[1:])]
-    )
-    report = {
-        "command": command, "machine": machine(), "devices": devices, "seconds": time.perf_counter() - begin,
-        "maps": maps, "logs": logs,
-    }  # fmt: skip
-    text = f"{to_markdown(maps, logs)}\n\nMachine: {machine()}. Command: `{command}`.\n"
-    print(text)
-    if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(text)
+    report = {"devices": devices, "seconds": time.perf_counter() - begin, "maps": maps, "logs": logs}
+    publish("real_scores.py", arguments, to_markdown(maps, logs), report)
     breached = any(row["breaches"] for row in maps)
     return 1 if breached or not all(a["same_ranking"] for log in logs for a in log["agreement"]) else 0
 

@@ -302,3 +302,15 @@ def test_stretches_of_machine_code_end_at_labels_and_branches(
 """
     found = importlib.import_module("cuda_code").stretches(code)
     assert [names for names in found if names] == [["LDC", "BRA"], ["FADD", "FMUL"], ["EXIT"]]
+
+
+def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
+    """A recorded map, on every device that is here."""
+    arguments = ["--data", str(data_dir), "--map", "columbia", "--log", "none"]
+    report = run_script("real_scores.py", *arguments, output=tmp_path / "real")
+    rows = report["maps"]
+    count = len({row["left"] for row in rows if row["right"] == "truth"})
+    assert count >= 2 and len(rows) == count + count * (count - 1) // 2
+    for row in rows:
+        assert row["breaches"] == 0 and "float32 beam model, scans" in row["differences"]
+    assert str(data_dir) not in str(report)

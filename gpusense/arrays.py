@@ -85,6 +85,8 @@ def adopt_poses(
         ValueError: another shape, not C-contiguous, or of use only as a copy where that must not be.
     """
     found = _adopt(array, backend, name, in_place=in_place)
+    if not backend.info.float64:
+        raise TypeError(f"{name}: must be in host memory on {backend.info.name}, which has no float64 to place them")
     wanted = ("S", "N", 3) if several else ("N", 3)
     if len(found.shape) != len(wanted) or found.shape[-1] != 3:
         raise ValueError(f"{name}: shape must be {shape_text(wanted)}, got {shape_text(found.shape)}")
@@ -107,8 +109,9 @@ def adopt_readings(array: object, backend: Backend, beams: int, *, in_place: boo
 
 
 def _check_numbers(found: Adopted, name: str) -> None:
+    dtype = found.dtype.name if found.dtype.isnative else found.dtype.str
     if found.dtype not in (np.float32, np.float64):
-        raise TypeError(f"{name}: must hold float32 or float64, got {found.dtype.name}")
+        raise TypeError(f"{name}: must hold float32 or float64, got {dtype}")
     if not found.contiguous:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {found.strides}")
 

@@ -122,7 +122,7 @@ class _StagedCall(BoundCall):
     """A call of few particles: what it is given goes to the device as one array, and what it finds comes back as one.
 
     A copy of few numbers takes as long as a launch. Poses and readings are float64 on the device, which keeps float32
-    as it is; limits of readings are those of the host, whatever their precision.
+    as it is; limits of readings are rounded to the readings' own precision, as on the host.
     """
 
     waits = True
@@ -138,7 +138,7 @@ class _StagedCall(BoundCall):
         found, verdict = self._outputs.parts
         self._device = DeviceCall(
             model, backend.lend(poses, (count, 3), _DOUBLE), backend.lend(ranges, (readings,), _DOUBLE),
-            backend.lend(found, (count,), model._real), verdict,
+            backend.lend(found, (count,), model._real), verdict, self._ranges.dtype,
         )  # fmt: skip
         self._space, self._lock = Workspace(backend), threading.Lock()
 
@@ -151,12 +151,16 @@ class _StagedCall(BoundCall):
         with self._lock:
             poses.reshape(self._poses.shape)[...] = self._poses
             ranges[...] = self._ranges
-            with self._space:
-                backend.upload(given.host, given.there, wait=False)
-                self._device.begin()
-                backend.download(outputs.there, outputs.host, wait=not self._gathers())
-                if self._gathers():
-                    backend.synchronize()
+            try:
+                with self._space:
+                    backend.upload(given.host, given.there, wait=False)
+                    self._device.begin()
+                    backend.download(outputs.there, outputs.host, wait=not self._gathers())
+                    if self._gathers():
+                        backend.synchronize()
+            except MemoryError:
+                # The whole table of a map that has changed; the ordinary call needs but a part of it.
+                return self._host()
             if not verdict[0]:
                 self.out[...] = found
                 return self.out

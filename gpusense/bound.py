@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from gpusense import arrays
-from gpusense.backends.base import Buffer, Gathering, Recording
+from gpusense.backends.base import Buffer, Gathering, Recording, Replay, Sharing
 from gpusense.cloud import Cloud, Placed, Readings, finish
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
@@ -124,8 +124,17 @@ class DeviceCall(BoundCall):
     waits = False
     # Launches that were gathered once.
     _kept: object | None = None
+    _replay: Replay | None = None
 
-    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any, verdict: Buffer | None = None) -> None:
+    def __init__(
+        self,
+        model: ScanModel,
+        poses: Any,
+        ranges: Any,
+        out: Any,
+        verdict: Buffer | None = None,
+        limits: np.dtype | None = None,
+    ) -> None:
         backend, real = model._backend, model._real
         self._model, self._backend, self._real = model, backend, real
         self._cloud = Cloud(poses, backend, in_place=True)
@@ -143,21 +152,25 @@ class DeviceCall(BoundCall):
             self._space.share("verdict", verdict, 2, _INT)
         self._none = backend.upload(np.zeros(1, _INT))
         self._scene = model._bound_scene()
-        self._scan, self._readings, self._fixed = self._placing_of(found.buffer, found.dtype)
+        self._scan, self._readings, self._fixed = self._placing_of(
+            found.buffer, found.dtype, found.dtype if limits is None else limits
+        )
+        # Pieces begin where the device can.
+        whole = max(cast(Sharing, backend).alignment // _INT.itemsize, 1)
+        self._chunk = -(-model._bound_chunk(self._scan.places) // whole) * whole
         self._counts = backend.upload(np.array([self._scan.parts], _INT))
         self._record()
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""
-        self._look_at_map()
-        self._replay(stream)
+        self._known()(stream)
         return self.out
 
     def begin(self) -> None:
         """Start a call's launches, or gather them where this thread gathers what it starts."""
-        self._look_at_map()
+        replay = self._known()
         if not hasattr(self._backend, "gather"):
-            self._replay()
+            replay()
             return
         gathering = cast(Gathering, self._backend)
         if self._kept is not None:
@@ -167,18 +180,24 @@ class DeviceCall(BoundCall):
         self._start(*self._scored)
         self._kept = gathering.kept(mark)
 
-    def _look_at_map(self) -> None:
-        if self._scene.map.version != self._version:
-            # The map has changed, or its table is another one.
+    def _known(self) -> Replay:
+        """The launches for the map as it is."""
+        cast(Any, self._backend).check_process()
+        if self._replay is not None and self._scene.map.version == self._version:
+            return self._replay
+        # The map has changed, or its table is another one.
+        if self._replay is not None:
             self._replay.wait()
-            self._record()
+        return self._record()
 
     def check(self) -> None:
         """See BoundCall.check."""
-        self._replay.wait()
+        cast(Any, self._backend).check_process()
+        if self._replay is not None:
+            self._replay.wait()
         finish(self._space, on_device=True)
 
-    def _placing_of(self, ranges: Buffer, dtype: np.dtype) -> tuple[PlacedScan, Readings, bool]:
+    def _placing_of(self, ranges: Buffer, dtype: np.dtype, limits: np.dtype) -> tuple[PlacedScan, Readings, bool]:
         """Where readings are placed, what does that, and whether those without a place add something."""
         model, backend, real, space = self._model, self._backend, self._real, self._space
         z_max, scanner, end_points = model._z_max, model.scanner, model._end_points
@@ -190,10 +209,10 @@ class DeviceCall(BoundCall):
             chosen = min(int(model.beams), chosen)
         places = chosen if model._specialize else len(beams)
         with np.errstate(over="ignore"):
-            nearest, farthest = dtype.type(scanner.range_min), dtype.type(scanner.range_max)
+            nearest, farthest = limits.type(scanner.range_min), limits.type(scanner.range_max)
         if scanner.range_min > 0:
             # A reading of 0 is none, even where the limit is rounded to 0.
-            nearest = max(nearest, np.finfo(dtype).smallest_subnormal)
+            nearest = max(nearest, np.finfo(limits).smallest_subnormal)
         kind = MAX_PLACED if model._max_depends or not model._specialize else MAX_FIXED
         kind = kind if z_max > 0 else MAX_LEFT_OUT
         possible = not model._impossible()
@@ -223,19 +242,21 @@ class DeviceCall(BoundCall):
         head = -(-max(len(beams), 1) // _GROUP) * _GROUP
         return scan, Readings(head, frozenset(flags), buffers, numbers), kind == MAX_FIXED or not possible
 
-    def _record(self) -> None:
+    def _record(self) -> Replay:
         """Make the table where there is none, and keep the launches of a call; nothing is started."""
         model, scene, cloud = self._model, self._scene, self._cloud
         with model._lock:
             # Kept, since another call of the model may need another table; the last one first makes room.
-            self._table = None
+            self._table, self._replay, self._kept = None, None, None
             self._table, region, _ = cloud.ensure(scene.map, 0, cloud.count)
             score = model._bound_scorer(self._table, region)
             self._version = scene.map.version
-            self._scored, self._kept = (score, region), None
-            self._replay = cast(Recording, self._backend).record(lambda: self._start(score, region))
+            self._scored = (score, region)
+            replay = cast(Recording, self._backend).record(lambda: self._start(score, region))
         # Other streams may come first to what was made just now.
         self._backend.synchronize()
+        self._replay = replay
+        return replay
 
     def _start(self, score: Scorer, region: Region) -> None:
         """All launches of a call."""
@@ -243,7 +264,7 @@ class DeviceCall(BoundCall):
         flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
         # One of several scans has a fixed term on the device.
         flags |= {"SCANS"} if self._fixed else set()
-        counts, chunk = self._counts, model._bound_chunk(scan.places)
+        counts, chunk = self._counts, self._chunk
         frame = (region, model.grid, model.scanner.mount)
         readings: Readings | None = self._readings
         for begin in range(0, cloud.count, chunk):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import cast
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer, Gathering
+from gpusense.backends.base import Backend, Buffer, Gathering, Sharing
 
 # Calls whose launches are kept.
 _MOST_KEPT = 64
@@ -35,9 +36,16 @@ class Workspace:
             self._gathering.gather()
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, *error: object) -> None:
+        if kind is not None:
+            self.abandon()
         if self._gathering is not None:
             self._gathering.scatter()
+
+    def abandon(self) -> None:
+        """After an error: what it left of the verdict on poses is not the next call's."""
+        if self._buffers.pop(("verdict", np.dtype(np.int32)), None) is not None:
+            self._forget()
 
     def start(self) -> None:
         """Let the device begin with what the call has started so far."""
@@ -74,15 +82,18 @@ class Workspace:
                 self._kept[key] = kept
         self._begun = None
 
-    def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """A buffer of at least ``count`` numbers; what it held is lost. A new one is cleared where asked."""
+    def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
+        """A buffer of at least ``count`` numbers; what it held is lost. A new one may be cleared, or one to be lent."""
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
             self._forget()
             self._buffers.pop((name, dtype), None)
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
-            buffer = self._backend.empty(capacity, dtype, zero=zero)
+            if lent:
+                buffer = cast(Sharing, self._backend).blank(capacity, dtype)
+            else:
+                buffer = self._backend.empty(capacity, dtype, zero=zero)
             self._buffers[name, dtype] = (capacity, buffer)
         return buffer
 
@@ -119,6 +130,25 @@ class Workspace:
             ]
             self._parts[key] = parts
         return parts
+
+    @contextmanager
+    def result(
+        self, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype
+    ) -> Iterator[Buffer]:
+        """Where what is started within writes some numbers of a flat host array, or of a buffer that can be lent."""
+        if isinstance(target, np.ndarray):
+            buffer = self.empty(name, count, dtype)
+            yield buffer
+            self.download(buffer, target[first : first + count])
+            return
+        sharing, begin = cast(Sharing, self._backend), first * dtype.itemsize
+        if begin % sharing.alignment == 0:
+            yield self._backend.part(target, first, count, dtype)
+            return
+        # The device cannot begin there.
+        buffer = self.empty(f"{name} lent", count, dtype, lent=True)
+        yield buffer
+        sharing.copy(buffer, target, count * dtype.itemsize, to=begin)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""

@@ -318,6 +318,26 @@ def test_short_calls_of_the_host_are_one_graph(case, gathering, monkeypatch):
     assert differing(call(), model.log_likelihood(poses, ranges)) == 0
 
 
+# Limits that float32 rounds, one up and one down, and readings beside them.
+ROUNDED = gs.Scanner(np.linspace(-3, 3, BEAMS), 5.6, 0.06)
+BESIDE = np.array(
+    [5.6, 0.06, np.nextafter(np.float32(5.6), np.float32(0)), 2.0, np.nextafter(np.float32(0.06), np.float32(0))]
+)
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", MODELS)
+def test_limits_are_rounded_as_readings_are(kind, real, gathering):
+    """A driver's largest float32 reading is a max reading, however it gets to the device."""
+    parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
+    model = kind(GRID, ROUNDED, parameters, backend=gathering[0])
+    poses, ranges = cloud(1), np.resize(BESIDE, BEAMS).astype(real)
+    expected = model.log_likelihood(to_device(poses), ranges).numpy()
+    assert differing(model.bind(to_device(poses), to_device(ranges))().numpy(), expected) == 0
+    call = model.bind(poses, ranges)
+    assert type(call) is binding._StagedCall and differing(call(), model.log_likelihood(poses, ranges)) == 0
+
+
 def test_what_is_not_short_takes_the_ordinary_way(gathering, monkeypatch):
     device, _ = gathering
     model = FIELD(GRID, NEAR, backend=device)

@@ -136,6 +136,114 @@ def test_pieces_of_calls(queue, there, monkeypatch):
     assert differing(model.log_likelihood(there(poses[:0]), scan(1)).get(), np.zeros(0, np.float32)) == 0
 
 
+@pytest.mark.parametrize("kind", MODELS)
+def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
+    """They are written elsewhere and copied; bound calls, which copy nothing, have larger ones."""
+    monkeypatch.setattr(chunks, "CHUNK", 49)
+    poses = cloud(3, 300).astype(np.float32)
+    model, caster = kind(GRID, NEAR, backend=queue, precision="float64"), gs.RayCaster(GRID, 5.0, backend=queue)
+    heading = gs.HeadingModel(backend=queue)
+    given, ranges = there(poses), there(mixed(1))
+    for _ in range(2):
+        expected = model.log_likelihood(poses, mixed(1))
+        assert differing(model.log_likelihood(given, mixed(1)).get(), expected) == 0
+        assert differing(caster.cast(given, [0.1, 0.2, 0.3]).get(), caster.cast(poses, [0.1, 0.2, 0.3])) == 0
+        assert differing(heading.log_likelihood(given, 0.3).get(), heading.log_likelihood(poses, 0.3)) == 0
+    call = model.bind(given, ranges)
+    for seed in (4, 5):
+        given.set(cloud(seed, 300).astype(np.float32))
+        expected = model.log_likelihood(given, mixed(1)).get()
+        assert differing(call().get(), expected) == 0
+    with pytest.raises(RuntimeError, match="only launches can be recorded"):
+        as_gpu.record(lambda: as_gpu.copy(given.base_data, given.base_data, 4))
+
+
+def test_parts_of_parts(queue, there, monkeypatch):
+    """What begins within a buffer, or is a part of one itself, has no parts of its own."""
+    import pyopencl as cl
+    import pyopencl.array
+
+    monkeypatch.setattr("gpusense.models.scan_model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
+    model, poses = FIELD(GRID, SCANNER, backend=queue), np.stack([cloud(i, 256) for i in range(3)])
+    scans = np.stack([scan(1), scan(2), np.full(BEAMS, np.nan)])
+    expected = model.log_likelihood(poses, scans)
+    given, room = there(np.concatenate([np.zeros((2, 256, 3)), poses]))[2:], there(np.zeros((5, 256), np.float32))
+    whole = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, 8192 + poses.nbytes)
+    own = pyopencl.array.Array(queue, poses.shape, np.float64, data=whole.get_sub_region(8192, poses.nbytes))
+    own.set(poses)
+    for one in (given, own):
+        assert differing(model.log_likelihood(one, scans).get(), expected) == 0
+        assert model.log_likelihood(one, scans, out=room[2:]) is not None
+        assert differing(room[2:].get(), expected) == 0
+
+
+def test_arrays_of_a_memory_pool(as_gpu, queue, monkeypatch):
+    """Their buffers are of another class."""
+    import pyopencl.array
+    import pyopencl.tools
+
+    pool = pyopencl.tools.MemoryPool(pyopencl.tools.ImmediateAllocator(queue))
+    model, poses = FIELD(GRID, NEAR, backend=queue), np.stack([cloud(1, 256), cloud(2, 256)])
+    monkeypatch.setattr("gpusense.models.scan_model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
+    scans = np.stack([mixed(1), mixed(2)])
+    given = pyopencl.array.to_device(queue, poses, allocator=pool)
+    assert differing(model.log_likelihood(given, scans).get(), model.log_likelihood(poses, scans)) == 0
+    one, ranges = given[1], pyopencl.array.to_device(queue, mixed(2), allocator=pool)
+    assert differing(model.bind(one, ranges)().get(), model.log_likelihood(one, mixed(2)).get()) == 0
+
+
+def test_arrays_in_shared_virtual_memory(queue):
+    import pyopencl as cl
+    import pyopencl.array
+    import pyopencl.tools
+
+    try:
+        allocator = pyopencl.tools.SVMAllocator(queue.context, queue=queue, flags=cl.svm_mem_flags.READ_WRITE)
+        given = pyopencl.array.to_device(queue, cloud(1), allocator=allocator)
+    except cl.Error:
+        pytest.skip("the device has none")
+    with pytest.raises(TypeError, match="poses: must be in a buffer, got an array in shared virtual memory"):
+        FIELD(GRID, SCANNER, backend=queue).log_likelihood(given, scan(1))
+
+
+def test_other_processes_are_refused(as_gpu, queue, there, monkeypatch):
+    """A fork's child has another number, and drivers do not survive in it."""
+    call = FIELD(GRID, NEAR, backend=queue).bind(there(cloud(1)), there(mixed(1)))
+    call()
+    call.check()
+    monkeypatch.setattr(as_gpu, "_process", -1)
+    for refused in (call, call.check, lambda: get_backend(queue), lambda: get_backend("opencl")):
+        with pytest.raises(RuntimeError, match="does not survive a fork"):
+            refused()
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_an_error_leaves_no_verdict_behind(kind, queue, there, monkeypatch):
+    """A pose that is not finite, in a call that ended early, is not the next call's."""
+    model, poses = kind(GRID, SCANNER, backend=queue), cloud(1)
+    expected = model.log_likelihood(there(poses), scan(1)).get()
+    bad = poses.copy()
+    bad[3] = np.nan
+    several = gs.log_likelihoods
+
+    def ends(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    for run in (lambda: model.log_likelihood(there(bad), scan(1)), lambda: several([model], there(bad), [scan(1)])):
+        with monkeypatch.context() as patch:
+            patch.setattr(model._workspace, "wait", ends)
+            with pytest.raises(KeyboardInterrupt):
+                run()
+        assert differing(model.log_likelihood(there(poses), scan(1)).get(), expected) == 0
+
+
+def test_a_device_without_float64_places_no_poses(as_gpu, queue, there, monkeypatch):
+    monkeypatch.setattr(as_gpu, "info", dataclasses.replace(as_gpu.info, float64=False))
+    for call in (call_of("field", queue), call_of("absolute", queue)):
+        with pytest.raises(TypeError, match=r"poses: must be in host memory on .*, which has no float64"):
+            call(there(cloud(1)))
+
+
 def test_what_another_queue_still_writes_is_waited_for(queue, there):
     """Before anything is started that reads it."""
     import pyopencl as cl
@@ -219,8 +327,11 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
         assert differing(call.out.get(), expected) == 0
     stranger = cl.CommandQueue(cl.Context([queue.device]))
     for stream in ("a stream", stranger):
-        with pytest.raises(TypeError, match=r"^stream: must be a queue of the model's context"):
+        with pytest.raises(TypeError, match=r"^stream: must be a queue of the model's context and device, got"):
             call(stream)
+    properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    with pytest.raises(ValueError, match="stream: must be a queue that does commands in their order"):
+        call(cl.CommandQueue(queue.context, properties=properties))
     # Nothing that a queue still works on is freed.
     call(other)
     del call
@@ -324,6 +435,7 @@ WRONG = {
     "integers": (lambda there: there(np.zeros((5, 3), np.int32)), TypeError, "poses: must hold float32 or float64"),
     "complex": (lambda there: there(np.zeros((5, 3), np.complex64)), TypeError, "poses: must hold real numbers, got"),
     "a shape": (lambda there: there(np.zeros((5, 2))), ValueError, "poses: shape must be (N, 3), got (5, 2)"),
+    "other bytes": (lambda there: there(np.zeros((5, 3), ">f8")), TypeError, "poses: must hold float32 or float64, got >"),
     "columns": (lambda there: there(np.zeros((3, 5))).T, ValueError, "poses: must be C-contiguous on the device, got"),
 }  # fmt: skip
 

@@ -128,8 +128,8 @@ def get_backend(selection: Selection = "auto") -> Backend:
             if selection.partition(":")[0] in ("auto", opened.info.backend):
                 opened.check_process()
         backend = _open(_find(selection))
-        if isinstance(backend, ProcessBound) and backend not in _OPENED:
-            _OPENED.append(backend)
+        if isinstance(backend, ProcessBound):
+            _OPENED.add(backend)
     return backend
 
 
@@ -140,13 +140,15 @@ def _of_queue(queue: Any) -> Backend:
         found = _OF_QUEUES.get(queue.int_ptr)
         if found is None:
             found = _OF_QUEUES[queue.int_ptr] = backend_of(queue)
+            _OPENED.add(found)
+    found.check_process()
     return found
 
 
 _LOCK = threading.Lock()
 # By the address of a queue, which its backend keeps.
-_OF_QUEUES: weakref.WeakValueDictionary[int, Backend] = weakref.WeakValueDictionary()
-_OPENED: list[ProcessBound] = []
+_OF_QUEUES: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+_OPENED: weakref.WeakSet[ProcessBound] = weakref.WeakSet()
 
 
 @functools.cache

@@ -148,6 +148,7 @@ class OpenCLBackend(ProcessBound):
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
         """See Sharing.copy."""
+        self._check_recording()
         if not size:
             return
         with driver_errors():
@@ -238,7 +239,8 @@ class OpenCLBackend(ProcessBound):
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
         if self._cache is not None:
             binaries: Any = program.get_info(cl.program_info.BINARIES)
-            self._cache.store(source, self.options, binaries[0])
+            devices: Any = program.get_info(cl.program_info.DEVICES)
+            self._cache.store(source, self.options, binaries[devices.index(self._device)])
         return program
 
     def _kept(self, source: str) -> cl.Program | None:

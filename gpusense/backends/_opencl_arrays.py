@@ -10,6 +10,8 @@ import pyopencl as cl
 import pyopencl.array
 
 from gpusense._checks import show
+from gpusense.backends._opencl_memory import driver_errors
+from gpusense.backends._opencl_replay import is_unordered
 from gpusense.backends.base import Adopted, Buffer
 
 
@@ -20,7 +22,7 @@ def queue_of(given: object) -> cl.CommandQueue:
         ValueError: its commands may be done in another order than theirs.
     """
     assert isinstance(given, cl.CommandQueue)
-    if given.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
+    if is_unordered(given):
         raise ValueError("backend: must be a queue that does commands in their order, got one that does not")
     return given
 
@@ -38,9 +40,22 @@ def part_of(buffer: cl.Buffer, first: int, size: int, alignment: int) -> cl.Buff
     """
     if first == 0 or size == 0:
         return buffer
+    # A part has no parts of its own.
+    whole: Any = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
+    if whole is not None:
+        begin: Any = buffer.get_info(cl.mem_info.OFFSET)
+        first, buffer = first + begin, whole
     if first % alignment:
         raise ValueError(f"buffer: parts must begin at multiples of {alignment} bytes here, got {first}")
-    return buffer.get_sub_region(first, size)
+    with driver_errors():
+        part: Any = buffer.get_sub_region(first, size)
+    return part
+
+
+def _plain(buffer: Any) -> Any:
+    """A buffer of a memory pool, which its array keeps, as any other; an empty array has none."""
+    known = buffer is None or isinstance(buffer, cl.Buffer)
+    return buffer if known else cl.Buffer.from_int_ptr(buffer.int_ptr, retain=True)
 
 
 def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in_place: bool) -> Adopted:
@@ -52,6 +67,8 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
         )
     if not isinstance(array.dtype, np.dtype) or array.dtype.kind not in "fiu":
         raise TypeError(f"{name}: must hold real numbers, got {show(array.dtype)}")
+    if isinstance(array.base_data, cl.SVMPointer):
+        raise TypeError(f"{name}: must be in a buffer, got an array in shared virtual memory")
     for event in array.events:
         event.wait()
     if array.queue is not None and array.queue != queue:
@@ -66,16 +83,18 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
                 f"{array.offset}: pass a copy"
             )
         if array.offset % alignment:
-            array = array.copy(queue=queue)
-        buffer = part_of(array.base_data, array.offset, array.nbytes, alignment)
+            with driver_errors():
+                array = array.copy(queue=queue)
+        buffer = part_of(_plain(array.base_data), array.offset, array.nbytes, alignment)
     held = array
 
     def to_host() -> np.ndarray:
-        if contiguous:
-            return np.asarray(held.get(queue=queue))
-        whole = held.base_data
-        numbers = np.empty(whole.size, np.uint8)
-        cl.enqueue_copy(queue, numbers, whole)
+        with driver_errors():
+            if contiguous:
+                return np.asarray(held.get(queue=queue))
+            whole = _plain(held.base_data)
+            numbers = np.empty(whole.size, np.uint8)
+            cl.enqueue_copy(queue, numbers, whole)
         return np.ndarray(held.shape, held.dtype, numbers, held.offset, held.strides).copy()
 
     return Adopted(buffer, tuple(map(int, array.shape)), array.dtype, tuple(array.strides), contiguous, to_host, array)

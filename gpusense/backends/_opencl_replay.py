@@ -9,7 +9,13 @@ from typing import Any
 
 import pyopencl as cl
 
+from gpusense._checks import show
 from gpusense.backends._opencl_memory import driver_errors
+
+
+def is_unordered(queue: cl.CommandQueue) -> bool:
+    """Whether a queue's commands may be done in another order than theirs."""
+    return bool(queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,12 @@ class Repeated:
                 queue.finish()
 
     def _checked(self, stream: Any) -> cl.CommandQueue:
-        if not isinstance(stream, cl.CommandQueue) or stream.context != self._queue.context:
-            raise TypeError(f"stream: must be a queue of the model's context, got {stream!r}")
+        same = isinstance(stream, cl.CommandQueue) and (stream.context, stream.device) == (
+            self._queue.context,
+            self._queue.device,
+        )
+        if not same:
+            raise TypeError(f"stream: must be a queue of the model's context and device, got {show(stream)}")
+        if is_unordered(stream):
+            raise ValueError("stream: must be a queue that does commands in their order, got one that does not")
         return stream

@@ -17,7 +17,10 @@ def adopted(array: Any, device: wp.Device, name: str) -> Adopted:
     found = _seen(array, device, name)
     if found.device != device:
         raise TypeError(f"{name}: must be on warp:{device.alias}, got an array on {found.device.alias}")
-    dtype = np.dtype(wp.dtype_to_numpy(found.dtype))
+    try:
+        dtype = np.dtype(wp.dtype_to_numpy(found.dtype))
+    except TypeError as error:
+        raise TypeError(f"{name}: must hold float32 or float64, got {found.dtype.__name__}") from error
     buffer = found
     if found.is_contiguous and found.ndim != 1:
         buffer = _flat(found.ptr, found.size, found.dtype, device.alias) if found.size else found.flatten()

@@ -114,7 +114,7 @@ class Sharing(Protocol):
         """
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """A buffer of exactly ``count`` numbers, or none, that can be lent."""
+        """A buffer of ``count`` numbers, of any kind but shared with the host, that can be lent; it may hold none."""
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
         """Start to copy ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""

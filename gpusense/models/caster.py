@@ -336,28 +336,28 @@ class MapCaster:
         normals = self.normals(region, cones.flags)
         given = cloud.given(backend, space, part)
         placed = cloud.place(backend, space, given, part, (region, self.grid, self.mount), self.real, careful=False)
-        if cloud.on_device:
-            result = backend.part(ranges, part[0] * rays, count * rays, self.real)
-        else:
-            result = space.empty("ranges", count * rays, self.real)
         flags = self.flags | self._wide | cones.flags
         flags |= set() if all_within(corners, self.grid, self.mount, region, 0) else {"ORIGINS_OUTSIDE"}
         sizes = (region.rows, region.cols, count, rays, *self.scalars, self.limit, self.grid.resolution, self.range_max)
-        if "ECHO" in flags:
-            other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
-            both = (other, result) if cones.incidence else (result, other)
-            inputs = (table, normals, placed.cell, placed.pose, ray)
-            backend.compile("cast_echoes", flags)((rays, count), *inputs, *both, *sizes[:4], *cones.scalars, *sizes[4:])
-        elif backend.info.kind == "gpu":
-            order = ordered(backend, space, placed, count, rays, self.real)
-            flags |= {"ORDERED"} if order is not None else set()
-            order = placed.cell if order is None else order
-            tiles, spread = tiles_of(count, rays)
-            backend.compile("cast_tiles", flags)(
-                (tiles,), table, placed.cell, placed.pose, order, ray, result, *sizes, spread
-            )
-        else:
-            flags = widened(backend.info, "cast_ranges", flags)
-            backend.compile("cast_ranges", flags)((rays, count), table, placed.cell, placed.pose, ray, result, *sizes)
-        if not cloud.on_device:
-            space.download(result, ranges[slice(*part)])
+        flat = ranges if cloud.on_device else ranges.reshape(-1)
+        with space.result("ranges", flat, part[0] * rays, count * rays, self.real) as result:
+            if "ECHO" in flags:
+                other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
+                both = (other, result) if cones.incidence else (result, other)
+                inputs = (table, normals, placed.cell, placed.pose, ray)
+                backend.compile("cast_echoes", flags)(
+                    (rays, count), *inputs, *both, *sizes[:4], *cones.scalars, *sizes[4:]
+                )
+            elif backend.info.kind == "gpu":
+                order = ordered(backend, space, placed, count, rays, self.real)
+                flags |= {"ORDERED"} if order is not None else set()
+                order = placed.cell if order is None else order
+                tiles, spread = tiles_of(count, rays)
+                backend.compile("cast_tiles", flags)(
+                    (tiles,), table, placed.cell, placed.pose, order, ray, result, *sizes, spread
+                )
+            else:
+                flags = widened(backend.info, "cast_ranges", flags)
+                backend.compile("cast_ranges", flags)(
+                    (rays, count), table, placed.cell, placed.pose, ray, result, *sizes
+                )

@@ -128,19 +128,15 @@ class PointModel(ABC):
             )
 
         def run(begin: int, end: int) -> None:
-            if cloud.on_device:
-                result = backend.part(flat, begin, end - begin, self._real)
-            else:
-                result = space.empty("log_p", end - begin, self._real)
-            if launch is None:
-                # Nothing is measured, but poses that are not finite are refused as ever.
-                if cloud.on_device:
+            if launch is None and not cloud.on_device:
+                return
+            with space.result("log_p", flat, begin, end - begin, self._real) as result:
+                if launch is None:
+                    # Nothing is measured, but poses that are not finite are refused as ever.
                     self._relative(cloud, (begin, end), "place_relative", (0.0,) * 4)
                     backend.upload(np.zeros(end - begin, self._real), result)
-                return
-            launch(cloud, (begin, end), result)
-            if not cloud.on_device:
-                space.download(result, flat[begin:end])
+                else:
+                    launch(cloud, (begin, end), result)
 
         with self._lock, space:
             self._last_code, self._last_left_out = None, left_out

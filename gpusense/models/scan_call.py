@@ -12,10 +12,11 @@ import numpy as np
 
 from gpusense import _checks, arrays
 from gpusense.backends import Backend
-from gpusense.backends.base import Buffer, Sharing
+from gpusense.backends.base import Buffer
 from gpusense.cloud import Cloud
 from gpusense.scan import check_ranges
 from gpusense.scanner import Scanner
+from gpusense.workspace import Workspace
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
 # launches fill the device for longer than it takes to start them.
@@ -56,18 +57,13 @@ class ScanCall:
         return any(cloud.on_device for cloud in self.clouds)
 
     @contextmanager
-    def target(self, backend: Backend, begin: int, end: int) -> Iterator[np.ndarray | Buffer]:
+    def target(self, space: Workspace, begin: int, end: int) -> Iterator[np.ndarray | Buffer]:
         """Where the log-likelihoods of some particles of all scans are written by what is started within."""
-        real, count = self.parts.dtype, end - begin
-        if not self.on_device:
-            yield self.flat[begin:end]
-        elif begin * real.itemsize % (sharing := cast(Sharing, backend)).alignment == 0:
-            yield backend.part(self.flat, begin, count, real)
+        if self.on_device:
+            with space.result("scan", self.flat, begin, end - begin, self.parts.dtype) as target:
+                yield target
         else:
-            # The device cannot begin there.
-            own = sharing.blank(count, real)
-            yield own
-            sharing.copy(own, self.flat, count * real.itemsize, to=begin * real.itemsize)
+            yield self.flat[begin:end]
 
     def separate(self, backend: Backend) -> None:
         """Give each scan a cloud of its own."""

@@ -173,7 +173,7 @@ class ScanModel(ABC):
                 self._workspace.release(keep="verdict")
                 call.separate(self._backend)
         for i, cloud in enumerate(call.clouds):
-            with call.target(self._backend, i * call.count, (i + 1) * call.count) as target:
+            with call.target(self._workspace, i * call.count, (i + 1) * call.count) as target:
                 self._score_scan(cloud, call.ranges[i], target, call.parts[i], call.parts.shape[-1] > 0)
             if not call.single:
                 self._workspace.start()
@@ -188,7 +188,8 @@ class ScanModel(ABC):
         call, so that the same program runs on every backend.
 
         Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
-        repeat or, with a temperature below 1, no range depends on the pose: these agree to rounding.
+        repeat or, with a temperature below 1, no range depends on the pose, and for some of the beams by number with
+        ``specialize=False``: these agree to rounding.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
@@ -228,13 +229,8 @@ class ScanModel(ABC):
         space, backend = self._workspace, self._backend
 
         def run(begin: int, end: int) -> None:
-            if cloud.host is None:
-                result = backend.part(log_p, begin, end - begin, self._real)
-            else:
-                result = space.empty("log_p", end - begin, self._real)
-            each = launch(cloud, (begin, end), result, per_beam)
-            if cloud.host is not None:
-                space.download(result, log_p[begin:end])
+            with space.result("log_p", log_p, begin, end - begin, self._real) as result:
+                each = launch(cloud, (begin, end), result, per_beam)
             if per_beam:
                 shape = (end - begin, len(scan.readings))
                 parts[begin:end, scan.columns] = backend.download(each, np.empty(shape, self._real))
@@ -243,14 +239,14 @@ class ScanModel(ABC):
 
     def _score_together(self, call: ScanCall) -> None:
         """Start to score several scans by common launches, each of as many scans as may be."""
-        (cloud,), backend, space, count = call.clouds, self._backend, self._workspace, call.count
+        (cloud,), space, count = call.clouds, self._workspace, call.count
         scans = self._prepared(call.ranges)
         self._last_scan = self._prepared(call.ranges[-1])
         assert scans.batch is not None
         most = max(self._chunk(max(scans.most_readings, 1) * self._rays_each) // count, 1)
         for begin, end in runs(scans, most):
             part = (begin * count, end * count)
-            with call.target(backend, *part) as target:
+            with call.target(space, *part) as target:
                 self._score_part(scans, (begin, end), cloud, part, target)
             space.start()
 
@@ -266,10 +262,8 @@ class ScanModel(ABC):
             return
         space = self._workspace
         launch = self._prepare_launch(part_of(scans, *some))
-        result = target if cloud.host is None else space.empty("log_p", part[1] - part[0], self._real)
-        launch(cloud, part, result, False)
-        if cloud.host is not None:
-            space.download(result, target)
+        with space.result("log_p", target, 0, part[1] - part[0], self._real) as result:
+            launch(cloud, part, result, False)
         self._together = max(self._together, some[1] - some[0])
 
     def _prepared(self, ranges: np.ndarray) -> PreparedScan:

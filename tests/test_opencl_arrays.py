@@ -435,7 +435,7 @@ WRONG = {
     "integers": (lambda there: there(np.zeros((5, 3), np.int32)), TypeError, "poses: must hold float32 or float64"),
     "complex": (lambda there: there(np.zeros((5, 3), np.complex64)), TypeError, "poses: must hold real numbers, got"),
     "a shape": (lambda there: there(np.zeros((5, 2))), ValueError, "poses: shape must be (N, 3), got (5, 2)"),
-    "other bytes": (lambda there: there(np.zeros((5, 3), ">f8")), TypeError, "poses: must hold float32 or float64, got >"),
+    "bytes": (lambda there: there(np.zeros((5, 3), ">f8")), TypeError, "poses: must hold float32 or float64, got"),
     "columns": (lambda there: there(np.zeros((3, 5))).T, ValueError, "poses: must be C-contiguous on the device, got"),
 }  # fmt: skip
 

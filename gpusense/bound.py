@@ -125,6 +125,8 @@ class DeviceCall(BoundCall):
     # Launches that were gathered once.
     _kept: object | None = None
     _replay: Replay | None = None
+    # What they score by, and the map's window.
+    _scored: tuple[Scorer, Region] | None = None
 
     def __init__(
         self,
@@ -177,6 +179,7 @@ class DeviceCall(BoundCall):
             gathering.repeat(self._kept)
             return
         mark = gathering.mark()
+        assert self._scored is not None
         self._start(*self._scored)
         self._kept = gathering.kept(mark)
 
@@ -247,7 +250,7 @@ class DeviceCall(BoundCall):
         model, scene, cloud = self._model, self._scene, self._cloud
         with model._lock:
             # Kept, since another call of the model may need another table; the last one first makes room.
-            self._table, self._replay, self._kept = None, None, None
+            self._table, self._scored, self._replay, self._kept = None, None, None, None
             self._table, region, _ = cloud.ensure(scene.map, 0, cloud.count)
             score = model._bound_scorer(self._table, region)
             self._version = scene.map.version

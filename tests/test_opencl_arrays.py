@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import re
+import weakref
 from typing import Any
 
 import numpy as np
@@ -384,6 +385,23 @@ def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies
         assert (up, down) == ("up", "down")
         assert 8 * (3 * COUNT + BEAMS) <= sent < 8 * (3 * COUNT + BEAMS) + 2048
         assert 4 * COUNT + 8 <= received < 4 * COUNT + 8 + 2048
+
+
+def test_a_new_table_finds_room(as_gpu, queue, there, monkeypatch):
+    """Launches that are kept let go of the old one before the new one is made."""
+    model = FIELD(GRID, NEAR, backend=queue, specialize=False)
+    call = model.bind(there(cloud(1)), there(mixed(1)))
+    expected = call().get()
+    old, prepare, alive = weakref.ref(call._table), model._map._prepare, []
+
+    def look(*given: Any) -> Any:
+        gc.collect()
+        alive.append(old() is not None)
+        return prepare(*given)
+
+    monkeypatch.setattr(model._map, "_prepare", look)
+    model._map._table, model._map.version = None, model._map.version + 1
+    assert differing(call().get(), expected) == 0 and alive == [False]
 
 
 def test_only_launches_can_be_recorded(as_gpu):

@@ -1,0 +1,56 @@
+"""A user's queue of pyopencl, and what tests of arrays on it need."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpusense.backends import get_backend
+
+
+@pytest.fixture
+def queue(needs) -> Any:
+    """A queue of a context of its own on the device under test."""
+    import pyopencl as cl
+
+    return cl.CommandQueue(cl.Context([get_backend(needs("opencl"))._device]))
+
+
+@pytest.fixture
+def there(queue):
+    """What makes an array on that queue."""
+    import pyopencl.array
+
+    return lambda array: pyopencl.array.to_device(queue, np.ascontiguousarray(array))
+
+
+@pytest.fixture
+def as_gpu(queue, monkeypatch):
+    """The queue's backend, whose device counts as a GPU: bound calls keep their launches there."""
+    device = get_backend(queue)
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
+    return device
+
+
+@pytest.fixture
+def copies(monkeypatch):
+    """Bytes that models copy to the device and back."""
+    from gpusense.backends._opencl import OpenCLBackend
+
+    seen: list[tuple[str, int]] = []
+    upload, download = OpenCLBackend.upload, OpenCLBackend.download
+
+    def up(self, array, out=None, *, wait=True):
+        seen.append(("up", array.nbytes))
+        return upload(self, array, out, wait=wait)
+
+    def down(self, buffer, out, *, wait=True):
+        seen.append(("down", out.nbytes))
+        return download(self, buffer, out, wait=wait)
+
+    monkeypatch.setattr(OpenCLBackend, "upload", up)
+    monkeypatch.setattr(OpenCLBackend, "download", down)
+    return seen

@@ -11,6 +11,24 @@ import numpy as np
 CPU, CUDA = 1, 2
 
 
+def counted_copies(monkeypatch: Any, backend: type) -> list[tuple[str, int]]:
+    """Bytes that a backend's class copies to the device ("up") and back ("down") from now on."""
+    seen: list[tuple[str, int]] = []
+    upload, download = backend.upload, backend.download
+
+    def up(self: Any, array: np.ndarray, out: Any = None, *, wait: bool = True) -> Any:
+        seen.append(("up", array.nbytes))
+        return upload(self, array, out, wait=wait)
+
+    def down(self: Any, buffer: Any, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        seen.append(("down", out.nbytes))
+        return download(self, buffer, out, wait=wait)
+
+    monkeypatch.setattr(backend, "upload", up)
+    monkeypatch.setattr(backend, "download", down)
+    return seen
+
+
 class Array:
     """Delegates DLPack to another array; ``device`` is what it says of its memory."""
 

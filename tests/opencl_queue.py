@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from array_libraries import counted_copies
 
 from gpusense.backends import get_backend
 
@@ -40,17 +41,4 @@ def copies(monkeypatch):
     """Bytes that models copy to the device and back."""
     from gpusense.backends._opencl import OpenCLBackend
 
-    seen: list[tuple[str, int]] = []
-    upload, download = OpenCLBackend.upload, OpenCLBackend.download
-
-    def up(self, array, out=None, *, wait=True):
-        seen.append(("up", array.nbytes))
-        return upload(self, array, out, wait=wait)
-
-    def down(self, buffer, out, *, wait=True):
-        seen.append(("down", out.nbytes))
-        return download(self, buffer, out, wait=wait)
-
-    monkeypatch.setattr(OpenCLBackend, "upload", up)
-    monkeypatch.setattr(OpenCLBackend, "download", down)
-    return seen
+    return counted_copies(monkeypatch, OpenCLBackend)

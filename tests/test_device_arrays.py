@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from array_libraries import Array, installed
+from array_libraries import Array, counted_copies, installed
 from conftest import skip_or_fail
 
 import gpusense as gs
@@ -64,20 +64,7 @@ def copies(monkeypatch):
 
     from gpusense.backends._warp import WarpBackend
 
-    seen = []
-    upload, download = WarpBackend.upload, WarpBackend.download
-
-    def up(self, array, out=None, *, wait=True):
-        seen.append(("up", array.nbytes))
-        return upload(self, array, out, wait=wait)
-
-    def down(self, buffer, out, *, wait=True):
-        seen.append(("down", out.nbytes))
-        return download(self, buffer, out, wait=wait)
-
-    monkeypatch.setattr(WarpBackend, "upload", up)
-    monkeypatch.setattr(WarpBackend, "download", down)
-    return seen
+    return counted_copies(monkeypatch, WarpBackend)
 
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
@@ -109,6 +96,20 @@ def test_out_on_the_device(method, device, copies):
         assert call(wrap(poses), out=out) is out
         assert room.ptr == address and differing(room.numpy(), expected) == 0
         assert all(size <= 16 * BEAMS or size == 4 * 8192 for way, size in copies)
+
+
+@pytest.mark.parametrize("selection", ["opencl", "warp"])
+def test_copies_on_the_device(selection, needs):
+    """From any place to any other, after what was started before."""
+    backend, real = get_backend(needs(selection)), np.dtype(np.float32)
+    source, target = backend.blank(8, real), backend.blank(6, real)
+    backend.upload(np.arange(8, dtype=real), source)
+    backend.upload(np.full(6, 77, real), target)
+    backend.copy(source, target, 12, begin=8, to=4)
+    backend.copy(source, target, 0)
+    found = backend.download(target, np.empty(6, real))
+    backend.synchronize()
+    assert found.tolist() == [77, 2, 3, 4, 77, 77]
 
 
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])

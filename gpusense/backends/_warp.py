@@ -137,8 +137,16 @@ class WarpBackend(ProcessBound):
         return self.part(self.empty(count, dtype), 0, count, dtype)
 
     def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Sharing.copy; parts may begin anywhere, so that nothing needs it."""
-        raise NotImplementedError
+        """See Sharing.copy."""
+        if not size:
+            # To Warp a count of 0 is all.
+            return
+        queue = self.gathering()
+        if queue is not None:
+            # After all that was gathered before.
+            self._flush(queue)
+        from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
+        wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
 
     def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
         """See Sharing.lend."""

@@ -37,10 +37,13 @@ class Workspace:
         return self
 
     def __exit__(self, kind: object, *error: object) -> None:
-        if kind is not None:
-            self.abandon()
-        if self._gathering is not None:
-            self._gathering.scatter()
+        try:
+            if self._gathering is not None:
+                self._gathering.scatter()
+        finally:
+            # Not before: what was gathered may write there.
+            if kind is not None:
+                self.abandon()
 
     def abandon(self) -> None:
         """After an error: what it left of the verdict on poses is not the next call's."""

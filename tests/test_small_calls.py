@@ -14,6 +14,7 @@ from gpusense import arrays
 from gpusense.backends import get_backend
 from gpusense.models import chunks, scan_model
 from gpusense.tolerances import differing
+from gpusense.workspace import Workspace
 
 BEAMS, COUNT, RANGE = 37, 300, 5.0
 RNG = np.random.default_rng(7)
@@ -320,3 +321,14 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering,
     for _ in range(3):
         assert differing(model.log_likelihood(cloud(1, 77), scan(1)), expected) == 0
     assert device._graphs.failed
+
+
+def test_an_error_forgets_no_memory_that_launches_still_need(gathering, monkeypatch):
+    """What was gathered before is started first."""
+    device, int32, seen = gathering[0], np.dtype(np.int32), []
+    space, scatter = Workspace(device), device.scatter
+    monkeypatch.setattr(device, "scatter", lambda: (seen.append(("verdict", int32) in space._buffers), scatter()))
+    with pytest.raises(KeyboardInterrupt), space:
+        space.empty("verdict", 2, int32, zero=True)
+        raise KeyboardInterrupt
+    assert seen == [True] and not space._buffers

@@ -51,9 +51,10 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
     with contextlib.ExitStack() as stack:
         for _, model in different:
             stack.enter_context(model._lock)
-        stack.enter_context(chosen[0]._workspace)
         for _, model in different:
             stack.push(lambda kind, *error, space=model._workspace: space.abandon() if kind else None)
+        # Left first: what was gathered is started before an error forgets its memory.
+        stack.enter_context(chosen[0]._workspace)
         for model, call in zip(chosen, calls, strict=True):
             model._start(call)
             model._workspace.start()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import re
 import threading
 import warnings
 from collections.abc import Callable
@@ -10,8 +13,14 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends import _opencl_arrays, _pocl
-from gpusense.backends._opencl_devices import info_of, is_simulator, list_devices, shares_memory
+from gpusense.backends import _opencl_arrays, _pocl, _pocl_kernels
+from gpusense.backends._opencl_devices import (
+    absent_drivers,
+    info_of,
+    list_devices,
+    shares_memory,
+    trouble_of,
+)
 from gpusense.backends._opencl_launch import Launch
 from gpusense.backends._opencl_memory import DeviceBuffer, SharedBuffer, driver_errors
 from gpusense.backends._opencl_replay import KeptLaunch, Repeated
@@ -20,7 +29,7 @@ from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS
 from gpusense.sources import assemble, relevant, uses_double, with_places
 
-__all__ = ["OpenCLBackend", "backend_of", "is_simulator", "list_devices"]
+__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "list_devices", "trouble_of"]
 
 # One driver's own clearing hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
@@ -31,7 +40,7 @@ _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
 def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
-    """Where programs are kept; None for PoCL, which keeps them itself.
+    """Return where programs are kept; None for PoCL, whose kernels are kept one by one.
 
     Asked for a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size. That
     takes three times as long as all it does unasked.
@@ -50,9 +59,10 @@ class OpenCLBackend(ProcessBound):
         super().__init__()
         self.info = info
         self._device = device
-        _pocl.mend(device)
-        self._queue = cl.CommandQueue(cl.Context([device])) if queue is None else queue
-        self._context = self._queue.context
+        _pocl.fit_target(device)
+        # Intel's driver does not keep the context of a queue alive.
+        self._context = cl.Context([device]) if queue is None else queue.context
+        self._queue = cl.CommandQueue(self._context) if queue is None else queue
         self._shared = shares_memory(device)
         # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
         self._count = threading.RLock()
@@ -63,9 +73,14 @@ class OpenCLBackend(ProcessBound):
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
         self._cache = _program_cache(info, device)
+        self._pocl = _pocl_kernels.pocl_kernels() if _pocl.is_pocl(device) else None
         # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
+        if self._pocl is not None:
+            # PoCL writes the number of warnings to the terminal. It tells kernels apart by their options, not by the
+            # processor they are for.
+            self.options += ["-w", f"-DTARGET_{re.sub(r'[^a-z0-9]', '_', info.target)}"]
 
     @property
     def queue(self) -> cl.CommandQueue:
@@ -193,6 +208,8 @@ class OpenCLBackend(ProcessBound):
             self._queue.finish()
         with self._count:
             self._ended = max(self._ended, queued)
+        if self._pocl is not None and self._pocl.changed:
+            self._pocl.save()
 
     def _check_recording(self) -> None:
         if self.recording() is not None:
@@ -222,7 +239,16 @@ class OpenCLBackend(ProcessBound):
         program = self._programs.get((row.file, flags))
         if program is None:
             program = self._programs[row.file, flags] = self._build(row.file, flags)
-        return Launch(self, cl.Kernel(program, kernel), row, flags)
+        return Launch(self, cl.Kernel(program, kernel), row, flags, self._kernel_runs(row.file, flags))
+
+    def _kernel_runs(self, file: str, flags: frozenset[str]) -> Callable[[], None] | None:
+        """Return what is to be called when a kernel of a program is launched for the first time."""
+        if self._pocl is None:
+            return None
+        return functools.partial(self._pocl.mark, self._program_key(assemble(file, flags)))
+
+    def _program_key(self, source: str) -> str:
+        return ProgramCache(self.info).key(source, self.options)
 
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:
@@ -232,8 +258,10 @@ class OpenCLBackend(ProcessBound):
         source = assemble(file, flags)
         if (program := self._kept(source)) is not None:
             return program
+        kept = contextlib.nullcontext() if self._pocl is None else self._pocl.building(self._program_key(source))
         try:
-            program = self._built(cl.Program(self._context, source))
+            with kept:
+                program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
             log = with_places(str(error), source)
             raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
@@ -267,4 +295,5 @@ def backend_of(queue: cl.CommandQueue) -> OpenCLBackend:
     Raises:
         ValueError: the queue does not do commands in their order.
     """
-    return OpenCLBackend(info_of(queue.device), queue.device, _opencl_arrays.queue_of(queue))
+    info = info_of(queue.device)
+    return OpenCLBackend(info, queue.device, _opencl_arrays.queue_of(queue))

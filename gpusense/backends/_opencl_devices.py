@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import pyopencl as cl
 
-from gpusense.backends import _pocl
+from gpusense.backends import _opencl_drivers, _pocl, _pocl_kernels
 from gpusense.backends.base import BackendInfo
-
-# Devices that check or emulate: correct, but no one wants to wait for them unasked.
-SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
-
-
-def is_simulator(name: str) -> bool:
-    """Whether a device of that name only imitates hardware."""
-    return any(word in name.lower() for word in SIMULATORS)
 
 
 def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
     """All OpenCL devices of this machine, simulators included, in the order of the platforms."""
     found = []
     try:
-        platforms = cl.get_platforms()
-    except cl.LogicError:
+        platforms = _opencl_drivers.platforms()
+    except RuntimeError:
         return []
     for p, platform in enumerate(platforms):
         try:
@@ -43,7 +35,27 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
         max_buffer=int(device.max_mem_alloc_size),
         float64=bool(device.double_fp_config),
         lanes=_lanes(device),
+        target=_pocl.target_of(device),
     )
+
+
+def trouble_of(device: cl.Device) -> str:
+    """Return why no kernel can be compiled for a device, where that is known beforehand; else an empty text."""
+    if not _pocl.is_pocl(device):
+        return ""
+    if absent := _pocl.lacking_for(device):
+        return f"PoCL's library for this processor uses {', '.join(absent)}, which it lacks"
+    try:
+        _pocl_kernels.pocl_kernels()
+    except OSError as error:
+        return str(error)
+    return ""
+
+
+def absent_drivers() -> list[tuple[str, str]]:
+    """Return the drivers that cannot be loaded, by their files, and the reasons."""
+    chosen = _opencl_drivers.choice()
+    return [*chosen.left_out, *([("OpenCL", chosen.failure)] if chosen.failure else [])]
 
 
 def info_of(device: cl.Device) -> BackendInfo:

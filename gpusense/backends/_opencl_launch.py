@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,8 +27,17 @@ class Enqueuer(Protocol):
 class Launch:
     """Binds arguments by the signature table and enqueues."""
 
-    def __init__(self, backend: Enqueuer, kernel: cl.Kernel, row: Kernel, flags: frozenset[str]) -> None:
+    def __init__(
+        self,
+        backend: Enqueuer,
+        kernel: cl.Kernel,
+        row: Kernel,
+        flags: frozenset[str],
+        first: Callable[[], None] | None = None,
+    ) -> None:
         self._backend, self._kernel = backend, kernel
+        # Called once, before the kernel is launched for the first time.
+        self._first = first
         self._lanes, self._group = (1, row.group)
         if "WIDE" in flags:
             self._lanes, self._group = (lanes_of(flags) if row.wide else 1), row.wide_group
@@ -41,6 +51,9 @@ class Launch:
         group = (self._group, *(1 for _ in size[1:]))
         rounded = (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:])
         # Arguments belong to the kernel object, so two threads must not interleave here.
+        if self._first is not None:
+            self._first()
+            self._first = None
         kept = self._backend.recording()
         if kept is not None:
             own = cl.Kernel(self._kernel.program, self._kernel.function_name)

@@ -1,72 +1,179 @@
-"""What is particular to PoCL, the OpenCL driver for processors that comes as a wheel.
+"""The processor for which PoCL compiles; PoCL is the OpenCL driver for processors that comes as a wheel.
 
-A processor may be newer than the PoCL of the wheel, whose compiler then refuses to compile for it. PoCL asks LLVM for
-the processor's name and hands the name back to it. LLVM 14 calls what it does not know (AMD's Zen 5, say) "generic",
-and takes no such name: "unknown target CPU 'generic'" (pocl issue 1049). PoCL has no setting for the name, so it is
-replaced where PoCL keeps it, by one that LLVM knows with the instruction sets of PoCL's own library.
+PoCL has its library of OpenCL functions compiled for several processors, and takes the best one whose instruction sets
+the machine has. Before version 5 it compiles kernels for the processor that LLVM names instead, and the two need not
+fit: to LLVM 14 a Zen 4 is a ``znver3``, without the AVX-512 of the library, and a Zen 5 is ``generic``, which is no
+processor at all (pocl issue 1049). Vectors are then passed in other registers than the callee expects, and the compiler
+aborts the process. Version 5 compiles kernels for the processor that its library was compiled for, which always fits.
+For older versions the same is done here.
+
+They have no setting for it: the environment variable POCL_LLVM_CPU_NAME came with version 5 too, options of the build
+are checked against a list, and the device's own name overrules them. So the name is replaced where PoCL keeps it.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+import re
 import struct
-from typing import TYPE_CHECKING
+from collections.abc import Set
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from gpusense.backends.processor import instruction_sets
 
 if TYPE_CHECKING:
     import pyopencl as cl
 
-# From the newest: instruction sets as Linux names them, and a processor that has them, as PoCL's own library does.
-_PROCESSORS: tuple[tuple[set[str], str], ...] = (
-    ({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}, "skylake-avx512"),
-    ({"avx2", "fma", "bmi2"}, "haswell"),
-    ({"avx"}, "sandybridge"),
-    (set(), "x86-64"),
+
+class Library(NamedTuple):
+    """A library of PoCL's.
+
+    Attributes:
+        name: The end of its file's name.
+        needs: Instruction sets, by Linux's names, with which PoCL chooses it.
+        processor: The processor for which it was compiled, by LLVM's name.
+        uses: Further instruction sets that code for that processor has.
+    """
+
+    name: str
+    needs: frozenset[str]
+    processor: str
+    uses: frozenset[str] = frozenset()
+
+
+def _sets(words: str) -> frozenset[str]:
+    return frozenset(words.split())
+
+
+# PoCL takes the last one of which a processor has all that it needs (getX86KernelLibName in PoCL 3).
+LIBRARIES = (
+    Library("sse2", _sets(""), "x86-64"),
+    Library("ssse3", _sets("ssse3 cx16"), "core2"),
+    Library("sse41", _sets("sse4_1 cx16"), "penryn", _sets("ssse3")),
+    Library("avx", _sets("avx cx16 popcnt"), "sandybridge", _sets("ssse3 sse4_1 sse4_2")),
+    Library("avx_f16c", _sets("avx cx16 popcnt f16c"), "ivybridge", _sets("ssse3 sse4_1 sse4_2")),
+    Library("avx_fma4", _sets("avx cx16 popcnt xop fma4"), "bdver1", _sets("ssse3 sse4_1 sse4_2 sse4a")),
+    Library("avx2", _sets("avx avx2 cx16 popcnt abm f16c fma bmi1 bmi2"), "haswell", _sets("ssse3 sse4_1 sse4_2")),
+    Library(
+        "avx512",
+        _sets("avx512f"),
+        "skylake-avx512",
+        _sets("avx2 fma f16c abm bmi1 bmi2 avx512bw avx512cd avx512dq avx512vl"),
+    ),
 )
 # The words of a device's description in which its names are looked for.
 _WORDS = 256
 _NAME = 24
+# The first version that chooses the processor by its library.
+_FITTING = (5, 0)
 
 
 def is_pocl(device: cl.Device) -> bool:
-    """Whether a device is one of PoCL's."""
+    """Return whether a device is one of PoCL's."""
     return "Portable Computing Language" in device.platform.name
 
 
-def known_processor(flags: set[str]) -> str:
-    """A processor LLVM 14 knows, with no instruction set that is not in ``flags``."""
-    return next(name for needed, name in _PROCESSORS if needed <= flags)
+def chosen_library(flags: Set[str]) -> Library:
+    """Return the library that PoCL takes on a processor with these instruction sets."""
+    return next(library for library in reversed(LIBRARIES) if library.needs <= flags)
 
 
-def mend(device: cl.Device) -> str | None:
-    """Give PoCL's device a processor's name its compiler knows; the name, or None where nothing is to be mended.
+def lacking(flags: Set[str]) -> list[str]:
+    """Return the instruction sets that the library PoCL takes uses, and that the processor lacks."""
+    return sorted(chosen_library(flags).uses - flags)
 
-    The name stands behind that of the target, ``x86_64-...``, in the device's description; where the two are not found
-    nothing is touched. Memory is read through the kernel, which answers an address that is none with an error.
+
+def lacking_for(device: cl.Device) -> list[str]:
+    """Return the instruction sets that PoCL's library uses on a device and that the processor lacks."""
+    return lacking(_flags(device)) if _is_misfit(device) and instruction_sets() else []
+
+
+def target_of(device: cl.Device) -> str:
+    """Return the processor for which PoCL compiles once :func:`fit_target` was called; empty where it is not known."""
+    if not is_pocl(device):
+        return ""
+    _, name = _find_name(device)
+    return chosen_library(_flags(device)).processor if name and _is_misfit(device) else name
+
+
+def fit_target(device: cl.Device) -> str | None:
+    """Make PoCL compile kernels for the processor for which its library was compiled.
+
+    Returns:
+        The name that was written into PoCL's description of the device; None where nothing was written.
     """
-    if not is_pocl(device) or not os.path.exists("/proc/self/mem"):
+    if not is_pocl(device) or not _is_misfit(device):
         return None
-    with open("/proc/self/mem", "rb", buffering=0) as memory:
-        words = struct.unpack(f"<{_WORDS}Q", os.pread(memory.fileno(), 8 * _WORDS, device.int_ptr))
-        for i in range(1, _WORDS):
-            target, name = (_text(memory.fileno(), word) for word in words[i - 1 : i + 1])
-            if target.startswith(b"x86_64-") and name == b"generic":
-                known = known_processor(_instruction_sets())
-                _replace(device.int_ptr + 8 * i, known)
-                return known
-    return None
+    place, name = _find_name(device)
+    fitting = chosen_library(_flags(device)).processor
+    if not name or name == fitting:
+        return None
+    _replace(place, fitting)
+    return fitting
 
 
-def _text(memory: int, address: int) -> bytes:
+def _flags(device: cl.Device) -> frozenset[str]:
+    """Return the processor's instruction sets as PoCL sees them.
+
+    The width of its vectors says whether LLVM found AVX-512, which a kernel of Linux may hide from its own list.
+    """
+    flags = instruction_sets()
+    return flags | {"avx512f"} if device.native_vector_width_float >= 16 else flags - {"avx512f"}
+
+
+def _is_misfit(device: cl.Device) -> bool:
+    """Return whether this PoCL takes its library by instruction sets, and the processor's name from LLVM."""
+    version = re.match(r"(\d+)\.(\d+)", device.driver_version.strip())
+    if version is None or tuple(map(int, version.groups())) >= _FITTING:
+        return False
+    return _has_libraries()
+
+
+def _has_libraries() -> bool:
+    """Return whether PoCL's libraries for several processors are here, rather than one for the machine it was made on.
+
+    They are looked for where PoCL looks: from the place of its own code.
+    """
     try:
-        return os.pread(memory, _NAME, address).split(b"\0")[0]
+        with open("/proc/self/maps", encoding="utf-8", errors="replace") as file:
+            places = {line.split()[-1] for line in file if "/libpocl" in line}
+    except OSError:
+        return False
+    below = ("share/pocl", "../share/pocl", "../../share/pocl", "../../pocl_binary_distribution/.libs/share/pocl")
+    folders = (Path(place).parent / folder for place in places for folder in below)
+    return any(next(folder.glob("kernel-x86_64-*-avx2.bc"), None) for folder in folders)
+
+
+def _find_name(device: cl.Device) -> tuple[int, str]:
+    """Return where the device's description holds the address of its processor's name, and the name.
+
+    The address stands behind that of the target's name, ``x86_64-...``. Memory is read through Linux, which answers an
+    address that is none with an error. Where the two are not found the name is empty.
+    """
+    try:
+        memory = os.open("/proc/self/mem", os.O_RDONLY)
+    except OSError:
+        return 0, ""
+    try:
+        data = os.pread(memory, 8 * _WORDS, device.int_ptr)
+        words = struct.unpack(f"<{len(data) // 8}Q", data[: len(data) // 8 * 8])
+        for i in range(1, len(words)):
+            if _text(memory, words[i - 1]).startswith("x86_64-"):
+                return device.int_ptr + 8 * i, _text(memory, words[i])
+    except OSError:
+        pass
+    finally:
+        os.close(memory)
+    return 0, ""
+
+
+def _text(memory: int, address: int) -> str:
+    try:
+        return os.pread(memory, _NAME, address).split(b"\0")[0].decode("ascii", "replace")
     except (OSError, OverflowError):
-        return b""
-
-
-def _instruction_sets() -> set[str]:
-    with open("/proc/cpuinfo", encoding="utf-8") as file:
-        return next((set(line.split(":")[1].split()) for line in file if line.startswith("flags")), set())
+        return ""
 
 
 def _replace(place: int, name: str) -> None:

@@ -19,7 +19,7 @@ from gpusense.backends._warp_arrays import adopted
 from gpusense.backends._warp_launch import SCALARS, Launch, LaunchStep, host_view
 from gpusense.backends._warp_pieces import shared
 from gpusense.backends._warp_queue import Graphs, Group, Queue, Recording, Repeated, Step
-from gpusense.backends._warp_settings import LOCK, initialize, settings
+from gpusense.backends._warp_settings import LOCK, initialize, load, settings
 from gpusense.backends.base import Adopted, BackendInfo, Launcher, ProcessBound
 from gpusense.signatures import KERNELS, Kernel
 from gpusense.sources import relevant
@@ -271,7 +271,7 @@ class WarpBackend(ProcessBound):
         with settings():
             made = warp_module(row.file).make(kernel, flags)
             try:
-                wp.load_module(made.module, device=self._device, block_dim=group)
+                load(made.module, self._device, group)
             except Exception as error:
                 raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
         launch = Launch(self._device, made, row, group, self.gathering)

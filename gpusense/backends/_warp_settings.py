@@ -1,42 +1,68 @@
-"""Warp, started without a word and with its own settings left as they are."""
+"""Warp, started in silence and with its own settings left as they are."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import os
 import tempfile
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from gpusense.backends.cache import cache_folder
+from gpusense._version import __version__
+from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends.processor import fingerprint
+from gpusense.backends.scratch import scratch_folder
 
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 # Guards Warp's settings, which belong to the process.
 LOCK = threading.RLock()
+_LOG = logging.getLogger("gpusense")
 
 
 @functools.cache
 def initialize() -> None:
-    """Start Warp without a word; that there is no CUDA driver is told by the list of devices."""
-    with settings(), _filtered_stderr():
-        wp.init()
+    """Start Warp in silence; the list of devices says that there is no CUDA driver.
+
+    Where Warp's own folder of kernels cannot be made, which would end the run, this process's folder takes its place.
+    """
+    with settings(kernels=False), _filtered_stderr():
+        try:
+            wp.init()
+        except OSError as error:
+            folder = _folder()
+            _LOG.warning("gpusense: Warp keeps its kernels in %s, as its own folder cannot be made: %s", folder, error)
+            wp.config.kernel_cache_dir = str(folder)
+            wp.init()
+
+
+def _folder() -> Path:
+    """Return this process's folder for Warp's kernels.
+
+    Raises:
+        OSError: no folder takes files.
+    """
+    folder = scratch_folder() / "warp"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @contextlib.contextmanager
-def settings() -> Iterator[None]:
-    """Warp without its greeting and progress, and without its cache where caches are off; then as it was before."""
-    with LOCK, contextlib.ExitStack() as stack:
+def settings(*, kernels: bool = True) -> Iterator[None]:
+    """Set Warp up without greeting and progress, and with this process's folder of kernels; then as it was before."""
+    with LOCK:
+        changed: dict[str, Any]
         if hasattr(wp.config, "log_level"):
-            changed: dict[str, Any] = {"log_level": max(wp.config.log_level, wp.LOG_WARNING)}
+            changed = {"log_level": max(wp.config.log_level, wp.LOG_WARNING)}
         else:
             changed = {"quiet": True}
-        if cache_folder() is None and wp.config.kernel_cache_dir is not None:
-            folder = tempfile.TemporaryDirectory(prefix="gpusense_", ignore_cleanup_errors=True)
-            changed |= {"cache_kernels": False, "kernel_cache_dir": stack.enter_context(folder)}
+        if kernels:
+            changed["kernel_cache_dir"] = str(_folder())
         before = {name: getattr(wp.config, name) for name in changed}
         try:
             for name, value in changed.items():
@@ -47,15 +73,47 @@ def settings() -> Iterator[None]:
                 setattr(wp.config, name, value)
 
 
+def load(module: wp.Module, device: wp.Device, group: int) -> None:
+    """Compile a module for a device, or take its code from the cache; within :func:`settings`.
+
+    Raises:
+        Exception: Warp's own, where the module does not compile.
+    """
+    name = module.get_module_identifier(block_dim=group)
+    host = fingerprint() if device.is_cpu else f"{device.arch}"
+    # The name holds a hash of the module's code.
+    key = "\n".join(["warp", wp.__version__, __version__, device.name, host, name])
+    kept = _restore(key)
+    wp.load_module(module, device=device, block_dim=group)
+    files = {f"{name}/{path.name}": path for path in (_folder() / name).glob("*") if path.is_file()}
+    if files.keys() - kept:
+        with contextlib.suppress(OSError):
+            store_entry(key, pack({file: path.read_bytes() for file, path in files.items()}))
+
+
+def _restore(key: str) -> set[str]:
+    payload = load_entry(key)
+    if payload is None:
+        return set()
+    try:
+        files = unpack(payload)
+        write_files(_folder(), files)
+    except (OSError, ValueError) as error:
+        _LOG.debug("compiled kernels were not restored: %s", error)
+        return set()
+    return set(files)
+
+
 @contextlib.contextmanager
 def _filtered_stderr() -> Iterator[None]:
     """Hold back what native code writes to standard error, and pass on all but the absence of a CUDA driver."""
-    try:
-        saved = os.dup(2)
-    except OSError:
-        yield
-        return
-    with tempfile.TemporaryFile() as held:
+    with contextlib.ExitStack() as stack:
+        try:
+            held = stack.enter_context(tempfile.TemporaryFile())
+            saved = os.dup(2)
+        except OSError:
+            yield
+            return
         os.dup2(held.fileno(), 2)
         try:
             yield

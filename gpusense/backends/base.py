@@ -31,6 +31,7 @@ class BackendInfo:
         float64: Whether float64 kernels exist on it.
         lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
         vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
+        target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
     """
 
     selection: str
@@ -43,6 +44,7 @@ class BackendInfo:
     float64: bool
     lanes: int = 1
     vector_loops: bool = False
+    target: str = ""
 
 
 class ProcessBound:

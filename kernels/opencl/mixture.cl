@@ -89,7 +89,7 @@ lanes log_density(const lanes z, const lanes expected, global const real *terms)
     const lanes length = x > SMALL_DECAY ? one_minus_exp(-x) * (1 / terms[4]) : expected;
     const lanes divisor = length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
     const lanes within = terms[3] * exp_lanes(-terms[4] * z) / divisor;
-    p += (z <= expected) & (expected > 0) ? within : (lanes)0;
+    p += ((z <= expected) & (expected > 0)) ? within : (lanes)0;
 #endif
     return log_lanes(p);
 }

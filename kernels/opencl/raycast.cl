@@ -98,7 +98,7 @@ lanes cast_rays(global const entry *map_table, const int rows, const int cols, c
 #if OUTSIDE_OCCUPIED
             found = stopped ? t : found;
 #else
-            found = stopped & (sides == OCCUPIED) ? t : found;
+            found = (stopped & (sides == OCCUPIED)) ? t : found;
 #endif
             going &= sides > OCCUPIED;
             if (!some(going)) return found;

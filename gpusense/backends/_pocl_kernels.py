@@ -1,0 +1,115 @@
+"""Kernels that PoCL has compiled, kept between processes with checksums.
+
+PoCL keeps a program's kernels in files below ``<folder>/XX/YYY...``, named by a hash of the source and the options, and
+loads whatever lies there. It is given this process's own folder. The folder of a program is copied there from an entry
+of the cache before the program is built, and back into an entry after its kernels have run.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import logging
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends.scratch import scratch_folder
+
+# What PoCL reads again: programs, and kernels for one size of groups.
+_ENDINGS = (".bc", ".so")
+
+
+class PoclKernels:
+    """The kernels of this process."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._lock = threading.RLock()
+        # By the keys of entries: the folders of a program, the files that its entry holds, programs to look at.
+        self._folders: dict[str, set[str]] = {}
+        self._saved: dict[str, frozenset[str]] = {}
+        self._changed: set[str] = set()
+        self._process = os.getpid()
+        atexit.register(self._save_all)
+
+    @contextlib.contextmanager
+    def building(self, key: str) -> Iterator[None]:
+        """Bring what the entry of a program holds before it is built, and see where PoCL puts it."""
+        with self._lock:
+            if key not in self._folders:
+                self._folders[key] = self._restore(key)
+            before = self._listed()
+            yield
+            self._folders[key] |= self._listed() - before
+            self._changed.add(key)
+
+    def mark(self, key: str) -> None:
+        """Say that a kernel of a program runs for the first time, and so is compiled."""
+        self._changed.add(key)
+
+    @property
+    def changed(self) -> bool:
+        """Whether there may be something to save."""
+        return bool(self._changed)
+
+    def save(self) -> None:
+        """Put what was compiled into entries of the cache; what was started must have ended."""
+        with self._lock:
+            changed, self._changed = self._changed, set()
+            for key in changed:
+                names = frozenset(self._files(key))
+                if names - self._saved.get(key, frozenset()):
+                    # What cannot be read is compiled anew next time.
+                    with contextlib.suppress(OSError):
+                        store_entry(key, pack({name: (self.folder / name).read_bytes() for name in names}))
+                        self._saved[key] = names
+
+    def _save_all(self) -> None:
+        if os.getpid() != self._process:
+            return
+        self._changed |= self._folders.keys()
+        self.save()
+
+    def _restore(self, key: str) -> set[str]:
+        payload = load_entry(key)
+        if payload is None:
+            return set()
+        try:
+            files = unpack(payload)
+            write_files(self.folder, files)
+        except (OSError, ValueError) as error:
+            logging.getLogger("gpusense").debug("compiled kernels were not restored: %s", error)
+            return set()
+        self._saved[key] = frozenset(files)
+        return {"/".join(name.split("/")[:2]) for name in files}
+
+    def _listed(self) -> set[str]:
+        """Return the folders of all programs."""
+        found = set()
+        with contextlib.suppress(OSError):
+            for first in os.scandir(self.folder):
+                if len(first.name) == 2 and first.is_dir():
+                    found |= {f"{first.name}/{second.name}" for second in os.scandir(first.path)}
+        return found
+
+    def _files(self, key: str) -> Iterator[str]:
+        for folder in self._folders[key]:
+            for path in (self.folder / folder).rglob("*"):
+                if path.suffix in _ENDINGS and not path.name.startswith("temp"):
+                    yield path.relative_to(self.folder).as_posix()
+
+
+@functools.cache
+def pocl_kernels() -> PoclKernels:
+    """Return the kernels of this process.
+
+    Raises:
+        OSError: no folder takes files.
+    """
+    folder = scratch_folder() / "pocl"
+    folder.mkdir(exist_ok=True)
+    return PoclKernels(folder)

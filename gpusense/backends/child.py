@@ -1,0 +1,172 @@
+"""Work with a driver in a child process, which a driver may end or hang without harm to the user's process."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+# Seconds; a first compilation takes some three on a common processor.
+_LIMIT = 60.0
+_MARK = "gpusense-child "
+_START = (
+    "import sys, json; job = json.loads(sys.stdin.readline()); sys.path[:] = job['path']; "
+    "from gpusense.backends.child import main; main(job)"
+)
+# Signals that come from outside: they say nothing of the driver.
+_FOREIGN = tuple(getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
+# Lines of a dying process that say nothing of the cause.
+_NOISE = re.compile(r"^(\s*$|Stack dump|PLEASE submit|\s*#?\d+[.\s]|\d+ warnings? generated|Aborted| +File |Traceback)")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a child.
+
+    Attributes:
+        said: What it reported, in order.
+        failure: How it failed, in one line; empty where it ended well.
+        conclusive: False where something else than the driver may have ended it.
+    """
+
+    said: list[dict[str, Any]]
+    failure: str = ""
+    conclusive: bool = True
+
+
+def can_start() -> bool:
+    """Return whether children can be started: whether the interpreter is a program that takes ``-c``."""
+    if os.environ.get("GPUSENSE_PROOF", "").lower() in ("off", "0", "false", "no"):
+        return False
+    name = os.path.basename(sys.executable or "").lower()
+    return bool(re.match(r"(python|pypy)", name)) and not getattr(sys, "frozen", False)
+
+
+def time_limit() -> float:
+    """Return the seconds that a child may take: ``$GPUSENSE_PROOF_SECONDS``.
+
+    Raises:
+        ValueError: the variable is not a positive number.
+    """
+    text = os.environ.get("GPUSENSE_PROOF_SECONDS", "")
+    try:
+        seconds = float(text) if text else _LIMIT
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < float("inf"):
+        raise ValueError(f"GPUSENSE_PROOF_SECONDS: must be a number of seconds > 0, got {text!r}")
+    return seconds
+
+
+def run(job: dict[str, Any]) -> Outcome:
+    """Do a job in a child.
+
+    Args:
+        job: ``do`` is the name of a function ``module:name``, which is called with the job and a function that reports
+            a dictionary; the rest is the function's own.
+    """
+    path = [os.path.abspath(entry) for entry in sys.path]
+    return run_text(["-P", "-W", "ignore", "-c", _START], {**job, "path": path})
+
+
+def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str] | None = None) -> Outcome:
+    """Run the interpreter in a child.
+
+    Args:
+        arguments: The interpreter's own.
+        job: What the program finds on standard input, as one line of JSON.
+        variables: Further variables of its environment.
+    """
+    # The child starts no children.
+    environment = os.environ | {"GPUSENSE_PROOF": "off"} | (variables or {})
+    command = [sys.executable, *arguments]
+    limit = time_limit()
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
+        try:
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=environment, start_new_session=True
+            )
+        except OSError as error:
+            return Outcome([], f"no child process can be started: {error}", conclusive=False)
+        try:
+            with contextlib.suppress(BrokenPipeError):
+                process.communicate(json.dumps(job).encode() + b"\n", timeout=limit)
+            code: int | None = process.returncode
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            _end(process)
+        said = _read_reports(out)
+        if code == 0:
+            return Outcome(said)
+        if code is None:
+            return Outcome(said, f"hangs: no answer in {limit:g} s")
+        return Outcome(said, _describe(code, _last_words(errors)), conclusive=-code not in _FOREIGN)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End the child, if it runs still, and what it started."""
+    if process.poll() is None:
+        with contextlib.suppress(OSError):
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+        process.wait()
+
+
+def _read_reports(file: BinaryIO) -> list[dict[str, Any]]:
+    file.seek(0)
+    lines = file.read(1 << 20).decode("utf-8", "replace").splitlines()
+    reports = []
+    for line in lines:
+        _, mark, text = line.partition(_MARK)
+        if mark:
+            # The last line of a child that was killed may be cut off.
+            with contextlib.suppress(ValueError):
+                reports.append(json.loads(text))
+    return reports
+
+
+def _last_words(file: BinaryIO) -> str:
+    """Return the line of standard error that says most about the end of a process."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - (1 << 16), 0))
+    lines = file.read().decode("utf-8", "replace").splitlines()
+    told = [line.strip() for line in lines if not _NOISE.match(line)]
+    errors = [line for line in told if re.search(r"\berror\b", line, re.IGNORECASE)]
+    return (errors or told or [""])[0 if errors else -1][:200]
+
+
+def _describe(code: int, words: str) -> str:
+    if code >= 0:
+        return words or f"exit code {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    return f"ends the process with {name}" + (f" ({words})" if words else "")
+
+
+def main(job: dict[str, Any]) -> None:
+    """Do a job in this process, which is the child."""
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        # A process that is expected to die leaves no image of its memory.
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    def report(said: dict[str, Any]) -> None:
+        sys.stdout.write(f"\n{_MARK}{json.dumps(said)}\n")
+        sys.stdout.flush()
+
+    module, _, name = job["do"].partition(":")
+    getattr(importlib.import_module(module), name)(job, report)

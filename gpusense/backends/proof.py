@@ -1,0 +1,176 @@
+"""Verdicts on devices: a child compiles and runs kernels of each family on a device before this process trusts it.
+
+A compiler that does not know a processor aborts, hangs or makes wrong code, and it does so in the process that asked.
+So the first time that a device, its driver, the processor and this version of gpusense are met, a child computes a
+small scene and compares it with NumPy. A family of kernels that fails is not used: vectors give way to narrower ones
+and then to scalar kernels, float64 is called absent, and where scalar kernels fail the device is unusable. The verdict
+is kept in the cache, and so is what the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import re
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+from gpusense._version import __version__
+from gpusense.backends import child
+from gpusense.backends.base import BackendInfo
+from gpusense.backends.cache import discard_entry, load_entry, store_entry
+from gpusense.backends.processor import fingerprint
+
+# Families of kernels, in the order in which a child tries them.
+SCALAR, VECTORS, FLOAT64 = FAMILIES = ("scalar kernels", "kernels in vectors", "float64 kernels")
+_PROVE = "gpusense.evaluation.proof:prove"
+_LOG = logging.getLogger("gpusense")
+# What helps against a failure, by what it says.
+_REMEDIES = (
+    (r'"ld" doesn\'t exist|linker command failed', "install the linker ld (on Debian: apt-get install binutils)"),
+    (r"No space left|takes \d+ MiB", "free some space, or set GPUSENSE_CACHE_DIR to a folder with more"),
+    (r"hangs", "set GPUSENSE_PROOF_SECONDS higher if the machine is slow"),
+)
+_OTHERWISE = "update the driver, or choose another device with GPUSENSE_BACKEND (for example warp:cpu or numpy)"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is known of a device.
+
+    Attributes:
+        usable: Whether models can run on it.
+        lanes: Lanes of kernels in vectors that were proved; 1 where only scalar ones were.
+        float64: Whether float64 kernels were proved.
+        reason: What failed, empty where nothing did.
+        remedy: What helps against it.
+    """
+
+    usable: bool
+    lanes: int
+    float64: bool
+    reason: str = ""
+    remedy: str = ""
+
+
+_lock = threading.RLock()
+_known: dict[str, Verdict] = {}
+
+
+def trust(info: BackendInfo) -> Verdict:
+    """Return a verdict that takes a driver by its word."""
+    return Verdict(True, info.lanes, info.float64)
+
+
+def unusable(reason: str) -> Verdict:
+    """Return the verdict on a device that no model can run on."""
+    return Verdict(False, 1, False, reason, remedy_for(reason))
+
+
+def verdict_on(info: BackendInfo, *, anew: bool = False) -> Verdict:
+    """Return the verdict on a device: the kept one, or a child's where there is none or it is to be made ``anew``."""
+    if not child.can_start():
+        return trust(info)
+    key = _key(info)
+    with _lock:
+        if anew:
+            _known.pop(key, None)
+            discard_entry(key)
+        verdict = _known.get(key) or _load(key)
+        if verdict is None:
+            verdict, conclusive = _prove(info)
+            if conclusive:
+                store_entry(key, json.dumps(dataclasses.asdict(verdict)).encode())
+            if verdict.reason:
+                _LOG.warning("gpusense: %s", summary(info, verdict))
+        _known[key] = verdict
+        return verdict
+
+
+def summary(info: BackendInfo, verdict: Verdict) -> str:
+    """Return what failed on a device and what follows, in one line."""
+    what = f"{info.selection} ({info.name}, {info.driver})"
+    if not verdict.usable:
+        return f"{what} is unusable: {verdict.reason}; {verdict.remedy}"
+    return f"{what}: {verdict.reason}, and so these are not used; {verdict.remedy}"
+
+
+def apply(info: BackendInfo, verdict: Verdict) -> BackendInfo:
+    """Return a device as the verdict leaves it."""
+    return dataclasses.replace(info, lanes=verdict.lanes, float64=verdict.float64)
+
+
+def remedy_for(reason: str) -> str:
+    """Return what helps against a failure."""
+    return next((remedy for pattern, remedy in _REMEDIES if re.search(pattern, reason)), _OTHERWISE)
+
+
+def _key(info: BackendInfo) -> str:
+    return "\n".join(
+        ["verdict", info.backend, info.name, info.driver, info.target, str(info.lanes), fingerprint(), __version__]
+    )
+
+
+def _load(key: str) -> Verdict | None:
+    kept = load_entry(key)
+    if kept is None:
+        return None
+    try:
+        return Verdict(**json.loads(kept))
+    except (TypeError, ValueError):
+        return None
+
+
+def _prove(info: BackendInfo) -> tuple[Verdict, bool]:
+    """Try families of kernels in children until each is proved or given up; also whether the verdict is to be kept."""
+    widths = [width for width in (info.lanes, 8, 1) if width <= info.lanes]
+    failures = []
+    conclusive = True
+    for lanes in dict.fromkeys(widths):
+        outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(dataclasses.replace(info, lanes=lanes))})
+        failed, failure = _failure(outcome)
+        if not failed:
+            return _verdict(lanes, info.float64, failures), conclusive
+        conclusive &= outcome.conclusive
+        failures.append(f"{failed} {failure}")
+        if failed == FLOAT64:
+            return _verdict(lanes, False, failures), conclusive
+        if failed != VECTORS:
+            break
+        failures[-1] = f"kernels in vectors of {lanes} {failure}"
+    return unusable("; ".join(failures)), conclusive
+
+
+def _verdict(lanes: int, float64: bool, failures: list[str]) -> Verdict:
+    reason = "; ".join(failures)
+    return Verdict(True, lanes, float64, reason, remedy_for(reason) if reason else "")
+
+
+def _failure(outcome: child.Outcome) -> tuple[str, str]:
+    """Return the family that failed, empty where none did, and how."""
+    begun = ""
+    for said in outcome.said:
+        begun = str(said.get("begin", begun))
+        if "wrong" in said:
+            return begun, f"compute wrong numbers ({said['wrong']})"
+        if said.get("end"):
+            begun = ""
+    if outcome.failure:
+        # A process that dies in its last moments has done all that was asked of it, but the next one may die too.
+        return begun or SCALAR, _verb(outcome.failure)
+    return begun, "ended early" if begun else ""
+
+
+def _verb(failure: str) -> str:
+    """Return a child's failure as it reads after the name of a family."""
+    for singular, plural in (("ends the process", "end the process"), ("hangs", "hang")):
+        if failure.startswith(singular):
+            return plural + failure[len(singular) :]
+    return f"fail: {failure}"
+
+
+def info_of(job: dict[str, Any]) -> BackendInfo:
+    """Return the device that a child is to prove."""
+    return BackendInfo(**job["info"])

@@ -1,0 +1,100 @@
+"""Prove a device: compute a small scene with each family of kernels and compare with NumPy.
+
+The scene is an ordinary one, so that the kernels compiled here are those of a first call with a scan, and serve it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends import Backend, get_backend, open_device
+from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, info_of
+from gpusense.grid import OccupancyGrid
+from gpusense.models.beam import BeamModel
+from gpusense.models.caster import RayCaster
+from gpusense.models.field import LikelihoodFieldModel
+from gpusense.prepare import distance_transform
+from gpusense.scanner import Scanner
+from gpusense.tolerances import TOLERANCES, Tolerance, scan_tolerance
+
+Report = Callable[[dict[str, Any]], None]
+_BEAMS = 24
+_POSES = 70
+
+
+class Scene:
+    """A room with pillars and an unknown corner, a scan, and poses of which some lie in walls."""
+
+    def __init__(self) -> None:
+        random = np.random.default_rng(0)
+        cells = np.zeros((40, 57), np.int8)
+        cells[[0, -1]] = cells[:, [0, -1]] = 100
+        cells[random.integers(1, 39, 25), random.integers(1, 56, 25)] = 100
+        cells[30:, 40:] = -1
+        self.obstacles = cells == 100
+        self.grid = OccupancyGrid(cells, resolution=0.1)
+        self.scanner = Scanner.uniform(angle_min=-3.0, angle_increment=6.0 / (_BEAMS - 1), count=_BEAMS, range_max=4.5)
+        self.poses = random.uniform((0.3, 0.3, -3.2), (5.4, 3.7, 3.2), (_POSES, 3))
+        self.ranges = random.uniform(0.1, 4.4, _BEAMS)
+        self.ranges[[3, 9, 10]] = 4.5, np.nan, np.inf
+
+
+def prove(job: dict[str, Any], report: Report) -> None:
+    """Try each family of kernels that a device has; stop at the first that computes wrong numbers.
+
+    Args:
+        job: ``info`` describes the device, with the lanes to try.
+        report: Gets the family that begins, what was wrong, and the end.
+    """
+    info = info_of(job)
+    scene, numpy = Scene(), get_backend("numpy")
+    report({"begin": SCALAR})
+    device = open_device(info)
+    families = [(SCALAR, _tables)]
+    families.append((VECTORS if info.lanes > 1 else SCALAR, _models))
+    if info.float64:
+        families.append((FLOAT64, _float64))
+    for family, check in families:
+        report({"begin": family})
+        if wrong := check(scene, device, numpy):
+            report({"wrong": wrong})
+            return
+    report({"end": True})
+
+
+def _tables(scene: Scene, device: Backend, numpy: Backend) -> str:
+    """Compare what is made of a map: kernels that have no bodies in vectors."""
+    mine, theirs = (distance_transform(scene.obstacles, backend=backend) for backend in (device, numpy))
+    return _difference(TOLERANCES["distance transform"], mine, theirs)
+
+
+def _models(scene: Scene, device: Backend, numpy: Backend) -> str:
+    """Compare both models of a scan in float32; the beam model casts its rays itself."""
+    tolerance = scan_tolerance("float32", _BEAMS).twice()
+    for kind in (LikelihoodFieldModel, BeamModel):
+        models = [kind(scene.grid, scene.scanner, backend=backend) for backend in (device, numpy)]
+        scores = [model.log_likelihood(scene.poses, scene.ranges) for model in models]
+        if wrong := _difference(tolerance, *scores):
+            return f"{kind.__name__}, {wrong}"
+    return ""
+
+
+def _float64(scene: Scene, device: Backend, numpy: Backend) -> str:
+    """Compare ranges in float64."""
+    angles = scene.scanner.bearings
+    ranges = [
+        RayCaster(scene.grid, scene.scanner.range_max, precision="float64", backend=backend).cast(scene.poses, angles)
+        for backend in (device, numpy)
+    ]
+    return _difference(TOLERANCES["float64 ranges"].twice(), *ranges)
+
+
+def _difference(tolerance: Tolerance, mine: np.ndarray, theirs: np.ndarray) -> str:
+    """Return how far results lie apart; empty where the tolerance allows it."""
+    found = tolerance.difference(mine, theirs)
+    if found <= tolerance.value:
+        return ""
+    return f"{tolerance.name}: {found:.3g} {tolerance.unit}, allowed {tolerance.value:.3g}"

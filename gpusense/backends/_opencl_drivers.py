@@ -58,12 +58,10 @@ class Driver:
     Attributes:
         file: The file; Intel's library itself where the file is made here.
         library: What the loader is to load.
-        beside: Whether the file lies beside pyopencl, where the loader looks whatever the variables say.
     """
 
     file: Path
     library: str
-    beside: bool = False
 
 
 @dataclass(frozen=True)
@@ -185,15 +183,19 @@ def _key(drivers: tuple[Driver, ...]) -> str:
 
 def _registered() -> list[Driver]:
     """Return the drivers that the loader finds by itself, the system's first."""
-    place = os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _SYSTEM
+    place = _place()
     beside = Path(cl.__file__).parent / ".libs"
-    if not os.path.isdir(place):
-        files = [Path(place)] if os.path.isfile(place) else []
-        # A single file or library stands for all drivers but those beside pyopencl.
-        return [Driver(file, _library(file) if file.suffix == ".icd" else str(file)) for file in files]
-    found = [Driver(file, _library(file)) for file in sorted(Path(place).glob("*.icd"))]
-    found += [Driver(file, _library(file), beside=True) for file in sorted(beside.glob("*.icd"))]
+    if place.is_file():
+        # A single file or library stands for all drivers.
+        return [Driver(place, _library(place) if place.suffix == ".icd" else str(place))]
+    found = [Driver(file, _library(file)) for file in sorted(place.glob("*.icd"))]
+    found += [Driver(file, _library(file)) for file in sorted(beside.glob("*.icd"))]
     return [driver for driver in found if driver.library]
+
+
+def _place() -> Path:
+    """Return the folder of the system's ``.icd`` files, or the one driver that a variable names."""
+    return Path(os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _SYSTEM)
 
 
 def _library(file: Path) -> str:
@@ -208,8 +210,7 @@ def _library(file: Path) -> str:
 
 def _intel(present: list[Driver]) -> Driver | None:
     """Return Intel's runtime where its wheel is installed and no ``.icd`` file names it."""
-    place = os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _SYSTEM
-    if not sys.platform.startswith("linux") or os.path.isfile(place):
+    if not sys.platform.startswith("linux") or _place().is_file():
         # A variable that names one driver is obeyed.
         return None
     if any(re.search(r"libintelocl\.so", driver.library) for driver in present):

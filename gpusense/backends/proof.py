@@ -46,6 +46,7 @@ class Verdict:
         float64: Whether float64 kernels were proved.
         reason: What failed, empty where nothing did.
         remedy: What helps against it.
+        rate: Calls of a scan per second, by which devices of one class are compared; 0 where it was not measured.
     """
 
     usable: bool
@@ -53,6 +54,7 @@ class Verdict:
     float64: bool
     reason: str = ""
     remedy: str = ""
+    rate: float = 0.0
 
 
 _lock = threading.RLock()
@@ -132,20 +134,21 @@ def _prove(info: BackendInfo) -> tuple[Verdict, bool]:
         outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(dataclasses.replace(info, lanes=lanes))})
         failed, failure = _failure(outcome)
         if not failed:
-            return _verdict(lanes, info.float64, failures), conclusive
+            return _verdict(lanes, info.float64, failures, outcome), conclusive
         conclusive &= outcome.conclusive
         failures.append(f"{failed} {failure}")
         if failed == FLOAT64:
-            return _verdict(lanes, False, failures), conclusive
+            return _verdict(lanes, False, failures, outcome), conclusive
         if failed != VECTORS:
             break
         failures[-1] = f"kernels in vectors of {lanes} {failure}"
     return unusable("; ".join(failures)), conclusive
 
 
-def _verdict(lanes: int, float64: bool, failures: list[str]) -> Verdict:
+def _verdict(lanes: int, float64: bool, failures: list[str], outcome: child.Outcome) -> Verdict:
     reason = "; ".join(failures)
-    return Verdict(True, lanes, float64, reason, remedy_for(reason) if reason else "")
+    rate = next((float(said["rate"]) for said in outcome.said if "rate" in said), 0.0)
+    return Verdict(True, lanes, float64, reason, remedy_for(reason) if reason else "", rate)
 
 
 def _failure(outcome: child.Outcome) -> tuple[str, str]:

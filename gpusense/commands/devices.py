@@ -62,8 +62,9 @@ def _driver(device: Device) -> str:
 
     if not device.available:
         return device.driver or "-"
-    vectors = f"{device.lanes} lanes" if device.lanes > 1 else ""
-    return ", ".join(filter(None, (short_driver(device.driver), vectors, device.target, "" if device.float64 else "no float64")))
+    lanes = f"{device.lanes} lanes" if device.lanes > 1 else ""
+    absent = "" if device.float64 else "no float64"
+    return ", ".join(part for part in (short_driver(device.driver), lanes, device.target, absent) if part)
 
 
 def _auto() -> tuple[str | None, str | None]:

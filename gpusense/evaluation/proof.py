@@ -5,6 +5,8 @@ The scene is an ordinary one, so that the kernels compiled here are those of a f
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +25,9 @@ from gpusense.tolerances import TOLERANCES, Tolerance, scan_tolerance
 Report = Callable[[dict[str, Any]], None]
 _BEAMS = 24
 _POSES = 70
+# Poses and seconds of the calls that are timed.
+_TIMED_POSES = 4000
+_TIMED_SECONDS = 0.05
 
 
 class Scene:
@@ -53,15 +58,15 @@ def prove(job: dict[str, Any], report: Report) -> None:
     scene, numpy = Scene(), get_backend("numpy")
     report({"begin": SCALAR})
     device = open_device(info)
-    families = [(SCALAR, _tables)]
-    families.append((VECTORS if info.lanes > 1 else SCALAR, _models))
-    if info.float64:
-        families.append((FLOAT64, _float64))
-    for family, check in families:
+    models = VECTORS if info.lanes > 1 else SCALAR
+    checks = [(SCALAR, _tables), (models, _models), *([(FLOAT64, _float64)] if info.float64 else [])]
+    for family, check in checks:
         report({"begin": family})
         if wrong := check(scene, device, numpy):
             report({"wrong": wrong})
             return
+        if family == models and check is _models:
+            report({"rate": _rate(scene, device)})
     report({"end": True})
 
 
@@ -80,6 +85,22 @@ def _models(scene: Scene, device: Backend, numpy: Backend) -> str:
         if wrong := _difference(tolerance, *scores):
             return f"{kind.__name__}, {wrong}"
     return ""
+
+
+def _rate(scene: Scene, device: Backend) -> float:
+    """Return how many scans per second the device scores: the geometric mean of both models' best calls."""
+    poses = np.resize(scene.poses, (_TIMED_POSES, 3))
+    best = []
+    for kind in (LikelihoodFieldModel, BeamModel):
+        model = kind(scene.grid, scene.scanner, backend=device)
+        model.log_likelihood(poses, scene.ranges)
+        seconds, end = [], time.perf_counter() + _TIMED_SECONDS
+        while len(seconds) < 3 or time.perf_counter() < end:
+            begin = time.perf_counter()
+            model.log_likelihood(poses, scene.ranges)
+            seconds.append(time.perf_counter() - begin)
+        best.append(min(seconds))
+    return 1 / math.sqrt(best[0] * best[1])
 
 
 def _float64(scene: Scene, device: Backend, numpy: Backend) -> str:

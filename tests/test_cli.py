@@ -174,8 +174,8 @@ def test_devices_as_json(capsys):
 def test_devices_as_a_table(capsys):
     assert cli.main(["devices"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["selection", "backend", "kind", "name", "status"]
-    assert any(line.split()[:2] == ["numpy", "numpy"] or line.split()[:3] == ["*", "numpy", "numpy"] for line in lines)
+    assert lines[0].split() == ["selection", "kind", "name", "driver", "status"]
+    assert any(line.split()[:2] == ["numpy", "cpu"] or line.split()[:3] == ["*", "numpy", "cpu"] for line in lines)
     assert sum(line.startswith("*  ") for line in lines) == 1
 
 

@@ -123,7 +123,8 @@ def _verdict(info: BackendInfo, handle: Any, module: ModuleType, *, anew: bool =
         return proof.trust(info)
     if info.backend == "opencl" and (trouble := module.trouble_of(handle)):
         return proof.unusable(trouble)
-    return proof.verdict_on(info, anew=anew)
+    drivers = module.drivers_as_job() if info.backend == "opencl" else None
+    return proof.verdict_on(info, drivers=drivers, anew=anew)
 
 
 def _device(info: BackendInfo, verdict: Verdict | None = None) -> Device:
@@ -236,6 +237,13 @@ def open_device(info: BackendInfo) -> Backend:
     if (listed.name, listed.driver) != (info.name, info.driver):
         raise RuntimeError(f"{info.selection} is {listed.name} ({listed.driver}), not {info.name} ({info.driver})")
     return _made(module, info, handle)
+
+
+def take_drivers(drivers: Any) -> None:
+    """Load the drivers that a parent names in this process, which is its child."""
+    from gpusense.backends import _opencl_drivers
+
+    _opencl_drivers.take(drivers)
 
 
 def _listed(selection: str) -> tuple[ModuleType, BackendInfo, Any]:

@@ -14,6 +14,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpusense.backends import _opencl_arrays, _pocl, _pocl_kernels
+from gpusense.backends._opencl_caches import new_kernel, without_caches
 from gpusense.backends._opencl_devices import (
     absent_drivers,
     info_of,
@@ -21,6 +22,7 @@ from gpusense.backends._opencl_devices import (
     shares_memory,
     trouble_of,
 )
+from gpusense.backends._opencl_drivers import as_job as drivers_as_job
 from gpusense.backends._opencl_launch import Launch
 from gpusense.backends._opencl_memory import DeviceBuffer, SharedBuffer, driver_errors
 from gpusense.backends._opencl_replay import KeptLaunch, Repeated
@@ -29,7 +31,7 @@ from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS
 from gpusense.sources import assemble, relevant, uses_double, with_places
 
-__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "list_devices", "trouble_of"]
+__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "drivers_as_job", "list_devices", "trouble_of"]
 
 # One driver's own clearing hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
@@ -72,6 +74,7 @@ class OpenCLBackend(ProcessBound):
         self.alignment = _opencl_arrays.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
+        self._keys = ProgramCache(info)
         self._cache = _program_cache(info, device)
         self._pocl = _pocl_kernels.pocl_kernels() if _pocl.is_pocl(device) else None
         # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
@@ -128,7 +131,7 @@ class OpenCLBackend(ProcessBound):
         if size <= 4 * _CLEARED_WORDS:
             cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
             return
-        kernel, words = cl.Kernel(self._built(cl.Program(self._context, _CLEAR)), "clear"), size // 4
+        kernel, words = new_kernel(self._built(cl.Program(self._context, _CLEAR)), "clear"), size // 4
         for first in range(0, words, _CLEARED_WORDS):
             kernel.set_args(buffer, np.uint64(first))
             cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
@@ -239,7 +242,7 @@ class OpenCLBackend(ProcessBound):
         program = self._programs.get((row.file, flags))
         if program is None:
             program = self._programs[row.file, flags] = self._build(row.file, flags)
-        return Launch(self, cl.Kernel(program, kernel), row, flags, self._kernel_runs(row.file, flags))
+        return Launch(self, new_kernel(program, kernel), row, flags, self._kernel_runs(row.file, flags))
 
     def _kernel_runs(self, file: str, flags: frozenset[str]) -> Callable[[], None] | None:
         """Return what is to be called when a kernel of a program is launched for the first time."""
@@ -248,7 +251,7 @@ class OpenCLBackend(ProcessBound):
         return functools.partial(self._pocl.mark, self._program_key(assemble(file, flags)))
 
     def _program_key(self, source: str) -> str:
-        return ProgramCache(self.info).key(source, self.options)
+        return self._keys.key(source, self.options)
 
     def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
         if "FLOAT64" in flags and not self.info.float64:
@@ -283,7 +286,7 @@ class OpenCLBackend(ProcessBound):
             return None
 
     def _built(self, program: cl.Program) -> cl.Program:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), without_caches():
             # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
             warnings.simplefilter("ignore", cl.CompilerWarning)
             return program.build(self.options, [self._device])

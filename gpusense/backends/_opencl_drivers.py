@@ -81,6 +81,8 @@ class Choice:
 
 _lock = threading.RLock()
 _loaded = False
+# What a parent has named.
+_taken: Choice | None = None
 
 
 def platforms() -> list[cl.Platform]:
@@ -113,9 +115,13 @@ def _ask() -> list[cl.Platform]:
         return []
 
 
-@functools.cache
 def choice() -> Choice:
-    """Return which drivers the loader is given, after a child has loaded them."""
+    """Return which drivers the loader is given: those that a child has loaded before, or a parent has named."""
+    return _chosen() if _taken is None else _taken
+
+
+@functools.cache
+def _chosen() -> Choice:
     present = _registered()
     intel = _intel(present)
     drivers = (*present, intel) if intel is not None else tuple(present)
@@ -134,6 +140,18 @@ def choice() -> Choice:
     known = json.loads(kept)
     left_out = tuple((name, reason) for name, reason in known["left_out"])
     return Choice(_without(drivers, left_out) if left_out else wanted, left_out, known["failure"])
+
+
+def as_job() -> list[tuple[str, str]] | None:
+    """Return the drivers that this process loads, for a child that is to load the same ones."""
+    drivers = choice().drivers
+    return None if drivers is None else [(str(driver.file), driver.library) for driver in drivers]
+
+
+def take(job: list[tuple[str, str]] | None) -> None:
+    """Load the drivers of :func:`as_job` in this process, which is a child."""
+    global _taken
+    _taken = Choice(None if job is None else tuple(Driver(Path(file), library) for file, library in job))
 
 
 def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tuple[Choice, bool]:

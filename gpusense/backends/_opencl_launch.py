@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import pyopencl as cl
 
+from gpusense.backends._opencl_caches import new_kernel, without_caches
 from gpusense.backends._opencl_memory import driver_errors
 from gpusense.backends._opencl_replay import KeptLaunch
 from gpusense.signatures import Kernel, lanes_of
@@ -45,7 +46,8 @@ class Launch:
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # Told the types, pyopencl sets all arguments in 1 us; a single number without takes it 6 us.
         self._types = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
-        kernel.set_arg_types(self._types)
+        with without_caches():
+            kernel.set_arg_types(self._types)
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         group = (self._group, *(1 for _ in size[1:]))
@@ -56,8 +58,9 @@ class Launch:
             self._first = None
         kept = self._backend.recording()
         if kept is not None:
-            own = cl.Kernel(self._kernel.program, self._kernel.function_name)
-            own.set_arg_types(self._types)
+            own = new_kernel(self._kernel.get_info(cl.kernel_info.PROGRAM), self._kernel.function_name)
+            with without_caches():
+                own.set_arg_types(self._types)
             own.set_args(*arguments)
             kept.append(KeptLaunch(own, rounded, group, arguments))
             return

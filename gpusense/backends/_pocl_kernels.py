@@ -49,7 +49,8 @@ class PoclKernels:
 
     def mark(self, key: str) -> None:
         """Say that a kernel of a program runs for the first time, and so is compiled."""
-        self._changed.add(key)
+        with self._lock:
+            self._changed.add(key)
 
     @property
     def changed(self) -> bool:

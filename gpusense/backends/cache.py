@@ -12,6 +12,7 @@ PoCL and Warp keep compiled kernels in folders of their own, without checksums. 
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import io
 import logging
@@ -31,7 +32,9 @@ MAX_ENTRIES = 1024
 _MAGIC = b"gpusense entry 2\n"
 _HEAD = len(_MAGIC) + 32
 _LOG = logging.getLogger("gpusense")
-# Folders whose failure was reported.
+# Bytes, as most entries have.
+_SMALL = 64 << 10
+# Folders that do not take files.
 _reported: set[str] = set()
 
 
@@ -62,13 +65,36 @@ def temporary_folder() -> Path | None:
 
 
 def _folders() -> Iterator[Path]:
-    """Yield the folders of the cache, the chosen one first."""
+    """Yield the chosen folder, and the temporary one where the chosen one does not take files."""
     chosen = cache_folder()
-    if chosen is not None:
-        yield chosen
+    if chosen is None:
+        return
+    yield chosen
+    if str(chosen) in _reported or not _takes_files(str(chosen)):
         temporary = temporary_folder()
         if temporary is not None and temporary != chosen:
             yield temporary
+
+
+@functools.lru_cache(maxsize=64)
+def _takes_files(folder: str) -> bool:
+    """Return whether a folder takes a small file; it is made where it is absent."""
+    try:
+        os.makedirs(folder, mode=0o700, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(_SMALL))
+    except OSError as error:
+        _report(folder, error)
+        return False
+    return True
+
+
+def _report(folder: str, error: OSError) -> None:
+    """Report once that a folder does not take files."""
+    if folder not in _reported:
+        _reported.add(folder)
+        reason = error.strerror or type(error).__name__
+        _LOG.warning("gpusense: the cache folder %s cannot be written: %s", folder, reason)
 
 
 def _file(key: str) -> str:
@@ -99,10 +125,7 @@ def store_entry(key: str, payload: bytes) -> None:
             _write(folder, _file(key), _MAGIC + hashlib.sha256(payload).digest() + payload)
             return
         except OSError as error:
-            if str(folder) not in _reported:
-                _reported.add(str(folder))
-                reason = error.strerror or type(error).__name__
-                _LOG.warning("gpusense: the cache folder %s cannot be written: %s", folder, reason)
+            _report(str(folder), error)
 
 
 def discard_entry(key: str) -> None:

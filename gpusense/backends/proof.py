@@ -23,8 +23,8 @@ from gpusense.backends.base import BackendInfo
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
 from gpusense.backends.processor import fingerprint
 
-# Families of kernels, in the order in which a child tries them.
-SCALAR, VECTORS, FLOAT64 = FAMILIES = ("scalar kernels", "kernels in vectors", "float64 kernels")
+# Families of kernels.
+SCALAR, FLOAT64, VECTORS = "scalar kernels", "float64 kernels", "kernels in vectors"
 _PROVE = "gpusense.evaluation.proof:prove"
 _LOG = logging.getLogger("gpusense")
 # What helps against a failure, by what it says.
@@ -32,6 +32,10 @@ _REMEDIES = (
     (r'"ld" doesn\'t exist|linker command failed', "install the linker ld (on Debian: apt-get install binutils)"),
     (r"No space left|takes \d+ MiB", "free some space, or set GPUSENSE_CACHE_DIR to a folder with more"),
     (r"hangs", "set GPUSENSE_PROOF_SECONDS higher if the machine is slow"),
+)
+# Failures of the machine's state and not of the driver: verdicts by them are not kept.
+_PASSING = re.compile(
+    r"No space left|is full|quota|Permission denied|Read-only file|[Oo]ut of memory|MemoryError|allocate|takes \d+ MiB"
 )
 _OTHERWISE = "update the driver, or choose another device with GPUSENSE_BACKEND (for example warp:cpu or numpy)"
 
@@ -71,8 +75,14 @@ def unusable(reason: str) -> Verdict:
     return Verdict(False, 1, False, reason, remedy_for(reason))
 
 
-def verdict_on(info: BackendInfo, *, anew: bool = False) -> Verdict:
-    """Return the verdict on a device: the kept one, or a child's where there is none or it is to be made ``anew``."""
+def verdict_on(info: BackendInfo, *, drivers: Any = None, anew: bool = False) -> Verdict:
+    """Return the verdict on a device: the kept one, or a child's where there is none or it is to be made ``anew``.
+
+    Args:
+        info: The device.
+        drivers: What a child is told of the drivers that it is to load.
+        anew: Whether the kept verdict is dropped.
+    """
     if not child.can_start():
         return trust(info)
     key = _key(info)
@@ -82,7 +92,7 @@ def verdict_on(info: BackendInfo, *, anew: bool = False) -> Verdict:
             discard_entry(key)
         verdict = _known.get(key) or _load(key)
         if verdict is None:
-            verdict, conclusive = _prove(info)
+            verdict, conclusive = _prove(info, drivers)
             if conclusive:
                 store_entry(key, json.dumps(dataclasses.asdict(verdict)).encode())
             if verdict.reason:
@@ -125,30 +135,31 @@ def _load(key: str) -> Verdict | None:
         return None
 
 
-def _prove(info: BackendInfo) -> tuple[Verdict, bool]:
+def _prove(info: BackendInfo, drivers: Any) -> tuple[Verdict, bool]:
     """Try families of kernels in children until each is proved or given up; also whether the verdict is to be kept."""
-    widths = [width for width in (info.lanes, 8, 1) if width <= info.lanes]
-    failures = []
+    failures: list[str] = []
     conclusive = True
-    for lanes in dict.fromkeys(widths):
-        outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(dataclasses.replace(info, lanes=lanes))})
+    while True:
+        outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(info), "drivers": drivers})
         failed, failure = _failure(outcome)
         if not failed:
-            return _verdict(lanes, info.float64, failures, outcome), conclusive
-        conclusive &= outcome.conclusive
-        failures.append(f"{failed} {failure}")
+            return _verdict(info, failures, outcome), conclusive
+        conclusive &= outcome.conclusive and not _PASSING.search(failure)
+        lanes = f" of {info.lanes}" if failed == VECTORS else ""
+        failures.append(f"{failed}{lanes} {failure}")
         if failed == FLOAT64:
-            return _verdict(lanes, False, failures, outcome), conclusive
-        if failed != VECTORS:
-            break
-        failures[-1] = f"kernels in vectors of {lanes} {failure}"
-    return unusable("; ".join(failures)), conclusive
+            info = dataclasses.replace(info, float64=False)
+        elif failed == VECTORS:
+            info = dataclasses.replace(info, lanes=8 if info.lanes > 8 else 1)
+        else:
+            return unusable("; ".join(failures)), conclusive
 
 
-def _verdict(lanes: int, float64: bool, failures: list[str], outcome: child.Outcome) -> Verdict:
+def _verdict(info: BackendInfo, failures: list[str], outcome: child.Outcome) -> Verdict:
+    """Return the verdict on a device as it was proved."""
     reason = "; ".join(failures)
     rate = next((float(said["rate"]) for said in outcome.said if "rate" in said), 0.0)
-    return Verdict(True, lanes, float64, reason, remedy_for(reason) if reason else "", rate)
+    return Verdict(True, info.lanes, info.float64, reason, remedy_for(reason) if reason else "", rate)
 
 
 def _failure(outcome: child.Outcome) -> tuple[str, str]:

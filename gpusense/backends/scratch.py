@@ -20,11 +20,6 @@ from typing import Any
 
 from gpusense.backends.cache import cache_folder, temporary_folder
 
-try:
-    import fcntl
-except ImportError:  # pragma: no cover - Windows
-    fcntl = None  # type: ignore[assignment]
-
 _PREFIX = "run-"
 _LOCK_FILE = "lock"
 # Bytes that must be free: kernels of a long run, with room for the compiler's own files.
@@ -75,19 +70,30 @@ def _make(parent: Path) -> Path:
     if hasattr(os, "statvfs") and os.statvfs(parent).f_flag & getattr(os, "ST_NOEXEC", 0):
         raise OSError("no code may run from there")
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
-    try:
+    with contextlib.ExitStack() as failing:
+        failing.callback(shutil.rmtree, folder, ignore_errors=True)
         # Held open, and so locked, until the process ends.
-        lock = open(folder / _LOCK_FILE, "wb")  # noqa: SIM115
-        if fcntl is not None:
-            with contextlib.suppress(OSError):
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock = failing.enter_context(open(folder / _LOCK_FILE, "wb"))
+        with contextlib.suppress(OSError):
+            _lock(lock)
         _check_room(folder)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+        failing.pop_all()
     atexit.register(_remove, folder, os.getpid(), lock)
     _remove_stale(parent)
     return folder
+
+
+def _lock(file: Any) -> None:
+    """Lock a file until it is closed or this process ends.
+
+    Raises:
+        OSError: another process has locked it, or the system has no such locks.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        raise OSError("no locks of files here") from None
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _check_room(folder: Path) -> None:
@@ -114,14 +120,12 @@ def _remove(folder: Path, process: int, lock: Any) -> None:
 
 def _remove_stale(parent: Path) -> None:
     """Remove the folders of processes that were killed: those whose lock nobody holds."""
-    if fcntl is None:
-        return
     for folder in parent.glob(f"{_PREFIX}*"):
         try:
             if time.time() - folder.lstat().st_mtime < _STALE:
                 continue
             with open(folder / _LOCK_FILE, "rb") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                _lock(lock)
                 shutil.rmtree(folder, ignore_errors=True)
         except OSError:
             continue

@@ -17,7 +17,7 @@ from gpusense._files import check_writable, write_whole
 from gpusense._version import __version__
 
 if TYPE_CHECKING:
-    from gpusense.backends import Backend
+    from gpusense.backends import Backend, BackendInfo, Device
 
 __all__ = ["check_writable", "write_whole"]
 
@@ -201,6 +201,15 @@ def progress(total: int) -> Iterator[Callable[[str], None]]:
             begun += 1
 
         yield step
+
+
+def driver_text(device: Device | BackendInfo) -> str:
+    """Return what compiles for a device, and how: ``PoCL 3.0, 16 lanes, skylake-avx512``."""
+    from gpusense.backends import short_driver
+
+    lanes = f"{device.lanes} lanes" if device.lanes > 1 else ""
+    absent = "" if device.float64 or not device.driver else "no float64"
+    return ", ".join(part for part in (short_driver(device.driver), lanes, device.target, absent) if part) or "-"
 
 
 def machine() -> dict[str, Any]:

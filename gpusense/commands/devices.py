@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from gpusense.commands._common import add_json, machine, machine_line, print_json, print_table
+from gpusense.commands._common import add_json, driver_text, machine, machine_line, print_json, print_table
 
 if TYPE_CHECKING:
     from gpusense.backends import Device
@@ -46,25 +46,23 @@ def run(args: argparse.Namespace) -> int:
         listed = [asdict(device) | {"auto": device.available and device.selection == auto} for device in found]
         print_json({"auto": auto, "auto_error": trouble, "devices": listed, "machine": machine()})
         return 0
-    rows = []
+    rows, notes = [], []
     for device in found:
         mark = "*" if device.available and device.selection == auto else ""
-        status = device.reason or "available"
-        rows.append((mark, device.selection or "-", device.kind, device.name, _driver(device), status))
+        rows.append((mark, device.selection or "-", device.kind, device.name, driver_text(device), _status(device)))
+        if device.reason:
+            notes.append(f"{device.selection or device.name}: {device.reason}")
     print_table(("", "selection", "kind", "name", "driver", "status"), rows)
-    print(f"\n* is what 'auto' takes\n{machine_line()}" if auto else f"\n'auto' does not work: {trouble}")
+    print("", *notes, sep="\n")
+    print(f"* is what 'auto' takes\n{machine_line()}" if auto else f"'auto' does not work: {trouble}")
     return 0
 
 
-def _driver(device: Device) -> str:
-    """Return what compiles for a device, and how."""
-    from gpusense.backends import short_driver
-
-    if not device.available:
-        return device.driver or "-"
-    lanes = f"{device.lanes} lanes" if device.lanes > 1 else ""
-    absent = "" if device.float64 else "no float64"
-    return ", ".join(part for part in (short_driver(device.driver), lanes, device.target, absent) if part)
+def _status(device: Device) -> str:
+    """Return what can be done with a device, in a word."""
+    if device.available:
+        return "limited" if device.reason else "available"
+    return "unusable" if device.selection else "absent"
 
 
 def _auto() -> tuple[str | None, str | None]:

@@ -7,9 +7,21 @@ import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from gpusense.commands._common import BACKEND_HELP, add_json, machine, machine_line, print_json, print_table, progress
+from gpusense.commands._common import (
+    BACKEND_HELP,
+    add_json,
+    driver_text,
+    machine,
+    machine_line,
+    print_json,
+    print_table,
+    progress,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from gpusense.backends import Backend
     from gpusense.stiff import Row
     from gpusense.tolerances import Check
 
@@ -78,6 +90,7 @@ def _run_stiff(args: argparse.Namespace) -> int:
         document = {"passed": not breaches, "rows": listed, "machine": machine()}
         print_json(document)
     else:
+        _print_head(backends)
         columns = ("backend", "precision", "case", "quantity", "worst", "bound", "not finite", "verdict")
         table = [
             (backend, precision, row.case, row.quantity, f"{row.worst:.3g}", f"{row.bound:.3g}", str(row.nonfinite),
@@ -89,6 +102,18 @@ def _run_stiff(args: argparse.Namespace) -> int:
         print(machine_line())
         print(f"{len(rows)} rows, {f'{breaches} BREACHED' if breaches else 'none breached'}")
     return BREACH if breaches else 0
+
+
+def _print_head(backends: Sequence[Backend]) -> None:
+    """Print what is tested, and what its proof left out."""
+    from gpusense.backends import devices
+
+    reasons = {device.selection: device.reason for device in devices()}
+    for info in (backend.info for backend in backends):
+        print(f"{info.selection}: {info.name} ({driver_text(info)})")
+        if reasons.get(info.selection):
+            print(f"    {reasons[info.selection]}")
+    print()
 
 
 def _run_pairs(args: argparse.Namespace) -> int:
@@ -114,11 +139,10 @@ def _run_pairs(args: argparse.Namespace) -> int:
         }
         print_json(document)
     else:
+        _print_head(backends)
         columns = ("backend", "against", "quantity", "largest difference", "tolerance", "unit", "verdict")
         print_table(columns, [_row(check) for check in checks], right=("largest difference", "tolerance"))
         print()
-        for info in (backend.info for backend in backends):
-            print(f"{info.selection}: {info.name} ({info.driver})")
         for device in absent:
             print(f"absent: {device.name}: {device.reason}")
         print(machine_line())

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends import Backend, get_backend, open_device
+from gpusense.backends import Backend, get_backend, open_device, take_drivers
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, info_of
 from gpusense.grid import OccupancyGrid
 from gpusense.models.beam import BeamModel
@@ -51,22 +51,24 @@ def prove(job: dict[str, Any], report: Report) -> None:
     """Try each family of kernels that a device has; stop at the first that computes wrong numbers.
 
     Args:
-        job: ``info`` describes the device, with the lanes to try.
+        job: ``info`` describes the device, with the lanes to try; ``drivers`` are those that OpenCL is to load.
         report: Gets the family that begins, what was wrong, and the end.
     """
     info = info_of(job)
+    if info.backend == "opencl" and "drivers" in job:
+        take_drivers(job["drivers"])
     scene, numpy = Scene(), get_backend("numpy")
     report({"begin": SCALAR})
     device = open_device(info)
     models = VECTORS if info.lanes > 1 else SCALAR
-    checks = [(SCALAR, _tables), (models, _models), *([(FLOAT64, _float64)] if info.float64 else [])]
+    # In float32 too poses are placed in float64 where a device has it.
+    checks = [(SCALAR, _tables), *([(FLOAT64, _float64)] if info.float64 else []), (models, _models)]
     for family, check in checks:
         report({"begin": family})
         if wrong := check(scene, device, numpy):
             report({"wrong": wrong})
             return
-        if family == models and check is _models:
-            report({"rate": _rate(scene, device)})
+    report({"rate": _rate(scene, device)})
     report({"end": True})
 
 
@@ -94,7 +96,8 @@ def _rate(scene: Scene, device: Backend) -> float:
     for kind in (LikelihoodFieldModel, BeamModel):
         model = kind(scene.grid, scene.scanner, backend=device)
         model.log_likelihood(poses, scene.ranges)
-        seconds, end = [], time.perf_counter() + _TIMED_SECONDS
+        seconds: list[float] = []
+        end = time.perf_counter() + _TIMED_SECONDS
         while len(seconds) < 3 or time.perf_counter() < end:
             begin = time.perf_counter()
             model.log_likelihood(poses, scene.ranges)
@@ -118,4 +121,4 @@ def _difference(tolerance: Tolerance, mine: np.ndarray, theirs: np.ndarray) -> s
     found = tolerance.difference(mine, theirs)
     if found <= tolerance.value:
         return ""
-    return f"{tolerance.name}: {found:.3g} {tolerance.unit}, allowed {tolerance.value:.3g}"
+    return f"{tolerance.name}: {found:.4g} {tolerance.unit}, allowed {tolerance.value:.3g}"

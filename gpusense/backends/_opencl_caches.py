@@ -1,0 +1,60 @@
+"""pyopencl's own caches, which are left out: a folder that cannot be written, or a damaged file there, ends the run.
+
+pyopencl keeps code that sets kernels' arguments in a database, and programs in files, both without checksums. Programs
+are kept by :mod:`gpusense.backends.cache`, and that code is made in a millisecond.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import sys
+import threading
+from collections.abc import Iterator
+
+import pyopencl as cl
+
+# Whether pyopencl's caches are off; it has no other way to switch them off once it is imported.
+_SWITCH = "_PYOPENCL_NO_CACHE"
+_lock = threading.RLock()
+
+
+def _open_database() -> None:
+    """Import the module that opens the database; where that fails the caches are off for the whole process."""
+    if getattr(cl, _SWITCH, True):
+        return
+    # What could not be made whole says so again when it is collected.
+    hook, sys.unraisablehook = sys.unraisablehook, lambda *_: None
+    try:
+        importlib.import_module("pyopencl.invoker")
+    except Exception as error:
+        setattr(cl, _SWITCH, True)
+        logging.getLogger("gpusense").warning("gpusense: pyopencl's cache cannot be used and is left out: %s", error)
+        error.__traceback__ = None
+    finally:
+        sys.unraisablehook = hook
+
+
+_open_database()
+
+
+def new_kernel(program: cl.Program, name: str) -> cl.Kernel:
+    """Return a new kernel object of a program."""
+    with without_caches():
+        return cl.Kernel(program, name)
+
+
+@contextlib.contextmanager
+def without_caches() -> Iterator[None]:
+    """Switch pyopencl's caches off, and back on."""
+    with _lock:
+        before = getattr(cl, _SWITCH, None)
+        if before is None:
+            yield
+            return
+        setattr(cl, _SWITCH, True)
+        try:
+            yield
+        finally:
+            setattr(cl, _SWITCH, before)

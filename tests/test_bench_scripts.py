@@ -211,6 +211,14 @@ def test_work_items_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert all(row["main_s"] > 0 and row["all_s"] > 0 for row in report["rows"])
 
 
+def test_first_call_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--backend", needs("opencl"), "--repeats", "1"]
+    report = run_script("first_call.py", *arguments, output=tmp_path / "first")
+    assert [row["cache"] for row in report["rows"]] == ["cold", "warm"]
+    cold, warm = report["rows"]
+    assert cold["open"] > warm["open"] > 0 and warm["field"] > 0 and warm["all"] > warm["open and field"]
+
+
 def test_several_scans_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", "numpy", "--backend", needs("opencl"), "--particles", "30", "--beams", "12"]
     small = ["--scans", "3", "--models", "2", "--size", "20", "--seconds", "0.01"]

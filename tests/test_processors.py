@@ -86,6 +86,11 @@ class Described:
 X86 = "x86_64-unknown-linux-gnu"
 
 
+def width_of(flags: str) -> int:
+    """Numbers of the processor's widest vectors, as PoCL tells."""
+    return 16 if "avx512f" in flags.split() else 8 if "avx" in flags.split() else 4
+
+
 @pytest.fixture
 def of(monkeypatch):
     """Give this machine the instruction sets of another, and PoCL its libraries for several processors."""
@@ -101,7 +106,7 @@ def of(monkeypatch):
 def test_the_target_fits_the_library_whatever_llvm_calls_the_processor(of, processor, llvm, flags, fitting):
     of(flags)
     for name in (llvm, "generic", "znver3", "skylake-avx512", fitting):
-        made = Described(X86, name, width=16 if "avx512f" in flags else 8)
+        made = Described(X86, name, width=width_of(flags))
         before = made.words.copy()
         assert _pocl.target_of(made.device) == fitting
         assert made.name() == name
@@ -126,11 +131,12 @@ def test_a_processor_that_no_library_fits_is_told(of):
     assert _pocl.lacking_for(made.device) == ["avx512bw", "avx512dq", "avx512vl"]
 
 
-def test_avx_512_is_what_llvm_sees_and_not_what_linux_lists(of):
+def test_avx_is_what_llvm_sees_and_not_what_linux_lists(of):
     of(HASWELL)
     assert _pocl.target_of(Described(X86, "znver3", width=16).device) == "skylake-avx512"
     of(SKYLAKE_X)
     assert _pocl.target_of(Described(X86, "skylake-avx512", width=8).device) == "haswell"
+    assert _pocl.target_of(Described(X86, "haswell", width=4).device) == "penryn"
 
 
 @pytest.mark.parametrize(

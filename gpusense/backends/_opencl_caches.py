@@ -12,6 +12,7 @@ import logging
 import sys
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pyopencl as cl
 
@@ -39,7 +40,7 @@ def _open_database() -> None:
 _open_database()
 
 
-def new_kernel(program: cl.Program, name: str) -> cl.Kernel:
+def new_kernel(program: Any, name: str) -> cl.Kernel:
     """Return a new kernel object of a program."""
     with without_caches():
         return cl.Kernel(program, name)

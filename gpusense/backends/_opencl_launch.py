@@ -58,7 +58,7 @@ class Launch:
             self._first = None
         kept = self._backend.recording()
         if kept is not None:
-            own = new_kernel(self._kernel.get_info(cl.kernel_info.PROGRAM), self._kernel.function_name)
+            own = new_kernel(self._kernel.program, self._kernel.function_name)
             with without_caches():
                 own.set_arg_types(self._types)
             own.set_args(*arguments)

@@ -117,10 +117,11 @@ def fit_target(device: cl.Device) -> str | None:
 def _flags(device: cl.Device) -> frozenset[str]:
     """Return the processor's instruction sets as PoCL sees them.
 
-    The width of its vectors says whether LLVM found AVX-512, which a kernel of Linux may hide from its own list.
+    The width of its vectors says whether LLVM found AVX and AVX-512, which Linux may list otherwise.
     """
-    flags = instruction_sets()
-    return flags | {"avx512f"} if device.native_vector_width_float >= 16 else flags - {"avx512f"}
+    width = device.native_vector_width_float
+    found = frozenset(name for name, needed in (("avx", 8), ("avx512f", 16)) if width >= needed)
+    return instruction_sets() - {"avx", "avx512f"} | found
 
 
 def _is_misfit(device: cl.Device) -> bool:

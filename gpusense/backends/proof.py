@@ -29,9 +29,12 @@ _PROVE = "gpusense.evaluation.proof:prove"
 _LOG = logging.getLogger("gpusense")
 # What helps against a failure, by what it says.
 _REMEDIES = (
-    (r'"ld" doesn\'t exist|linker command failed', "install the linker ld (on Debian: apt-get install binutils)"),
+    (
+        r'"ld" doesn\'t exist|linker command failed',
+        "install the linker ld (on Debian: apt-get install binutils), then run 'gpusense devices --prove'",
+    ),
     (r"No space left|takes \d+ MiB", "free some space, or set GPUSENSE_CACHE_DIR to a folder with more"),
-    (r"hangs", "set GPUSENSE_PROOF_SECONDS higher if the machine is slow"),
+    (r"\bhangs?\b", "set GPUSENSE_PROOF_SECONDS higher if the machine is slow"),
 )
 # Failures of the machine's state and not of the driver: verdicts by them are not kept.
 _PASSING = re.compile(

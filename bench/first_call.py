@@ -1,0 +1,108 @@
+"""First calls: what a new process waits for, with nothing kept on disk and with everything.
+
+    python bench/first_call.py --backend opencl --backend warp:cpu
+    python bench/first_call.py --backend opencl --tree .:now --tree ../old:before --output bench/results/first_call_name
+
+Each time is of a new process: the import of the package, opening the device, the first call of the likelihood field,
+the first one of the beam model after it. "Cold" begins with an empty cache folder, so that the device is proved too;
+"warm" is the next process with the same folder. Trees (checkouts, with a name each) take turns, so that their ratio
+holds on a busy machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from speed import publish
+
+_PROCESS = """
+import json, sys, time
+marks = [time.perf_counter()]
+def mark(): marks.append(time.perf_counter())
+import gpusense as gs
+mark()
+import numpy as np
+from gpusense.backends import get_backend
+from gpusense.worlds import building
+grid = building(0)
+scanner = gs.Scanner.uniform(angle_min=-1.5, angle_increment=0.05, count=60, range_max=12.0)
+poses, ranges = np.random.default_rng(0).uniform(2, 8, (2000, 3)), np.full(60, 3.0)
+before = time.perf_counter()
+device = get_backend(sys.argv[1])
+mark()
+marks[1] += before - marks[1]
+gs.LikelihoodFieldModel(grid, scanner, backend=device).log_likelihood(poses, ranges)
+mark()
+gs.BeamModel(grid, scanner, backend=device).log_likelihood(poses, ranges)
+mark()
+print(json.dumps([1e3 * (b - a) for a, b in zip(marks, marks[1:])]))
+"""
+STEPS = ("import and scene", "open", "field", "beam model")
+
+
+def milliseconds(tree: Path, backend: str, folder: str) -> list[float]:
+    """Run one process and return the milliseconds of its steps."""
+    places = dict.fromkeys(("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "WARP_CACHE_PATH"), folder)
+    environment = os.environ | places | {"PYTHONPATH": str(tree.resolve())}
+    command = [sys.executable, "-c", _PROCESS, backend]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return [float(value) for value in json.loads(done.stdout.splitlines()[-1])]
+
+
+def measured(trees: list[tuple[Path, str]], backend: str, repeats: int) -> list[dict[str, Any]]:
+    """Return a row for each tree and state of the cache: medians over the repeats."""
+    times: dict[tuple[str, str], list[list[float]]] = {}
+    for _ in range(repeats):
+        for tree, name in trees:
+            with tempfile.TemporaryDirectory() as folder:
+                for state in ("cold", "warm"):
+                    times.setdefault((name, state), []).append(milliseconds(tree, backend, folder))
+    rows = []
+    for (name, state), runs in times.items():
+        steps = {step: median(run[i] for run in runs) for i, step in enumerate(STEPS)}
+        field = median(run[1] + run[2] for run in runs)
+        whole = median(sum(run) for run in runs)
+        rows.append({"backend": backend, "tree": name, "cache": state, **steps, "open and field": field, "all": whole})
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the rows as Markdown."""
+    columns = ("backend", "tree", "cache", *STEPS, "open and field", "all")
+    lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
+    for row in rows:
+        cells = (str(row[column]) if column in columns[:3] else f"{row[column]:.0f}" for column in columns)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backend", action="append", help="selection string (default: opencl and warp:cpu)")
+    parser.add_argument(
+        "--tree", action="append", default=[], metavar="PATH:NAME", help="a checkout (default: this one)"
+    )
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
+    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
+    arguments = parser.parse_args()
+    here = f"{Path(__file__).parent.parent}:this"
+    trees = [(Path(path), name) for path, _, name in (text.rpartition(":") for text in arguments.tree or [here])]
+    rows: list[dict[str, Any]] = []
+    for backend in arguments.backend or ["opencl", "warp:cpu"]:
+        rows += measured(trees, backend, arguments.repeats)
+    publish(Path(__file__).name, arguments, table(rows), {"rows": rows}, f"Milliseconds, {arguments.repeats} runs.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

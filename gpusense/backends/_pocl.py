@@ -160,8 +160,10 @@ def _find_name(device: cl.Device) -> tuple[int, str]:
     try:
         data = os.pread(memory, 8 * _WORDS, device.int_ptr)
         words = struct.unpack(f"<{len(data) // 8}Q", data[: len(data) // 8 * 8])
-        for i in range(1, len(words)):
+        for i in range(1, len(words) - 1):
             if _text(memory, words[i - 1]).startswith("x86_64-"):
+                # Version 5 has the name of its library in between.
+                i += _text(memory, words[i]).startswith("kernel-")
                 return device.int_ptr + 8 * i, _text(memory, words[i])
     except OSError:
         pass

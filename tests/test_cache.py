@@ -328,7 +328,7 @@ DAMAGES = {
     "emptied": lambda data: b"",
     "zeroed": lambda data: bytes(len(data)),
     "a bit flipped in the head": lambda data: bytes([data[0] ^ 1]) + data[1:],
-    "a bit flipped in the middle": lambda data: data[:99] + bytes([data[99] ^ 16]) + data[100:],
+    "a bit flipped in the contents": lambda data: data[:-9] + bytes([data[-9] ^ 16]) + data[-8:],
     "another's contents": lambda data: b"gpusense entry 2\n" + bytes(200),
 }
 
@@ -355,8 +355,7 @@ def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, fa
     assert f"the cache folder {tmp_path / 'cold'} cannot be written" in errors
 
 
-@pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
-@pytest.mark.parametrize("how", BLOCKED)
+@pytest.mark.parametrize(("family", "how"), [*(("opencl", how) for how in BLOCKED), ("warp:cpu", BLOCKED[1])])
 def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
     """gpusense's own folder, and where PoCL and Warp would put theirs."""
     needs(family.split(":")[0])
@@ -401,10 +400,10 @@ def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_p
     for number in range(25):
         proof = {} if number % 2 else {"GPUSENSE_PROOF": "off"}
         environment = fake_driver.environment(tmp_path, **proof)
-        if number % 6 == 0:
+        if number % 8 == 0:
             shutil.rmtree(tmp_path / "cold", ignore_errors=True)
         process = start(family, environment)
-        time.sleep(moments.uniform(0.2, 2.2))
+        time.sleep(moments.uniform(0.2, 1.6))
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         code, out, errors = outcome(process)
@@ -415,7 +414,7 @@ def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_p
     assert outcome(start(family, fake_driver.environment(tmp_path))) == (0, expected, "")
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     families=st.tuples(*[st.sampled_from(["opencl", "warp:cpu"])] * 2),
     delay=st.floats(0, 2.5),

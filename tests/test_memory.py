@@ -200,6 +200,8 @@ def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         # It gets vectors of truth values wrong that LLVM's optimizer makes; unoptimized, it also sees every access.
         "OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable",
         "GPUSENSE_CACHE": "off",
+        # With the cache off, every process would prove its device.
+        "GPUSENSE_PROOF": "off",
         "PYOPENCL_NO_CACHE": "1",
     }
     return subprocess.run(

@@ -122,7 +122,7 @@ def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str]
 
 def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Path) -> None:
     needs("warp")
-    run_quietly(tmp_path, GPUSENSE_CACHE="off")
+    run_quietly(tmp_path, GPUSENSE_CACHE="off", GPUSENSE_PROOF="off")
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 

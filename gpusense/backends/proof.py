@@ -34,7 +34,10 @@ _REMEDIES = (
         "install the linker ld (on Debian: apt-get install binutils), then run 'gpusense devices --prove'",
     ),
     (r"No space left|takes \d+ MiB", "free some space, or set GPUSENSE_CACHE_DIR to a folder with more"),
-    (r"\bhangs?\b", "set GPUSENSE_PROOF_SECONDS higher if the machine is slow"),
+    (
+        r"\bhangs?\b",
+        "set GPUSENSE_PROOF_SECONDS higher if the machine is slow, or choose another device with GPUSENSE_BACKEND",
+    ),
 )
 # Failures of the machine's state and not of the driver: verdicts by them are not kept.
 _PASSING = re.compile(

@@ -303,7 +303,7 @@ def entries(folder: Path) -> dict[str, int]:
 
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
-    """What is compiled is put into entries, and so would be again."""
+    """A compiled kernel is stored as an entry; a second process stores none."""
     needs(family.split(":")[0])
     environment = fake_driver.environment(tmp_path)
     assert outcome(start(family, environment)) == (0, expected, "")

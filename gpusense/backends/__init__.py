@@ -200,12 +200,19 @@ def _opened(selection: str) -> Backend:
 
 
 def _of_queue(queue: Any) -> Backend:
-    from gpusense.backends._opencl import backend_of
+    from gpusense.backends import _opencl
 
     with _LOCK:
         found = _OF_QUEUES.get(queue.int_ptr)
         if found is None:
-            found = _OF_QUEUES[queue.int_ptr] = backend_of(queue)
+            info = _opencl.info_of(queue.device)
+            verdict = proof.trust(info)
+            # A child cannot address a part of a device.
+            if any(info.selection == listed.selection for listed, _ in _opencl.list_devices()):
+                verdict = _verdict(info, queue.device, _opencl)
+            if not verdict.usable:
+                raise ValueError(f"backend: {proof.summary(info, verdict)}, got a queue of it")
+            found = _OF_QUEUES[queue.int_ptr] = _opencl.backend_of(queue, proof.apply(info, verdict))
             _OPENED.add(found)
     found.check_process()
     return found

@@ -31,7 +31,7 @@ from gpusense.backends.cache import ProgramCache
 from gpusense.signatures import KERNELS
 from gpusense.sources import assemble, relevant, uses_double, with_places
 
-__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "drivers_as_job", "list_devices", "trouble_of"]
+__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "drivers_as_job", "info_of", "list_devices", "trouble_of"]
 
 # One driver's own clearing hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
@@ -292,11 +292,10 @@ class OpenCLBackend(ProcessBound):
             return program.build(self.options, [self._device])
 
 
-def backend_of(queue: cl.CommandQueue) -> OpenCLBackend:
-    """A backend that works on a user's queue, and so on the arrays that were made with it.
+def backend_of(queue: cl.CommandQueue, info: BackendInfo) -> OpenCLBackend:
+    """Return a backend that works on a user's queue, and so on the arrays that were made with it.
 
     Raises:
         ValueError: the queue does not do commands in their order.
     """
-    info = info_of(queue.device)
     return OpenCLBackend(info, queue.device, _opencl_arrays.queue_of(queue))

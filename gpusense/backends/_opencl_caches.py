@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import logging
+import sqlite3
 import sys
 import threading
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ def _open_database() -> None:
     hook, sys.unraisablehook = sys.unraisablehook, lambda *_: None
     try:
         importlib.import_module("pyopencl.invoker")
-    except Exception as error:
+    except (ImportError, OSError, sqlite3.Error) as error:
         setattr(cl, _SWITCH, True)
         logging.getLogger("gpusense").warning("gpusense: pyopencl's cache cannot be used and is left out: %s", error)
         error.__traceback__ = None

@@ -66,7 +66,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class Choice:
-    """What the loader is given.
+    """The drivers that the loader is given.
 
     Attributes:
         drivers: The drivers, where they are not those that it finds by itself; else None.
@@ -157,8 +157,9 @@ def take(job: list[tuple[str, str]] | None) -> None:
 def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tuple[Choice, bool]:
     """Load all drivers in a child, and where it dies each alone; also whether the verdict is worth keeping."""
     together = _try(wanted)
-    if not together.failure:
-        return Choice(wanted), True
+    if not together.failure or not together.conclusive:
+        # A child that was not started, or was killed from outside, says nothing against a driver.
+        return Choice(wanted), together.conclusive
     alone = [(str(driver.file), outcome) for driver in drivers if (outcome := _try((driver,))).failure]
     left_out = tuple((name, outcome.failure) for name, outcome in alone)
     conclusive = together.conclusive and all(outcome.conclusive for _, outcome in alone)

@@ -59,7 +59,7 @@ def temporary_folder() -> Path | None:
         found = folder.lstat()
     except OSError:
         return None
-    # Kernels are code: nobody else may have made the folder, or write into it.
+    # Kernels are code: the folder must be owned by this user and writable by this user only.
     mine = stat.S_ISDIR(found.st_mode) and (not hasattr(os, "getuid") or found.st_uid == os.getuid())
     return folder if mine and not found.st_mode & 0o022 else None
 

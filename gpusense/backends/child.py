@@ -29,7 +29,7 @@ _NOISE = re.compile(r"^(\s*$|Stack dump|PLEASE submit|\s*#?\d+[.\s]|\d+ warnings
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a child.
+    """The reports of a child process, and how it ended.
 
     Attributes:
         said: What it reported, in order.

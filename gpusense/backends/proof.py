@@ -48,7 +48,7 @@ _OTHERWISE = "update the driver, or choose another device with GPUSENSE_BACKEND 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known of a device.
+    """The families of kernels that a device runs correctly.
 
     Attributes:
         usable: Whether models can run on it.
@@ -86,7 +86,7 @@ def verdict_on(info: BackendInfo, *, drivers: Any = None, anew: bool = False) ->
 
     Args:
         info: The device.
-        drivers: What a child is told of the drivers that it is to load.
+        drivers: The OpenCL drivers that the child loads; see ``_opencl_drivers.as_job``.
         anew: Whether the kept verdict is dropped.
     """
     if not child.can_start():
@@ -176,9 +176,9 @@ def _failure(outcome: child.Outcome) -> tuple[str, str]:
         if "wrong" in said:
             return begun, f"compute wrong numbers ({said['wrong']})"
         if said.get("end"):
-            begun = ""
+            # All families are proved; some drivers crash when their process exits.
+            return "", ""
     if outcome.failure:
-        # A process that dies in its last moments has done all that was asked of it, but the next one may die too.
         return begun or SCALAR, _verb(outcome.failure)
     return begun, "ended early" if begun else ""
 

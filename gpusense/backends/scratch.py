@@ -119,7 +119,7 @@ def _remove(folder: Path, process: int, lock: Any) -> None:
 
 
 def _remove_stale(parent: Path) -> None:
-    """Remove the folders of processes that were killed: those whose lock nobody holds."""
+    """Remove the folders of killed processes: those with an unlocked lock file."""
     for folder in parent.glob(f"{_PREFIX}*"):
         try:
             if time.time() - folder.lstat().st_mtime < _STALE:

@@ -1,1 +1,1 @@
-"""What shows that gpusense computes what it should: here, the proof of a device."""
+"""Evaluate devices and models: the proof of a device."""

@@ -137,6 +137,12 @@ def test_a_state_of_the_machine_is_no_lasting_verdict(driver, state):
     assert len(tried) == 2
 
 
+def test_a_crash_after_the_end_of_a_proof_condemns_no_device(monkeypatch):
+    said = [{"begin": SCALAR}, {"rate": 5.0}, {"end": True}]
+    monkeypatch.setattr(child, "run", lambda job: Outcome(said, "ends the process with SIGSEGV"))
+    assert verdict_on(INFO) == Verdict(True, 16, True, rate=5.0)
+
+
 def test_a_damaged_verdict_is_made_anew(driver, folder):
     tried = driver({})
     verdict_on(INFO)

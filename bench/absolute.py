@@ -23,7 +23,7 @@ from speed import Recorder, best, publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.worlds import building, cloud_uniform
+from gpusense.evaluation.worlds import building, cloud_uniform
 
 CHECKED = 200
 # Where the building stands [m]: a place of UTM's.

@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from gpusense.benchmark.candidates import Candidate
-from gpusense.benchmark.scenes import Scene
-from gpusense.scanner import Reading, classify
+from gpusense.evaluation.benchmark.candidates import Candidate
+from gpusense.evaluation.benchmark.scenes import Scene
+from gpusense.world.scanner import Reading, classify
 
 THETA_BINS = (500, 2000, 8000)
 CDDT_BINS = (54, 108, 216, 720)

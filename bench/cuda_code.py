@@ -19,8 +19,8 @@ from pathlib import Path
 
 import warp as wp
 
-from gpusense._kernel_files import warp_module
-from gpusense.signatures import FLAGS, KERNELS
+from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.signatures import FLAGS, KERNELS
 
 _INSTRUCTION = re.compile(r"/\*[0-9a-f]{4,}\*/\s+(?:@!?U?P\w+\s+)?([A-Z]\w*)")
 _ENDS = {"BRA", "CALL", "EXIT", "RET", "BSYNC", "WARPSYNC"}

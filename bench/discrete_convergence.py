@@ -20,8 +20,8 @@ import numpy as np
 from scipy.stats import truncnorm
 
 import gpusense as gs
-from gpusense.plots import new_figure, save
-from gpusense.reference.densities import log_mixture
+from gpusense.models.scan.densities import log_mixture
+from gpusense.plots.drawing import new_figure, save
 
 mpl.use("Agg")
 RANGE = 6.0

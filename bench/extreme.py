@@ -29,10 +29,10 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands._common import machine
-from gpusense.replay import Recorder, replay
-from gpusense.tolerances import differing, per_scan
-from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+from gpusense.commands.common import machine
+from gpusense.evaluation.replay import Recorder, replay
+from gpusense.evaluation.tolerances import differing, per_scan
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 
 RANGE_MAX, SIGMA, FARTHEST = 30.0, 0.2, 2.0  # metres; the last two are nav2's defaults for its field
 SIZES, LARGER = ((1_000, 100_000), (1_000_000, 1_000), (10_000_000, 4)), ((10_000, 100_000), (10_000_000, 60))

@@ -31,7 +31,7 @@ import gpusense as gs
 mark()
 import numpy as np
 from gpusense.backends import get_backend
-from gpusense.worlds import building
+from gpusense.evaluation.worlds import building
 grid = building(0)
 scanner = gs.Scanner.uniform(angle_min=-1.5, angle_increment=0.05, count=60, range_max=12.0)
 poses, ranges = np.random.default_rng(0).uniform(2, 8, (2000, 3)), np.full(60, 3.0)

@@ -23,8 +23,9 @@ import numpy as np
 from speed import publish
 
 import gpusense as gs
-from gpusense import fitting, held_out
-from gpusense.scoring import BEAM_PARAMETERS, Cloud, logged_scans, score_log
+from gpusense.evaluation import held_out
+from gpusense.evaluation import range_data as fitting
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, Cloud, logged_scans, score_log
 
 LOGS = ("intel", "freiburg-079", "csail", "aces")
 TEMPERATURES = (1.0, 0.1)

@@ -43,9 +43,10 @@ from sonar_field import recorded, ring_of
 from speed import publish
 
 import gpusense as gs
-from gpusense import fitting, held_out
-from gpusense.fitting import RangeData
-from gpusense.scoring import logged_scans
+from gpusense.evaluation import held_out
+from gpusense.evaluation import range_data as fitting
+from gpusense.evaluation.range_data import RangeData
+from gpusense.evaluation.scoring import logged_scans
 
 LOGS = ("intel", "freiburg-079", "csail", "aces")
 SONARS = {"sonar1": (8.0, 0.0), "sonar2": (5.0, 0.3)}

@@ -1,4 +1,4 @@
-"""Recorded runs among landmarks, each in its own text format, as gpusense.landmark_runs.LandmarkRun."""
+"""Recorded runs among landmarks, each in its own text format, as gpusense.logs.records.LandmarkRun."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import gpusense as gs
-from gpusense.landmark_runs import LandmarkRun, first_scans
+from gpusense.evaluation.landmark_runs import first_scans
 from gpusense.logs.mrclam import read_mrclam
+from gpusense.logs.records import LandmarkRun
 
 # The LEGO robot: metres per tick, distance of its wheels, and from where a cylinder is hit to its axis.
 _TICK, _TRACK, _AXIS = 0.000349, 0.150, 0.09

@@ -25,7 +25,7 @@ from landmark_sets import run_of
 from speed import publish
 
 import gpusense as gs
-from gpusense import landmark_runs as lr
+from gpusense.evaluation import landmark_runs as lr
 
 SETS = ("mrclam_1", "mrclam_2", "mrclam_3", "beacons", "lego", "freiburg")
 MOVED = ((0.0, 0.0), (0.1, 0.05), (0.3, 0.15))

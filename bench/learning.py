@@ -33,13 +33,13 @@ from speed import best, publish
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
-from gpusense.learning.device_sums import DeviceSums
-from gpusense.learning.em import em_step
-from gpusense.learning.options import make_bounds, open_device
-from gpusense.learning.pairs import Pairs, make_pairs
-from gpusense.learning.point import Point, first_guess, random_start
-from gpusense.learning.problem import NO_PRIOR, Problem
-from gpusense.learning.scenes import Scene, learning_scenes
+from gpusense.evaluation.fit_scenes import Scene, learning_scenes
+from gpusense.learning.beam.device_sums import DeviceSums
+from gpusense.learning.beam.em import em_step
+from gpusense.learning.beam.options import make_bounds, open_device
+from gpusense.learning.beam.pairs import Pairs, make_pairs
+from gpusense.learning.beam.point import Point, first_guess, random_start
+from gpusense.learning.beam.problem import NO_PRIOR, Problem
 
 TYPICAL = Scene("typical", gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 0.5), 30.0, (0.02, 0.98))
 IDENTIFIED, FALLS, SHARE, NATS = 0.3, 1e-9, 0.95, 1e-4

@@ -23,7 +23,7 @@ from speed import Recorder, best, publish, started_together
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose
 
 CHECKED = 100
 # Sets of launches that are waited for together.

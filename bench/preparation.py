@@ -23,9 +23,9 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
-from gpusense.prepare import empty_rectangles, packed, squared_distances
-from gpusense.selftest import scipy_squares
-from gpusense.worlds import building
+from gpusense.evaluation.selftest import scipy_squares
+from gpusense.evaluation.worlds import building
+from gpusense.tables.distances import empty_rectangles, packed, squared_distances
 
 RESOLUTION, CAP, EDIT = 0.05, 1601, 50
 SCANNER = gs.Scanner(np.linspace(-2, 2, 60), 10.0)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import get_backend
-from gpusense.workspace import Workspace
+from gpusense.backends.workspace import Workspace
 
 LOOK_UPS, ADDITIONS, WORDS = 64, 1024, 8
 # Bytes of a table that the nearest cache of most devices holds.
@@ -180,7 +180,7 @@ class _OpenCL:
     def __init__(self, info: Any, items: int) -> None:
         import pyopencl as cl
 
-        from gpusense.backends._opencl import list_devices
+        from gpusense.backends.opencl.backend import list_devices
 
         device = next(device for found, device in list_devices() if found.selection == info.selection)
         self._cl, self._context = cl, cl.Context([device])

@@ -22,10 +22,10 @@ from typing import Any
 from speed import publish
 
 import gpusense as gs
-from gpusense import selftest
 from gpusense.backends import get_backend
 from gpusense.commands.score import summary
-from gpusense.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, logged_scans, score_log
+from gpusense.evaluation import selftest
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, logged_scans, score_log
 
 MAPS = {
     Path(name).stem: name

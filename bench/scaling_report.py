@@ -44,7 +44,7 @@ def figures_markdown(device: dict[str, Any]) -> str:
 
 def draw(device: dict[str, Any], path: Path) -> None:
     """Three panels: nanoseconds per ray or particle-beam over particles, beams and the map's side."""
-    from gpusense.plots import new_figure
+    from gpusense.plots.drawing import new_figure
 
     colours = dict(zip(KINDS, ("#0072b2", "#d55e00", "#009e73"), strict=True))
     figure = new_figure(15.0, 5.6)

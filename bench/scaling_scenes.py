@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.frames import place_poses, ray_vectors
-from gpusense.prepare import empty_rectangles, sectors_of
+from gpusense.evaluation.worlds import building, cloud_around, free_pose
 from gpusense.reference import raycast
-from gpusense.worlds import building, cloud_around, free_pose
+from gpusense.tables.distances import empty_rectangles, sectors_of
+from gpusense.world.frames import place_poses, ray_vectors
 
 RANGE_MAX, RESOLUTION, LARGEST_BUILDING = 30.0, 0.05, 2000
 CHECKED, COUNTED, WINDOW = 8, 512, 1400

@@ -5,7 +5,7 @@
 
 Each row has three ways, in turns in one run, so that their ratios hold on a busy machine: one call whose scans share
 launches however large they are, one call whose scans are queued one after the other, and a call for each. The library
-takes the first way up to so many particle-beams of a scan (``gpusense.models.scan_call.TOGETHER``), and beyond it the
+takes the first way up to so many particle-beams of a scan (``gpusense.models.scan.call.TOGETHER``), and beyond it the
 second. Times are least ones of whole calls, NumPy arrays in and out; on Warp's CUDA also of arrays on the device. All
 ways must have the same bits.
 """
@@ -25,9 +25,9 @@ from speed import publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import scan_model
-from gpusense.models.scan_call import TOGETHER
-from gpusense.worlds import building, cloud_around, free_pose, simulate_scan
+from gpusense.evaluation.worlds import building, cloud_around, free_pose, simulate_scan
+from gpusense.models.scan import model as scan_model
+from gpusense.models.scan.call import TOGETHER
 
 ALWAYS, NEVER = 1 << 62, 0
 WAYS = ("together", "queued", "calls")

@@ -28,7 +28,7 @@ from speed import Recorder, publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.worlds import building, cloud_around, free_pose, simulate_scan
+from gpusense.evaluation.worlds import building, cloud_around, free_pose, simulate_scan
 
 MODELS = {"field": gs.LikelihoodFieldModel, "beam model": gs.BeamModel}
 # What takes the number of a call.

@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense import plots
 from gpusense.backends import get_backend
-from gpusense.commands._common import machine, machine_line
-from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+from gpusense.commands.common import machine, machine_line
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+from gpusense.plots import drawing as plots
 
 SPREAD_XY, SPREAD_THETA = 0.3, 0.2
 FIELD, LASER, CONE, MIRRORS = "likelihood field", "beams without cone", "beams with cone", "cone and mirrors"

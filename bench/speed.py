@@ -27,7 +27,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 
 CHECKED = 200
 

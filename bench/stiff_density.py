@@ -20,11 +20,11 @@ import mpmath as mp
 import numpy as np
 
 import gpusense as gs
-from gpusense import stiff
 from gpusense.backends import devices, get_backend
-from gpusense.reference.densities import naive_log_hit, naive_log_short
+from gpusense.evaluation import stiff
+from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.models.scan.densities import naive_log_hit, naive_log_short
 from gpusense.reference.mixture import log_density
-from gpusense.tolerances import TOLERANCES
 
 mpl.use("Agg")
 mp.mp.dps = 60
@@ -154,8 +154,8 @@ def grid_table(backends: list[str]) -> None:
 
 def bilinear_table() -> None:
     """What rounding a position within a cell costs the interpolated field in float32, beside a cliff of distances."""
-    from gpusense.replay import Recorder, replay
-    from gpusense.tolerances import beam_tolerance
+    from gpusense.evaluation.replay import Recorder, replay
+    from gpusense.evaluation.tolerances import beam_tolerance
 
     case = next(case for case in stiff.cases() if case.name.startswith("in walls"))
     poses = np.random.default_rng(1).uniform((-2, -2, -4), (6, 5, 4), (2000, 3))

@@ -4,7 +4,7 @@
 
 Rows are of the built-in building of 2000 x 2000 cells, with a cloud over the whole map and one around a pose. "All" are
 the launches of a call with its arrays on the device; "main" is the one that casts or looks up, four of them in a row.
-Ways are taken in turns. GPUs split their launches by ``gpusense.cloud``; to processors the number means nothing.
+Ways are taken in turns. GPUs split their launches by ``gpusense.models.cloud``; to processors the number means nothing.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from speed import Recorder, publish, scene_of
 
-from gpusense import cloud
 from gpusense.backends import get_backend
-from gpusense.models import field
+from gpusense.models import cloud
+from gpusense.models.scan import field
 
 AGAIN = 4
 

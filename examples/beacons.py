@@ -5,7 +5,8 @@ import sys
 import numpy as np
 
 import gpusense as gs
-from gpusense import plots, position_plots
+from gpusense.plots import drawing as plots
+from gpusense.plots import positions as position_plots
 
 # Made-up beacons, and what a robot at a pose that we pretend not to know measures of them.
 beacons = np.array([(1.0, 1.0), (8.0, 2.0), (4.5, 7.0)])

@@ -3,7 +3,7 @@
 import numpy as np
 
 import gpusense as gs
-from gpusense import worlds
+from gpusense.evaluation import worlds
 
 rng = np.random.default_rng(7)
 grid = worlds.building()

@@ -14,89 +14,99 @@ from gpusense._version import __version__
 
 if TYPE_CHECKING:
     from gpusense.backends import Device, devices
-    from gpusense.bound import BoundCall
-    from gpusense.discrete import DiscreteBeamModel, DiscreteCauses, DiscreteFit
-    from gpusense.grid import OccupancyGrid
-    from gpusense.landmarks import LandmarkMap
-    from gpusense.learning.fit import fit_beam_parameters
-    from gpusense.learning.incidence import IncidenceFit, fit_incidence_parameters
-    from gpusense.learning.landmark_result import LandmarkFit
-    from gpusense.learning.landmarks import fit_landmark_parameters
-    from gpusense.learning.result import BeamFit
-    from gpusense.learning.suspicious import suspicious_landmarks
+    from gpusense.learning.beam.fit import fit_beam_parameters
+    from gpusense.learning.beam.incidence import IncidenceFit, fit_incidence_parameters
+    from gpusense.learning.beam.result import BeamFit
+    from gpusense.learning.discrete.table import DiscreteBeamModel, DiscreteCauses, DiscreteFit
+    from gpusense.learning.landmark.fit import fit_landmark_parameters
+    from gpusense.learning.landmark.result import LandmarkFit
+    from gpusense.learning.landmark.suspicious import suspicious_landmarks
+    from gpusense.localization.weights import Weights, normalize_weights, resample
     from gpusense.logs import Odometry, Scan, read_log
-    from gpusense.map_io import read_map, write_map
-    from gpusense.models.absolute import HeadingModel, PositionModel
-    from gpusense.models.beacons import BeaconModel
-    from gpusense.models.beam import BeamModel
-    from gpusense.models.bumper import BumperModel
-    from gpusense.models.caster import CasterMethod, RayCaster
-    from gpusense.models.field import LikelihoodFieldModel
-    from gpusense.models.landmark import LandmarkModel
-    from gpusense.models.several import log_likelihoods
-    from gpusense.normals import surface_normals
-    from gpusense.parameters import BeamParameters, IncidenceParameters, LandmarkParameters, LikelihoodFieldParameters
+    from gpusense.models.landmark.model import LandmarkModel
+    from gpusense.models.point.absolute import HeadingModel, PositionModel
+    from gpusense.models.point.beacons import BeaconModel
+    from gpusense.models.point.bumper import BumperModel
+    from gpusense.models.scan.beam import BeamModel
+    from gpusense.models.scan.bound import BoundCall
+    from gpusense.models.scan.caster import CasterMethod, RayCaster
+    from gpusense.models.scan.field import LikelihoodFieldModel
+    from gpusense.models.scan.several import log_likelihoods
     from gpusense.positions.bearings import triangulate, triangulate_triangle
     from gpusense.positions.both import locate
     from gpusense.positions.fix import PositionFix
     from gpusense.positions.ranges import trilaterate
-    from gpusense.prepare import distance_transform
-    from gpusense.scanner import Reading, Scanner, classify
-    from gpusense.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
-    from gpusense.weights import Weights, normalize_weights, resample
+    from gpusense.tables.distances import distance_transform
+    from gpusense.tables.normals import surface_normals
+    from gpusense.world.grid import OccupancyGrid
+    from gpusense.world.landmarks import LandmarkMap
+    from gpusense.world.map_files import read_map, write_map
+    from gpusense.world.parameters import (
+        BeamParameters,
+        IncidenceParameters,
+        LandmarkParameters,
+        LikelihoodFieldParameters,
+    )
+    from gpusense.world.scanner import Reading, Scanner, classify
+    from gpusense.world.sensor_parameters import (
+        BeaconParameters,
+        BumperParameters,
+        HeadingParameters,
+        PositionParameters,
+    )
 
 _HOME = {
-    "BeaconModel": "gpusense.models.beacons",
-    "BeaconParameters": "gpusense.sensor_parameters",
-    "BeamFit": "gpusense.learning.result",
-    "BeamModel": "gpusense.models.beam",
-    "BeamParameters": "gpusense.parameters",
-    "BoundCall": "gpusense.bound",
-    "BumperModel": "gpusense.models.bumper",
-    "BumperParameters": "gpusense.sensor_parameters",
-    "CasterMethod": "gpusense.models.caster",
+    "BeaconModel": "gpusense.models.point.beacons",
+    "BeaconParameters": "gpusense.world.sensor_parameters",
+    "BeamFit": "gpusense.learning.beam.result",
+    "BeamModel": "gpusense.models.scan.beam",
+    "BeamParameters": "gpusense.world.parameters",
+    "BoundCall": "gpusense.models.scan.bound",
+    "BumperModel": "gpusense.models.point.bumper",
+    "BumperParameters": "gpusense.world.sensor_parameters",
+    "CasterMethod": "gpusense.models.scan.caster",
     "Device": "gpusense.backends",
-    "DiscreteBeamModel": "gpusense.discrete",
-    "DiscreteCauses": "gpusense.discrete",
-    "DiscreteFit": "gpusense.discrete",
-    "HeadingModel": "gpusense.models.absolute",
-    "HeadingParameters": "gpusense.sensor_parameters",
-    "IncidenceFit": "gpusense.learning.incidence",
-    "IncidenceParameters": "gpusense.parameters",
-    "LandmarkFit": "gpusense.learning.landmark_result",
-    "LandmarkMap": "gpusense.landmarks",
-    "LandmarkModel": "gpusense.models.landmark",
-    "LandmarkParameters": "gpusense.parameters",
-    "LikelihoodFieldModel": "gpusense.models.field",
-    "LikelihoodFieldParameters": "gpusense.parameters",
-    "OccupancyGrid": "gpusense.grid",
+    "DiscreteBeamModel": "gpusense.learning.discrete.table",
+    "DiscreteCauses": "gpusense.learning.discrete.table",
+    "DiscreteFit": "gpusense.learning.discrete.table",
+    "HeadingModel": "gpusense.models.point.absolute",
+    "HeadingParameters": "gpusense.world.sensor_parameters",
+    "IncidenceFit": "gpusense.learning.beam.incidence",
+    "IncidenceParameters": "gpusense.world.parameters",
+    "LandmarkFit": "gpusense.learning.landmark.result",
+    "LandmarkMap": "gpusense.world.landmarks",
+    "LandmarkModel": "gpusense.models.landmark.model",
+    "LandmarkParameters": "gpusense.world.parameters",
+    "LikelihoodFieldModel": "gpusense.models.scan.field",
+    "LikelihoodFieldParameters": "gpusense.world.parameters",
+    "OccupancyGrid": "gpusense.world.grid",
     "Odometry": "gpusense.logs",
     "PositionFix": "gpusense.positions.fix",
-    "PositionModel": "gpusense.models.absolute",
-    "PositionParameters": "gpusense.sensor_parameters",
-    "RayCaster": "gpusense.models.caster",
-    "Reading": "gpusense.scanner",
+    "PositionModel": "gpusense.models.point.absolute",
+    "PositionParameters": "gpusense.world.sensor_parameters",
+    "RayCaster": "gpusense.models.scan.caster",
+    "Reading": "gpusense.world.scanner",
     "Scan": "gpusense.logs",
-    "Scanner": "gpusense.scanner",
-    "Weights": "gpusense.weights",
-    "classify": "gpusense.scanner",
+    "Scanner": "gpusense.world.scanner",
+    "Weights": "gpusense.localization.weights",
+    "classify": "gpusense.world.scanner",
     "devices": "gpusense.backends",
-    "distance_transform": "gpusense.prepare",
-    "fit_beam_parameters": "gpusense.learning.fit",
-    "fit_incidence_parameters": "gpusense.learning.incidence",
-    "fit_landmark_parameters": "gpusense.learning.landmarks",
+    "distance_transform": "gpusense.tables.distances",
+    "fit_beam_parameters": "gpusense.learning.beam.fit",
+    "fit_incidence_parameters": "gpusense.learning.beam.incidence",
+    "fit_landmark_parameters": "gpusense.learning.landmark.fit",
     "locate": "gpusense.positions.both",
-    "log_likelihoods": "gpusense.models.several",
-    "normalize_weights": "gpusense.weights",
+    "log_likelihoods": "gpusense.models.scan.several",
+    "normalize_weights": "gpusense.localization.weights",
     "read_log": "gpusense.logs",
-    "read_map": "gpusense.map_io",
-    "resample": "gpusense.weights",
-    "surface_normals": "gpusense.normals",
-    "suspicious_landmarks": "gpusense.learning.suspicious",
+    "read_map": "gpusense.world.map_files",
+    "resample": "gpusense.localization.weights",
+    "surface_normals": "gpusense.tables.normals",
+    "suspicious_landmarks": "gpusense.learning.landmark.suspicious",
     "triangulate": "gpusense.positions.bearings",
     "triangulate_triangle": "gpusense.positions.bearings",
     "trilaterate": "gpusense.positions.ranges",
-    "write_map": "gpusense.map_io",
+    "write_map": "gpusense.world.map_files",
 }
 
 __all__ = [
@@ -155,8 +165,14 @@ __all__ = [
 ]
 
 
+# Public modules.
+_MODULES = ("casters", "compat", "plots", "worlds")
+
+
 def __getattr__(name: str) -> Any:
     """Load a public name from its module on first use."""
+    if name in _MODULES:
+        return importlib.import_module(f"gpusense.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'gpusense' has no attribute {name!r}")
     value = getattr(importlib.import_module(_HOME[name]), name)
@@ -165,4 +181,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_MODULES])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.grid import OccupancyGrid
+from gpusense.world.grid import OccupancyGrid
 
 GRID = OccupancyGrid([[0, 100]])
 GRID_CASES = [

@@ -9,7 +9,7 @@ from pathlib import Path
 from bad_input_files import Action, put
 from bad_input_grid import GRID
 
-from gpusense.map_io import read_map, write_map
+from gpusense.world.map_files import read_map, write_map
 
 GOOD_YAML = {
     "image": "map.pgm",

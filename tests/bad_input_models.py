@@ -13,7 +13,7 @@ import bad_input_landmarks
 import numpy as np
 
 import gpusense as gs
-from gpusense import casters
+from gpusense.tables import casters
 
 Action = Callable[[], object]
 Message = str | Callable[[], str]
@@ -251,7 +251,7 @@ CASTER_CASES = [
         "caster-method-class",
         caster(method=casters.March),
         TypeError,
-        f"method: must be one of {CASTERS}, got <class 'gpusense.casters.March'>",
+        f"method: must be one of {CASTERS}, got <class 'gpusense.tables.casters.March'>",
     ),
     (
         "caster-save",

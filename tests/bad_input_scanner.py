@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from bad_input_files import Action
 
-from gpusense.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.scanner import Scanner, classify
+from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.world.scanner import Scanner, classify
 
 SCANNER = Scanner([0.0, 0.1, 0.2], 5.0, 0.1)
 

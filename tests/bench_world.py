@@ -7,7 +7,7 @@ import copy
 import numpy as np
 
 from gpusense.backends import get_backend
-from gpusense.benchmark import candidates, report, runner, scenes
+from gpusense.evaluation.benchmark import candidates, report, runner, scenes
 
 TIMES = {
     "first_s", "build_s", "compile_s", "call_min_s", "call_median_s", "calls", "launch_min_s", "launch_median_s",

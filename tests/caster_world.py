@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 import gpusense as gs
-from gpusense.casters import Caster
+from gpusense.tables.casters import Caster
 
 RANGE = 3.0
 

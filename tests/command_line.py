@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import gpusense
-from gpusense import cli
+from gpusense.commands import cli
 
 SMALL = ["demo", "--particles", "400", "--beams", "20"]
 

@@ -14,8 +14,8 @@ import mpmath as mp
 import numpy as np
 
 import gpusense as gs
-from gpusense.frames import place_poses
 from gpusense.reference import landmarks as at
+from gpusense.world.frames import place_poses
 
 mp.mp.dps = 36
 
@@ -167,7 +167,7 @@ def exact_inputs(model: gs.LandmarkModel, poses: Any, features: Any, *, rounded:
 
 def prepared(model: gs.LandmarkModel, features: Any) -> np.ndarray:
     """The numbers of features that all say something."""
-    from gpusense.features import check_features, prepare_features
+    from gpusense.models.landmark.features import check_features, prepare_features
 
     p, sensor = model.parameters, model._sensor
     given = check_features(features, p, sensor.span)

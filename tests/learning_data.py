@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.backends import Backend, get_backend
-from gpusense.learning.device_sums import DeviceSums
-from gpusense.learning.options import make_bounds
-from gpusense.learning.pairs import make_pairs
-from gpusense.learning.point import Point, first_guess, random_start
-from gpusense.learning.problem import NO_PRIOR, Prior, Problem
-from gpusense.parameters import BeamParameters
-from gpusense.worlds import sample_readings
+from gpusense.evaluation.worlds import sample_readings
+from gpusense.learning.beam.device_sums import DeviceSums
+from gpusense.learning.beam.options import make_bounds
+from gpusense.learning.beam.pairs import make_pairs
+from gpusense.learning.beam.point import Point, first_guess, random_start
+from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem
+from gpusense.world.parameters import BeamParameters
 
 RANGE_MAX = 10.0
 TYPICAL = BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 1.0)

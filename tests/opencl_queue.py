@@ -39,6 +39,6 @@ def as_gpu(queue, monkeypatch):
 @pytest.fixture
 def copies(monkeypatch):
     """Bytes that models copy to the device and back."""
-    from gpusense.backends._opencl import OpenCLBackend
+    from gpusense.backends.opencl.backend import OpenCLBackend
 
     return counted_copies(monkeypatch, OpenCLBackend)

@@ -10,8 +10,8 @@ import numpy as np
 from ray_oracles import Ray, walk
 
 from gpusense.backends import get_backend
-from gpusense.lanes import widened
-from gpusense.prepare import empty_rectangles
+from gpusense.interface.lanes import widened
+from gpusense.tables.distances import empty_rectangles
 
 LAST_FLOAT32 = 1 - 2.0**-24
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, LAST_FLOAT32)
@@ -66,7 +66,7 @@ def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: 
     table = empty_rectangles(device, scene.occupied, sectors)
     cell, pose = device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real))
     rays, ranges = device.upload(np.array([[1.0, 0.0]], real)), device.empty(count, real)
-    code = widened(device.info, "cast_ranges", flags) if wide else frozenset(flags)
+    code = widened(device.info.lanes, "cast_ranges", flags) if wide else frozenset(flags)
     device.compile("cast_ranges", code)(
         (1, count), table, cell, pose, rays, ranges, rows, cols, count, 1, 0, 0.0, 0.0, scene.limit, 1.0, scene.limit
     )

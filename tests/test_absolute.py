@@ -17,7 +17,7 @@ from test_absolute_oracle import assert_close, each_precision
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.models import chunks
-from gpusense.models.bumper import sample_outline
+from gpusense.models.point.bumper import sample_outline
 
 NAN = float("nan")
 CELLS = (np.random.default_rng(4).random((40, 50)) < 0.03).astype(int) * 100

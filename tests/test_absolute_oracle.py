@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 import gpusense as gs
-from gpusense.models.beacons import t_series
+from gpusense.models.point.beacons import t_series
 
 PRECISIONS = ("float32", "float64")
 each_precision = pytest.mark.parametrize("precision", PRECISIONS)

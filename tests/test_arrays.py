@@ -10,10 +10,9 @@ import pytest
 from array_libraries import CUDA, Array, OldArray, Recorded, installed
 
 import gpusense as gs
-from gpusense import arrays
-from gpusense.backends import get_backend
-from gpusense.tolerances import differing
-from gpusense.workspace import Workspace
+from gpusense.backends import arrays, get_backend
+from gpusense.backends.workspace import Workspace
+from gpusense.evaluation.tolerances import differing
 
 BEAMS, COUNT, RANGE = 21, 40, 5.0
 RNG = np.random.default_rng(12)

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from bench_world import ERRORS, TIMES, made_report
 
-from gpusense import cli
-from gpusense.benchmark import candidates, diagrams, report, scenes
+from gpusense.commands import cli
+from gpusense.evaluation.benchmark import candidates, report, scenes
+from gpusense.plots import benchmark as diagrams
 
 pytestmark = pytest.mark.usefixtures("no_data")
 

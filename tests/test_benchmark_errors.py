@@ -10,8 +10,8 @@ from bench_world import quick_scene
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.benchmark import accuracy, scenes
-from gpusense.tolerances import TOLERANCES
+from gpusense.evaluation.benchmark import accuracy, scenes
+from gpusense.evaluation.tolerances import TOLERANCES
 
 pytestmark = pytest.mark.usefixtures("no_data")
 

@@ -11,7 +11,8 @@ from bench_world import candidate, free_ranges, plan_of, quick_scene
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.benchmark import accuracy, candidates, diagrams, measure, peers, report, runner
+from gpusense.evaluation.benchmark import accuracy, candidates, measure, peers, report, runner
+from gpusense.plots import benchmark as diagrams
 
 pytestmark = pytest.mark.usefixtures("no_data")
 
@@ -155,7 +156,7 @@ def test_compiling_does_not_use_up_the_time_of_a_run():
 def test_peers_are_read_from_a_file(tmp_path):
     file = tmp_path / "peers.py"
     file.write_text(
-        "from gpusense.benchmark.candidates import Candidate\n"
+        "from gpusense.evaluation.benchmark.candidates import Candidate\n"
         "def make(scene, backend, precision): ...\n"
         "def candidates():\n"
         "    return [Candidate(p, 'theirs', make, outside='their 1.0') for p in ('ranges', 'field')]\n"

@@ -8,8 +8,9 @@ import math
 import numpy as np
 from bench_world import ERRORS, made_point, made_report, wrong
 
-from gpusense import cli
-from gpusense.benchmark import compare, diagrams, profiles, report
+from gpusense.commands import cli
+from gpusense.evaluation.benchmark import compare, profiles, report
+from gpusense.plots import benchmark as diagrams
 
 
 def test_pareto_front_by_hand():

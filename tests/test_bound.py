@@ -15,9 +15,9 @@ from conftest import BACKENDS
 from test_small_calls import BEAMS, COUNT, GRID, MODELS, RANGE, cloud, gathering, to_device
 
 import gpusense as gs
-from gpusense import cloud as places
+from gpusense.evaluation.tolerances import TOLERANCES, differing
 from gpusense.models import chunks
-from gpusense.tolerances import TOLERANCES, differing
+from gpusense.models import cloud as places
 
 __all__ = ["gathering"]
 

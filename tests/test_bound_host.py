@@ -10,8 +10,8 @@ from test_bound import BEAM, CASES, FIELD, NEAR, SCANS, mixed
 from test_small_calls import BEAMS, COUNT, GRID, MODELS, cloud, gathering, to_device
 
 import gpusense as gs
-from gpusense import binding
-from gpusense.tolerances import differing
+from gpusense.evaluation.tolerances import differing
+from gpusense.models.scan import binding
 
 __all__ = ["gathering"]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import casters
+from gpusense.tables import casters
 
 
 @pytest.mark.parametrize(

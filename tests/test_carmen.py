@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpusense.logs import Odometry, Scan, read_log
-from gpusense.scanner import Reading, classify
+from gpusense.world.scanner import Reading, classify
 
 TAIL = "12.5 robot 0.5"
 

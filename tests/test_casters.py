@@ -14,12 +14,13 @@ from raycast_scenes import FAMILIES, Scene, scenes_of
 from raycast_scenes import cast as scene_cast
 
 import gpusense as gs
-from gpusense import casters, region
 from gpusense.backends import get_backend
-from gpusense.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March, Window
-from gpusense.directional import directional_table
-from gpusense.prepare import sectors_of
-from gpusense.reference.densities import log_mixture
+from gpusense.models.scan.densities import log_mixture
+from gpusense.tables import casters
+from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March, Window
+from gpusense.tables.directional import directional_table
+from gpusense.tables.distances import sectors_of
+from gpusense.world import windows
 
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "casters.md"
 KINDS = [
@@ -48,7 +49,7 @@ def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, mon
     bearings = np.linspace(-3, 3, 9)
     caster = functools.partial(gs.RayCaster, grid, 20.0, method=kind, outside=outside)
     whole = caster(backend="numpy").cast(poses, bearings)
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 100)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 100)
     cropped = caster(backend=backend)
     cropped.prepare([[200.5, 150.5, 0.0]])
     before = cropped._caster.map.region

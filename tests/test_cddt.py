@@ -11,9 +11,9 @@ from caster_world import lists_of
 from scipy.spatial import cKDTree
 
 import gpusense as gs
-from gpusense.casters import Cddt, Exact, Lookup
-from gpusense.directional import directional_table
-from gpusense.worlds import building, cloud_uniform
+from gpusense.evaluation.worlds import building, cloud_uniform
+from gpusense.tables.casters import Cddt, Exact, Lookup
+from gpusense.tables.directional import directional_table
 
 
 def clipped_begin(col: int, row: int, turn: float, line: int) -> float | None:

@@ -12,8 +12,7 @@ import pytest
 from command_line import SMALL, error_of, script
 
 import gpusense
-from gpusense import cli
-from gpusense.commands import devices
+from gpusense.commands import cli, devices
 
 
 @pytest.fixture
@@ -57,7 +56,7 @@ def test_command_modules_keep_the_contract(name):
 
 def test_help_loads_no_backend_and_no_drawing(tmp_path):
     done = script(
-        "from gpusense.cli import main; code = main(['--help'])\n"
+        "from gpusense.commands.cli import main; code = main(['--help'])\n"
         "heavy = {'matplotlib', 'rich', 'pyopencl', 'warp', 'scipy', 'PIL', 'yaml'} & set(sys.modules)\n"
         "print(code, sorted(heavy))",
         cwd=tmp_path,
@@ -135,7 +134,7 @@ def test_broken_pipe_is_silent(broken, capsys):
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes break with a signal's error on POSIX only")
 def test_reader_that_went_away_leaves_no_traceback(tmp_path):
     code = (
-        "import os; from gpusense.cli import main\n"
+        "import os; from gpusense.commands.cli import main\n"
         "read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
         "sys.exit(main(['devices', '--json']))"
     )
@@ -145,7 +144,7 @@ def test_reader_that_went_away_leaves_no_traceback(tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_full_disk_is_one_line(tmp_path):
-    code = "from gpusense.cli import main; import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1); "
+    code = "from gpusense.commands.cli import main; import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1); "
     code += "sys.exit(main(['devices']))"
     done = script(code, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (2, "gpusense: error: No space left on device\n")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.compat import PEERS, BeamWeights, FieldWeights
+from gpusense.world.compat import PEERS, BeamWeights, FieldWeights
 
 NAN, INF = math.nan, math.inf
 # A wall 8 m east of the grid's corner, an unknown cell to the north-east, and free cells of 1 m.

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from command_line import SMALL, error_of, script
 
-from gpusense import cli
-from gpusense.commands import demo
+from gpusense.commands import cli, demo
 
 # What a model in float32 may differ from the float64 reference on 60 beams at most [nats], on its own rounded inputs.
 DEMO_TOLERANCE = 1e-2
@@ -109,7 +108,8 @@ def test_demo_goes_on_without_a_device_that_nobody_asked_for(needs, monkeypatch,
 def test_demo_draws_without_pyplot(tmp_path):
     done = script(
         "from gpusense.commands import demo; demo.LATTICE = 0.5\n"
-        f"from gpusense.cli import main; code = main({[*SMALL, '--backend', 'numpy', '--output', 'demo.svg']})\n"
+        "from gpusense.commands.cli import main\n"
+        f"code = main({[*SMALL, '--backend', 'numpy', '--output', 'demo.svg']})\n"
         "print(code, 'matplotlib.pyplot' in sys.modules)",
         cwd=tmp_path,
     )

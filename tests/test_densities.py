@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gpusense as gs
-from gpusense.reference import densities
-from gpusense.reference.densities import log_hit, log_mixture, log_rand, log_short, naive_log_hit, naive_log_short
+from gpusense.models.scan import densities
+from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short, naive_log_hit, naive_log_short
 
 PRECISIONS = ("float64", "float32")
 BOUND = 16  # eps (1 + |log p|)

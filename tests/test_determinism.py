@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import region
 from gpusense.backends import get_backend
-from gpusense.tolerances import TOLERANCES, beam_tolerance, scan_tolerance
+from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, scan_tolerance
+from gpusense.world import windows
 
 KINDS = ("ranges", "beam", "field", "bilinear")
 PRECISIONS = ("float32", "float64")
@@ -126,7 +126,7 @@ def test_any_batches(call):
 def test_any_batches_of_a_cropped_map(kind, call, backend, monkeypatch):
     """Each batch of neighbouring particles sees a window of the map of its own."""
     whole, along = call(cloud()), np.argsort(cloud()[:, 0])
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 1)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     owner, cropped = make(kind, whole.dtype.name, backend)
     found = np.concatenate([cropped(some) for some in np.split(cloud()[along], [1, 40, 99, 250])])
     table = getattr(owner, "_map", None) or getattr(owner, "map", None) or owner._caster.map

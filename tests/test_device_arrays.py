@@ -11,11 +11,10 @@ from array_libraries import Array, counted_copies, installed
 from conftest import skip_or_fail
 
 import gpusense as gs
-from gpusense import arrays
-from gpusense.backends import get_backend
+from gpusense.backends import arrays, get_backend
+from gpusense.backends.workspace import Workspace
+from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
-from gpusense.tolerances import differing
-from gpusense.workspace import Workspace
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
 RNG = np.random.default_rng(12)
@@ -62,7 +61,7 @@ def copies(monkeypatch):
     """Sizes of what goes to the device and comes back, by the names of buffers."""
     import warp  # noqa: F401
 
-    from gpusense.backends._warp import WarpBackend
+    from gpusense.backends.warp.backend import WarpBackend
 
     return counted_copies(monkeypatch, WarpBackend)
 

@@ -13,8 +13,8 @@ import pytest
 from oracles import Mixture
 
 import gpusense as gs
-from gpusense.discrete import bins_of
-from gpusense.reference.discrete import log_spread
+from gpusense.learning.discrete.probabilities import log_spread
+from gpusense.learning.discrete.table import bins_of
 
 RANGE = 6.0
 CAUSES = {

@@ -13,7 +13,7 @@ import fake_driver
 import pytest
 
 pytest.importorskip("pyopencl")
-from gpusense.backends import _opencl_drivers as drivers
+from gpusense.backends.opencl import drivers
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import pytest
 from model_world import INF, KINDS, NAN, REPEATED, cloud, make, room, scan
 
 import gpusense as gs
-from gpusense import cloud as cloud_module
-from gpusense import region
 from gpusense.backends import Backend, get_backend
+from gpusense.models import cloud as cloud_module
+from gpusense.world import windows
 
 
 def left_out(model: Any) -> dict[str, str]:
@@ -24,7 +24,7 @@ def left_out(model: Any) -> dict[str, str]:
 
 def test_explain_names_what_is_left_out(monkeypatch):
     """Each omission with the number that decides it, and what it saves; nothing about a scan before there is one."""
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 1)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     grid = room((400, 500))
     z = scan(REPEATED)
     z[:4] = [NAN, INF, INF, -1.0]

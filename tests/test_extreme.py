@@ -10,8 +10,8 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.prepare import empty_rectangles
-from gpusense.tolerances import differing, per_scan
+from gpusense.evaluation.tolerances import differing, per_scan
+from gpusense.tables.distances import empty_rectangles
 
 PRECISIONS = ("float32", "float64")
 # Denormal in float32, denormal in float64 too, and on either side of what a ray takes for 0.

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import sources
 from gpusense.backends import get_backend
+from gpusense.interface import sources
 from gpusense.models import chunks
 
 
@@ -99,7 +99,7 @@ def test_places_in_the_whole_source_become_places_in_files():
 def test_a_device_that_is_gone_says_so(needs, monkeypatch):
     import pyopencl as cl
 
-    from gpusense.backends import _opencl
+    from gpusense.backends.opencl import backend as _opencl
 
     grid, scanner, poses, ranges = room()
     model = gs.BeamModel(grid, scanner, backend=needs("opencl"))

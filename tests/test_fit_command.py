@@ -12,10 +12,11 @@ import yaml
 from scipy.integrate import quad
 
 import gpusense as gs
-from gpusense import fitting, held_out
-from gpusense.cli import main
 from gpusense.commands import fit as command
-from gpusense.worlds import building, free_pose, simulate_scan
+from gpusense.commands.cli import main
+from gpusense.evaluation import held_out
+from gpusense.evaluation import range_data as fitting
+from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 
 TRUTH = gs.BeamParameters(z_hit=0.8, z_short=0.08, z_max=0.05, z_rand=0.07, sigma_hit=0.04, lambda_short=0.5)
 SCANS, BEAMS, RANGE = 60, 60, 10.0

@@ -10,7 +10,7 @@ import pytest
 from oracles import placed
 
 import gpusense as gs
-from gpusense.frames import place_poses, ray_vectors, split
+from gpusense.world.frames import place_poses, ray_vectors, split
 
 FLOAT64, FLOAT32 = np.dtype(np.float64), np.dtype(np.float32)
 NO_MOUNT = (0.0, 0.0, 0.0)

@@ -11,7 +11,7 @@ from model_world import BEARINGS, KINDS, RANGE, cloud, make, parts_of_kind, room
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.models import chunks
-from gpusense.models.reachable import ReachableMap
+from gpusense.tables.reachable import ReachableMap
 
 
 class FullDevice:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpusense.grid import OccupancyGrid
+from gpusense.world.grid import OccupancyGrid
 
 CELLS = [
     [0, 100, -1],

@@ -10,10 +10,10 @@ from incidence_world import INCIDENCE, RANGE, RIGHT, place
 from raycast_scenes import FAMILIES, Scene, scenes_of
 
 import gpusense as gs
-from gpusense import region
 from gpusense.backends import get_backend
-from gpusense.prepare import empty_rectangles
-from gpusense.tolerances import TOLERANCES, differing
+from gpusense.evaluation.tolerances import TOLERANCES, differing
+from gpusense.tables.distances import empty_rectangles
+from gpusense.world import windows
 
 # ---------------------------------------------------------------------------------------------------------- normals
 
@@ -99,13 +99,13 @@ def test_normals_turn_with_the_map_and_know_its_surroundings():
 
 
 def test_normals_do_not_depend_on_how_a_map_is_cut():
-    from gpusense import normals
+    from gpusense.tables import normals
 
     rng = np.random.default_rng(3)
     obstacles = rng.random((70, 90)) < 0.2
     for outside in ("free", "occupied"):
-        everything = normals.normal_table(obstacles, region.Region(0, 0, 70, 90), outside, np.dtype(float))
-        for part in (region.Region(0, 0, 20, 30), region.Region(33, 41, 37, 49), region.Region(10, 80, 5, 1)):
+        everything = normals.normal_table(obstacles, windows.Region(0, 0, 70, 90), outside, np.dtype(float))
+        for part in (windows.Region(0, 0, 20, 30), windows.Region(33, 41, 37, 49), windows.Region(10, 80, 5, 1)):
             cut = normals.normal_table(obstacles, part, outside, np.dtype(float))
             want = everything[part.row : part.row + part.rows + 2, part.col : part.col + part.cols + 2]
             np.testing.assert_array_equal(cut, want)
@@ -245,7 +245,7 @@ def test_a_cropped_or_changed_map_has_the_angles_of_a_new_one(backend, monkeypat
     poses = np.column_stack([rng.uniform(208, 209.5, 60), rng.uniform(158, 159.5, 60), rng.uniform(-3, 3, 60)])
     bearings = np.linspace(-3, 3, 9)
     whole = gs.RayCaster(grid, 20.0, backend="numpy").incidence(poses, bearings)
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 100)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 100)
     caster = gs.RayCaster(grid, 20.0, backend=backend)
     caster.prepare([[200.5, 150.5, 0.0]])
     tolerance = TOLERANCES["float32 angles of incidence"]

@@ -9,7 +9,7 @@ import pytest
 from learning_data import RANGE_MAX
 
 import gpusense as gs
-from gpusense.worlds import sample_readings
+from gpusense.evaluation.worlds import sample_readings
 
 HEAD_ON = gs.BeamParameters(0.85, 0.05, 0.05, 0.05, 0.05, 1.0)
 GRAZING = gs.BeamParameters(0.45, 0.05, 0.4, 0.1, 0.3, 1.0)

@@ -10,9 +10,9 @@ from conftest import on_every_backend
 from incidence_world import EDGES, INCIDENCE, KINDS, RANGE, RIGHT, P, place
 
 import gpusense as gs
-from gpusense import cloud
-from gpusense.reference.densities import log_mixture
-from gpusense.tolerances import differing, per_beam, per_scan
+from gpusense.evaluation.tolerances import differing, per_beam, per_scan
+from gpusense.models import cloud
+from gpusense.models.scan.densities import log_mixture
 
 
 def a_scan(count: int = 23) -> np.ndarray:

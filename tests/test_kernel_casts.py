@@ -7,7 +7,7 @@ import pytest
 from kernel_scenes import PRECISIONS, SECTORS, adversarial_poses, each_grid, ranges_on_both, scene_flags
 
 from gpusense.backends import Backend
-from gpusense.tolerances import differing
+from gpusense.evaluation.tolerances import differing
 
 
 @pytest.mark.parametrize("sectors", SECTORS)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from kernel_scenes import PRECISIONS, scene_flags
 
-from gpusense._kernel_files import warp_module
 from gpusense.backends import get_backend
-from gpusense.signatures import FLAGS, KERNELS
-from gpusense.sources import assemble, relevant
+from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.signatures import FLAGS, KERNELS
+from gpusense.interface.sources import assemble, relevant
 
 # Kernel, the flag, flags beside it, and what only the flag's code has, in OpenCL and in Warp's C++.
 TRACES = [

@@ -11,12 +11,12 @@ from kernel_scenes import PRECISIONS, on_both, scene_flags
 
 import gpusense as gs
 from gpusense.backends import Backend
-from gpusense.frames import frame_scalars, ray_vectors, split
+from gpusense.evaluation.tolerances import differing
+from gpusense.models.scan.readings import choose_beams, prepare_scan
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED, is_chosen
-from gpusense.scan import choose_beams, prepare_scan
-from gpusense.scanner import Reading
-from gpusense.tolerances import differing
+from gpusense.world.frames import frame_scalars, ray_vectors, split
+from gpusense.world.scanner import Reading
 
 RANGE, NEAREST, RESOLUTION, GUARD = 5.0, 0.2, 0.05, 3.25 * 2.0**-23
 LAST = float(np.nextafter(np.float32(RANGE), np.float32(0)))

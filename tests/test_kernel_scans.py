@@ -11,8 +11,8 @@ from test_kernel_scores import field_scene, mixture, scan
 from test_kernel_tiles import OCCUPIED, RANGE, an_order, guards_of, items, poses, rays_of, room_for, strides
 
 from gpusense.backends import Backend
+from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.reference.error_free import BLOCK_TERMS, strands_in
-from gpusense.tolerances import differing, per_beam, per_scan
 
 PER_SCAN, SCANS = 37, 4
 COUNT = PER_SCAN * SCANS

@@ -27,9 +27,9 @@ from kernel_scenes import (
 )
 
 from gpusense.backends import Backend, get_backend
-from gpusense.frames import split
+from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.reference.mixture import log_density
-from gpusense.tolerances import differing, per_beam, per_scan
+from gpusense.world.frames import split
 
 # Weights and shapes of mixtures: z_hit, z_short, z_rand, sigma_hit and lambda_short in metres.
 MIXTURES = {

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from kernel_scenes import PRECISIONS
 
-from gpusense._kernel_files import kernel_root, opencl_source, warp_module
-from gpusense.signatures import KERNELS, Argument
+from gpusense.interface.kernel_files import kernel_root, opencl_source, warp_module
+from gpusense.interface.signatures import KERNELS, Argument
 
 each_kernel = pytest.mark.parametrize("kernel", list(KERNELS))
 

@@ -24,9 +24,9 @@ from kernel_scenes import (
 )
 
 from gpusense.backends import Backend, get_backend
-from gpusense.prepare import empty_rectangles, packed
 from gpusense.reference.rectangles import OCCUPIED, slope
-from gpusense.region import Region
+from gpusense.tables.distances import empty_rectangles, packed
+from gpusense.world.windows import Region
 
 # ---- distances
 

@@ -29,10 +29,10 @@ from kernel_scenes import (
 from test_kernel_scores import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mixture, scan
 
 from gpusense.backends import Backend, get_backend
-from gpusense.models.field import _GUARD
+from gpusense.evaluation.tolerances import differing, per_beam
+from gpusense.models.scan.field import _GUARD
 from gpusense.reference.error_free import BLOCK_TERMS, strand_sums, strands_in
 from gpusense.reference.tiles import TILE, TILE_PARTICLES
-from gpusense.tolerances import differing, per_beam
 
 SPREADS = range(6)
 COUNTS = (1, 15, 16, 17, 777)

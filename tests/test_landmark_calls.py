@@ -12,8 +12,8 @@ from test_absolute import GRID, models, poses_around
 from test_device_arrays import copies, device, each_framework, framework, to_device  # noqa: F401
 
 import gpusense as gs
+from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
-from gpusense.tolerances import differing
 
 INF = float("inf")
 IMPOSSIBLE = {

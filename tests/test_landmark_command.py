@@ -11,7 +11,7 @@ import pytest
 from command_line import error_of
 
 import gpusense as gs
-from gpusense.cli import main
+from gpusense.commands.cli import main
 from gpusense.logs.mrclam import dead_reckoning, read_mrclam
 
 

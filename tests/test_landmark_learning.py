@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.learning import landmark_pairs as inner
+from gpusense.learning.landmark import pairs as inner
 
 VIEWS = (2 * math.pi, 4.5, 1.2)
 

@@ -12,7 +12,7 @@ import pytest
 from conftest import on_every_backend
 
 import gpusense as gs
-from gpusense.tolerances import TOLERANCES
+from gpusense.evaluation.tolerances import TOLERANCES
 
 PRECISIONS = ("float32", "float64")
 NAN = scenes.NAN

@@ -9,9 +9,9 @@ from conftest import on_every_backend
 from scipy.special import ndtr
 
 import gpusense as gs
-from gpusense.features import check_features
-from gpusense.landmarks import make_buckets
 from gpusense.models import chunks
+from gpusense.models.landmark.features import check_features
+from gpusense.world.landmarks import make_buckets
 
 NAN = scenes.NAN
 FLOAT64 = dict(precision="float64")

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy import special
 
-from gpusense._kernel_files import opencl_source
-from gpusense.signatures import LANES
-from gpusense.sources import prelude, resolve
-from gpusense.tolerances import TOLERANCES
+from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.interface.kernel_files import opencl_source
+from gpusense.interface.signatures import LANES
+from gpusense.interface.sources import prelude, resolve
 
 NORMAL = float(np.finfo(np.float32).tiny)
 COUNT = 1 << 22

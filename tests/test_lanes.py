@@ -12,9 +12,9 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.lanes import widened
-from gpusense.signatures import LANES, lanes_of
-from gpusense.tolerances import beam_tolerance, differing
+from gpusense.evaluation.tolerances import beam_tolerance, differing
+from gpusense.interface.lanes import widened
+from gpusense.interface.signatures import LANES, lanes_of
 
 RANGE = 9.0
 KERNELS = ("cast_ranges", "score_beams", "score_field")
@@ -136,16 +136,16 @@ def test_end_points_next_to_edges_and_far_away(resolution, device):
 def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
     wide = dataclasses.replace(info, lanes=LANES)
-    assert widened(info, "cast_ranges", set()) == frozenset()
-    assert widened(wide, "cast_ranges", set()) == {"WIDE"}
+    assert widened(info.lanes, "cast_ranges", set()) == frozenset()
+    assert widened(wide.lanes, "cast_ranges", set()) == {"WIDE"}
     for flag in ("FLOAT64", "MARCH", "LOOKUP", "SHARED_RAYS", "SHARP"):
-        assert widened(wide, "cast_ranges", {flag}) == {flag}
-    assert widened(wide, "score_beams", {"HIT"}) == {"HIT"}
-    assert widened(wide, "score_beams", {"HIT", "LINEAR"}) == {"HIT", "LINEAR", "WIDE"}
-    assert widened(wide, "score_field", {"BILINEAR"}) == {"BILINEAR"}
-    assert widened(wide, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
-    assert widened(wide, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
-    assert widened(wide, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
+        assert widened(wide.lanes, "cast_ranges", {flag}) == {flag}
+    assert widened(wide.lanes, "score_beams", {"HIT"}) == {"HIT"}
+    assert widened(wide.lanes, "score_beams", {"HIT", "LINEAR"}) == {"HIT", "LINEAR", "WIDE"}
+    assert widened(wide.lanes, "score_field", {"BILINEAR"}) == {"BILINEAR"}
+    assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
+    assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
+    assert widened(wide.lanes, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_which_devices_are_asked_for_lanes(platform, kind, width, lanes, needs):
     needs("opencl")
     import pyopencl as cl
 
-    from gpusense.backends._opencl_devices import _lanes
+    from gpusense.backends.opencl.devices import _lanes
 
     device = SimpleNamespace(
         platform=SimpleNamespace(name=platform), type=getattr(cl.device_type, kind), native_vector_width_float=width

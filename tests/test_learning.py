@@ -9,9 +9,9 @@ import pytest
 from learning_data import RANGE_MAX, TYPICAL, draw, starts
 
 import gpusense as gs
-from gpusense.learning.scenes import learning_scenes
-from gpusense.reference.densities import log_mixture
-from gpusense.tolerances import TOLERANCES
+from gpusense.evaluation.fit_scenes import learning_scenes
+from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.models.scan.densities import log_mixture
 
 FAR = gs.BeamParameters(0.7, 0.1, 0.15, 0.05, 1.0, 0.3)
 EQUAL = gs.BeamParameters(0.25, 0.25, 0.25, 0.25, 1.0, 1.0)
@@ -101,7 +101,7 @@ def test_a_fit_of_the_model_scores_highest(needs) -> None:
     pose = [[4.0, 3.0, 0.3]]
     model = gs.BeamModel(grid, scanner, backend="numpy", precision="float64")
     expected = model.expected_ranges(pose)[0]
-    from gpusense.worlds import sample_readings
+    from gpusense.evaluation.worlds import sample_readings
 
     z = sample_readings(np.minimum(expected, 9.0), 9.0, TYPICAL, np.random.default_rng(0))
     fit = gs.fit_beam_parameters(z, expected, 9.0, backend="numpy")

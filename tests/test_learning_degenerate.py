@@ -7,8 +7,8 @@ import pytest
 from learning_data import RANGE_MAX, TYPICAL, draw
 
 import gpusense as gs
-from gpusense.learning.pairs import quantum_of
-from gpusense.learning.problem import NOTHING
+from gpusense.learning.beam.pairs import quantum_of
+from gpusense.learning.beam.problem import NOTHING
 
 RNG = np.random.default_rng(0)
 AHEAD = RNG.uniform(1, 9, 200)

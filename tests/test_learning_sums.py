@@ -12,10 +12,10 @@ from kernel_scenes import PRECISIONS
 from learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
 from gpusense.backends import get_backend
-from gpusense.learning.point import BIAS, Point
-from gpusense.learning.problem import Prior
-from gpusense.reference.densities import log_mixture
-from gpusense.tolerances import TOLERANCES, per_beam
+from gpusense.evaluation.tolerances import TOLERANCES, per_beam
+from gpusense.learning.beam.point import BIAS, Point
+from gpusense.learning.beam.problem import Prior
+from gpusense.models.scan.densities import log_mixture
 
 POINTS = {
     "ordinary": point(0.6, 0.2, 0.05, 0.15, sigma=0.2, rate=0.4),
@@ -163,7 +163,7 @@ def test_sums_do_not_depend_on_how_pairs_are_cut(as_gpu, monkeypatch: pytest.Mon
     device = as_gpu(False)
     whole = problem_of(z, expected, backend=device).device.sums(POINTS["ordinary"])
     as_gpu(True)
-    monkeypatch.setattr("gpusense.learning.device_sums._CHUNK", 700)
+    monkeypatch.setattr("gpusense.learning.beam.device_sums._CHUNK", 700)
     cut = problem_of(z, expected, backend=device).device.sums(POINTS["ordinary"])
     np.testing.assert_allclose(cut, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max())
     again = problem_of(z, expected, backend=device).device.sums(POINTS["ordinary"])
@@ -195,6 +195,6 @@ def test_threads_share_the_blocks_with_the_same_bits(needs, monkeypatch: pytest.
     z, expected = draw(TYPICAL, 3001, 3)
     device = problem_of(z, expected, backend=needs("warp")).device
     sums, causes = device.sums(POINTS["ordinary"]), device.causes(POINTS["ordinary"])
-    monkeypatch.setattr("gpusense.backends._warp_pieces._PIECE_WORK", 64)
+    monkeypatch.setattr("gpusense.backends.warp.pieces._PIECE_WORK", 64)
     assert (device.sums(POINTS["ordinary"]) == sums).all()
     assert (device.causes(POINTS["ordinary"]) == causes).all()

@@ -11,9 +11,9 @@ import pytest
 from caster_world import RANGE, place, same_bits
 
 import gpusense as gs
-from gpusense import casters
-from gpusense.casters import Lookup
-from gpusense.lookup_files import read_lookup, write_lookup
+from gpusense.tables import casters
+from gpusense.tables.casters import Lookup
+from gpusense.tables.lookup_files import read_lookup, write_lookup
 
 
 def saved(path: Path, backend: str = "numpy", bins: int = 12, **options: object) -> np.ndarray:
@@ -123,7 +123,7 @@ def test_a_table_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
         raise OSError("the disk is full")
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match="the disk is full"):
-        patch.setattr("gpusense._files.os.replace", full)
+        patch.setattr("gpusense._util.files.os.replace", full)
         saved(path)
     assert path.read_bytes() == b"before" and [one.name for one in tmp_path.iterdir()] == ["table"]
     with pytest.raises(FileNotFoundError, match="nowhere"):

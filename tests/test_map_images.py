@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from map_files import CELLS, GREYS, chunk, pgm, png, yaml_text
 from PIL import Image
 
-from gpusense import _images
-from gpusense.map_io import read_map
+from gpusense.world import images
+from gpusense.world.map_files import read_map
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale"])
@@ -154,7 +154,7 @@ def test_image_data_in_many_chunks(place):
 
 @pytest.mark.parametrize("kind", ["P2", "P5", "P6", "png", "bmp"])
 def test_every_strip_has_its_place(place, monkeypatch, kind):
-    monkeypatch.setattr(_images, "_STRIP_CELLS", 16)
+    monkeypatch.setattr(images, "_STRIP_CELLS", 16)
     greys = np.random.default_rng(1).choice(np.array([0, 205, 254], np.uint8), (13, 7))
     expected = np.where(greys == 0, 100, np.where(greys == 254, 0, -1))[::-1]
     if kind == "P2":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from map_files import CELLS, GREYS, pgm, yaml_text
 
-from gpusense.map_io import read_map
+from gpusense.world.map_files import read_map
 
 
 def test_trinary_by_nav2(place):

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gpusense import map_io
-from gpusense.grid import OccupancyGrid
-from gpusense.map_io import read_map, write_map
+from gpusense.world import map_files
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map, write_map
 
 TRINARY = st.sampled_from([0, 100, -1])
 ANY = st.integers(-1, 100)
@@ -90,7 +90,7 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path, monkeypatch):
         stream.write(b"P5")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(map_io, "_write_image", failing)
+    monkeypatch.setattr(map_files, "_write_image", failing)
     with pytest.raises(OSError, match="no space left"):
         write_map(OccupancyGrid([[1, 2]]), tmp_path / "copy.yaml")
     assert list(tmp_path.iterdir()) == []

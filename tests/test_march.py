@@ -9,8 +9,8 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.casters import March, Window
 from gpusense.reference import march as march_reference
+from gpusense.tables.casters import March, Window
 
 LEAST_PART = 2.0**-22
 

@@ -27,13 +27,13 @@ if BACKEND.startswith("warp"):
     warp.config.mode = "debug"
     warp.config.verify_fp = False
 import gpusense as gs
-import gpusense.cloud
+import gpusense.models.cloud
 from gpusense.backends import get_backend
-from gpusense.backends._numpy import NumpyBackend
-from gpusense.casters import CASTERS, Lookup, March
-from gpusense.frames import frame_scalars
-from gpusense.prepare import empty_rectangles
-from gpusense.region import Region
+from gpusense.backends.numpy.backend import NumpyBackend
+from gpusense.tables.casters import CASTERS, Lookup, March
+from gpusense.world.frames import frame_scalars
+from gpusense.tables.distances import empty_rectangles
+from gpusense.world.windows import Region
 
 rng = np.random.default_rng(0)
 cells = np.zeros((13, 17), int)
@@ -93,7 +93,7 @@ ranges[2] = np.nan
 scanner = gs.Scanner(bearings, 1.0, mount=(0.1, 0.02, 0.1))
 for kind, precision, outside in itertools.product(("cpu", "gpu"), ("float32", "float64"), ("free", "occupied")):
     pretend(kind)
-    gpusense.cloud.LEAST_ORDERED = (1, 1) if outside == "free" else (1 << 22, 1 << 12)
+    gpusense.models.cloud.LEAST_ORDERED = (1, 1) if outside == "free" else (1 << 22, 1 << 12)
     casts = [gs.RayCaster(grid, 1.0, backend=b, precision=precision, outside=outside).cast(poses, bearings)
              for b in (BACKEND, "numpy")]
     wrong += np.count_nonzero(casts[0] != casts[1])
@@ -102,7 +102,7 @@ for order, (kind, options) in itertools.product(((1, 1), (1 << 22, 1 << 12)), (
     (gs.BeamModel, {}), (gs.BeamModel, dict(specialize=False)), (gs.LikelihoodFieldModel, {}),
     (gs.LikelihoodFieldModel, dict(specialize=False)), (gs.LikelihoodFieldModel, dict(compat="amcl")),
 )):
-    gpusense.cloud.LEAST_ORDERED = order
+    gpusense.models.cloud.LEAST_ORDERED = order
     model = kind(grid, scanner, backend=device, **options)
     for some in (poses, poses[:1] * 0.1 + 0.7):
         wrong += np.count_nonzero(model.log_likelihood(some, ranges)

@@ -17,9 +17,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gpusense as gs
+from gpusense.evaluation.tolerances import TOLERANCES, per_beam
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.heading import cos_sin
-from gpusense.tolerances import TOLERANCES, per_beam
 
 CELL, MARGIN, RANGE, CAP, MOUNT = 0.25, 6, 6.0, 1.0, (0.2, -0.1, 0.3)
 FIELD = {

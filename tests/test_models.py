@@ -9,8 +9,8 @@ import pytest
 from model_world import BEARINGS, KINDS, NAN, RANGE, cloud, make, parts_of_kind, room, same_bits, scan
 
 import gpusense as gs
+from gpusense.backends.workspace import Workspace
 from gpusense.models import chunks
-from gpusense.workspace import Workspace
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -17,8 +17,8 @@ from test_small_calls import BEAMS, COUNT, GRID, MODELS, SCANNER, cloud, scan
 import gpusense as gs
 from gpusense import backends
 from gpusense.backends import get_backend
+from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
-from gpusense.tolerances import differing
 
 __all__ = ["as_gpu", "copies", "queue", "there"]
 
@@ -69,7 +69,7 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
     """Also where the device cannot begin with the particles of a scan, or those of a piece."""
     model = kind(GRID, SCANNER, backend=queue)
     monkeypatch.setattr(
-        "gpusense.models.scan_model.TOGETHER", {"gpu": 1 << 22 if share else 0} | {"cpu": 1 << 22 if share else 0}
+        "gpusense.models.scan.model.TOGETHER", {"gpu": 1 << 22 if share else 0} | {"cpu": 1 << 22 if share else 0}
     )
     for count in (COUNT, 129, 256):
         poses = np.stack([cloud(i, count) for i in range(4)]).astype(np.float32)
@@ -121,7 +121,7 @@ def test_parts_of_parts(queue, there, monkeypatch):
     import pyopencl as cl
     import pyopencl.array
 
-    monkeypatch.setattr("gpusense.models.scan_model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
+    monkeypatch.setattr("gpusense.models.scan.model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
     model, poses = FIELD(GRID, SCANNER, backend=queue), np.stack([cloud(i, 256) for i in range(3)])
     scans = np.stack([scan(1), scan(2), np.full(BEAMS, np.nan)])
     expected = model.log_likelihood(poses, scans)
@@ -142,7 +142,7 @@ def test_arrays_of_a_memory_pool(as_gpu, queue, monkeypatch):
 
     pool = pyopencl.tools.MemoryPool(pyopencl.tools.ImmediateAllocator(queue))
     model, poses = FIELD(GRID, NEAR, backend=queue), np.stack([cloud(1, 256), cloud(2, 256)])
-    monkeypatch.setattr("gpusense.models.scan_model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
+    monkeypatch.setattr("gpusense.models.scan.model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
     scans = np.stack([mixed(1), mixed(2)])
     given = pyopencl.array.to_device(queue, poses, allocator=pool)
     assert differing(model.log_likelihood(given, scans).get(), model.log_likelihood(poses, scans)) == 0

@@ -12,8 +12,8 @@ from opencl_queue import as_gpu, copies, queue, there
 from test_bound import CASES, NEAR, mixed
 from test_small_calls import BEAMS, COUNT, GRID, MODELS, cloud
 
-from gpusense import binding
-from gpusense.tolerances import differing
+from gpusense.evaluation.tolerances import differing
+from gpusense.models.scan import binding
 
 __all__ = ["as_gpu", "copies", "queue", "there"]
 
@@ -81,7 +81,7 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
 
 def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
     """A call is three launches, started by kernels of its own."""
-    from gpusense.backends import _opencl_replay
+    from gpusense.backends.opencl import replay as _opencl_replay
 
     model = FIELD(GRID, NEAR, backend=queue)
     call = model.bind(there(cloud(1)), there(mixed(1)))

@@ -17,7 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 
 import gpusense
-from gpusense._kernel_files import opencl_source
+from gpusense.interface.kernel_files import opencl_source
 
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("bench", "docs", "examples", "gpusense", "kernels", "tests")
@@ -29,7 +29,7 @@ FIND = """
 import json
 import sys
 import gpusense
-from gpusense._kernel_files import kernel_root, opencl_source
+from gpusense.interface.kernel_files import kernel_root, opencl_source
 
 root = kernel_root()
 sources = {path.stem: opencl_source(path.stem) for path in root.glob("opencl/*.cl")}
@@ -40,7 +40,7 @@ print(json.dumps({"package": gpusense.__file__, "root": str(root), "path": sys.p
 IMPORT = """
 import json
 import warp
-from gpusense._kernel_files import kernel_root, warp_module
+from gpusense.interface.kernel_files import kernel_root, warp_module
 
 names = [path.stem for path in kernel_root().glob("warp/*.py") if path.stem != "__init__"]
 modules = {name: warp_module(name) for name in names}
@@ -70,7 +70,7 @@ def double(values: wp.array(dtype=wp.float32)):
 """
 LAUNCH = """
 import warp as wp
-from gpusense._kernel_files import warp_module
+from gpusense.interface.kernel_files import warp_module
 
 wp.config.quiet = True
 module = warp_module("probe_kernel")

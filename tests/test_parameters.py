@@ -11,7 +11,7 @@ import json
 import numpy as np
 import pytest
 
-from gpusense.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
+from gpusense.world.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
 
 
 def test_defaults():

@@ -19,14 +19,14 @@ from hypothesis import strategies as st
 from oracles import placed
 
 import gpusense as gs
-from gpusense._kernel_files import opencl_source, warp_module
 from gpusense.backends import Backend, get_backend
-from gpusense.frames import frame_scalars, place_poses
+from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.interface.kernel_files import opencl_source, warp_module
+from gpusense.interface.sources import assemble, relevant, uses_double
 from gpusense.reference import heading
 from gpusense.reference.placement import FARTHEST
-from gpusense.region import Region
-from gpusense.sources import assemble, relevant, uses_double
-from gpusense.tolerances import TOLERANCES
+from gpusense.world.frames import frame_scalars, place_poses
+from gpusense.world.windows import Region
 
 WORST = TOLERANCES["cosines and sines of headings"].value
 PRECISIONS = ("float32", "float64")

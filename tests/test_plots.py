@@ -9,7 +9,8 @@ import pytest
 from matplotlib.colors import to_rgb
 
 import gpusense as gs
-from gpusense import plots, worlds
+from gpusense.evaluation import worlds
+from gpusense.plots import drawing as plots
 
 TURNED = (5e5, -3e5, 0.6)
 

@@ -11,7 +11,8 @@ import pytest
 from scipy import stats
 
 import gpusense as gs
-from gpusense import plots, position_plots
+from gpusense.plots import drawing as plots
+from gpusense.plots import positions as position_plots
 
 ROOT = Path(__file__).resolve().parents[1]
 XY = np.array([(1.0, 1.0), (8.0, 2.0), (4.5, 7.0)]) + np.array([5e5, -3e5])

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("pyopencl")
-from gpusense.backends import _pocl, get_backend, processor
+from gpusense.backends import get_backend, processor
+from gpusense.backends.opencl import pocl
 
 SSE2 = "fpu sse sse2"
 CORE2 = f"{SSE2} pni ssse3 cx16"
@@ -70,7 +71,7 @@ class Described:
     def __init__(self, target: str, name: str, *, version: str = "3.0", platform: str = "Portable Computing Language",
                  width: int = 8) -> None:  # fmt: skip
         self.names = [ctypes.create_string_buffer(text.encode()) for text in (target, name)]
-        self.words = np.arange(_pocl._WORDS, dtype=np.uint64)
+        self.words = np.arange(pocl._WORDS, dtype=np.uint64)
         self.words[::7] = 0xDEAD_BEEF_0000
         self.words[40] = np.uint64(2**64 - 1)
         self.words[79:81] = [ctypes.addressof(name) for name in self.names]
@@ -96,8 +97,8 @@ def of(monkeypatch):
     """Give this machine the instruction sets of another, and PoCL its libraries for several processors."""
 
     def give(flags: str, libraries: bool = True) -> None:
-        monkeypatch.setattr(_pocl, "instruction_sets", lambda: frozenset(flags.split()))
-        monkeypatch.setattr(_pocl, "_has_libraries", lambda: libraries)
+        monkeypatch.setattr(pocl, "instruction_sets", lambda: frozenset(flags.split()))
+        monkeypatch.setattr(pocl, "_has_libraries", lambda: libraries)
 
     return give
 
@@ -108,19 +109,19 @@ def test_the_target_fits_the_library_whatever_llvm_calls_the_processor(of, proce
     for name in (llvm, "generic", "znver3", "skylake-avx512", fitting):
         made = Described(X86, name, width=width_of(flags))
         before = made.words.copy()
-        assert _pocl.target_of(made.device) == fitting
+        assert pocl.target_of(made.device) == fitting
         assert made.name() == name
-        assert _pocl.fit_target(made.device) == (None if name == fitting else fitting)
-        assert made.name() == fitting == _pocl.target_of(made.device)
+        assert pocl.fit_target(made.device) == (None if name == fitting else fitting)
+        assert made.name() == fitting == pocl.target_of(made.device)
         assert np.flatnonzero(made.words != before).tolist() == ([] if name == fitting else [80])
-        assert _pocl.fit_target(made.device) is None
-        assert _pocl.lacking_for(made.device) == []
+        assert pocl.fit_target(made.device) is None
+        assert pocl.lacking_for(made.device) == []
 
 
 def test_no_name_stands_for_instruction_sets_that_the_processor_lacks():
     for name, _, flags, _ in PROCESSORS:
         sets = frozenset(flags.split())
-        library = _pocl.chosen_library(sets)
+        library = pocl.chosen_library(sets)
         assert library.needs | library.uses <= sets, name
 
 
@@ -128,15 +129,15 @@ def test_a_processor_that_no_library_fits_is_told(of):
     """A Xeon Phi: PoCL takes its library for AVX-512, most of which the processor lacks."""
     of(f"{HASWELL} avx512f avx512cd avx512er avx512pf")
     made = Described(X86, "knl", width=16)
-    assert _pocl.lacking_for(made.device) == ["avx512bw", "avx512dq", "avx512vl"]
+    assert pocl.lacking_for(made.device) == ["avx512bw", "avx512dq", "avx512vl"]
 
 
 def test_avx_is_what_llvm_sees_and_not_what_linux_lists(of):
     of(HASWELL)
-    assert _pocl.target_of(Described(X86, "znver3", width=16).device) == "skylake-avx512"
+    assert pocl.target_of(Described(X86, "znver3", width=16).device) == "skylake-avx512"
     of(SKYLAKE_X)
-    assert _pocl.target_of(Described(X86, "skylake-avx512", width=8).device) == "haswell"
-    assert _pocl.target_of(Described(X86, "haswell", width=4).device) == "penryn"
+    assert pocl.target_of(Described(X86, "skylake-avx512", width=8).device) == "haswell"
+    assert pocl.target_of(Described(X86, "haswell", width=4).device) == "penryn"
 
 
 @pytest.mark.parametrize(
@@ -153,26 +154,26 @@ def test_only_a_pocl_whose_target_may_not_fit_is_touched(of, changes):
     of(SKYLAKE_X)
     made = Described(**{"target": X86, "name": "znver3"} | changes)
     before = made.words.copy()
-    assert _pocl.fit_target(made.device) is None
+    assert pocl.fit_target(made.device) is None
     assert np.array_equal(made.words, before)
 
 
 def test_a_pocl_whose_library_is_for_one_processor_is_not_touched(of):
     of(SKYLAKE_X, libraries=False)
     made = Described(X86, "znver3", width=16)
-    assert _pocl.target_of(made.device) == "znver3"
-    assert _pocl.fit_target(made.device) is None
+    assert pocl.target_of(made.device) == "znver3"
+    assert pocl.fit_target(made.device) is None
 
 
 def test_the_wheels_pocl_compiles_for_the_processor_of_its_library(needs):
     backend = get_backend(needs("opencl"))
     if "Portable" not in backend.info.driver:
         pytest.skip(f"{backend.info.name} is not PoCL's")
-    if not _pocl._is_misfit(backend._device):
+    if not pocl._is_misfit(backend._device):
         pytest.skip("this PoCL chooses its target by its library")
-    name = _pocl.chosen_library(_pocl._flags(backend._device)).processor
-    assert _pocl._find_name(backend._device)[1] == name == backend.info.target
-    assert _pocl.fit_target(backend._device) is None
+    name = pocl.chosen_library(pocl._flags(backend._device)).processor
+    assert pocl._find_name(backend._device)[1] == name == backend.info.target
+    assert pocl.fit_target(backend._device) is None
     backend.compile("distance_lines", frozenset())
 
 

@@ -383,13 +383,13 @@ def test_without_a_linker_pocl_says_what_to_install(needs, tmp_path):
 
 _MISFIT = """
 import sys
-from gpusense.backends import _pocl
-fit = _pocl.fit_target
+from gpusense.backends.opencl import pocl
+fit = pocl.fit_target
 def misfit(device):
     fit(device)
-    place, name = _pocl._find_name(device)
-    _pocl._replace(place, "znver3")
-_pocl.fit_target = misfit
+    place, name = pocl._find_name(device)
+    pocl._replace(place, "znver3")
+pocl.fit_target = misfit
 """
 
 

@@ -22,8 +22,8 @@ from raycast_scenes import (
 )
 
 from gpusense.backends import get_backend
+from gpusense.evaluation.tolerances import differing
 from gpusense.reference.ray import crossed
-from gpusense.tolerances import differing
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

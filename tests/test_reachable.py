@@ -9,8 +9,8 @@ import pytest
 from model_world import BEARINGS, KINDS, RANGE, make, parts_of_kind, room, same_bits, scan
 
 import gpusense as gs
-from gpusense import region
-from gpusense.models.reachable import ReachableMap
+from gpusense.tables.reachable import ReachableMap
+from gpusense.world import windows
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
@@ -40,7 +40,7 @@ def test_a_cropped_map_gives_the_same_bits(kind, outside, backend, monkeypatch):
 
     whole, (preparations, cells) = results()
     assert (preparations, cells) == (1, 400 * 500)
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 1)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     cropped, (preparations, cells) = results()
     assert preparations >= 4
     for a, b in zip(whole, cropped, strict=True):
@@ -53,7 +53,7 @@ def test_a_cropped_map_gives_the_same_bits(kind, outside, backend, monkeypatch):
 
 
 def test_a_window_is_kept_while_the_cloud_stays(backend, monkeypatch):
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 1)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     grid, z = room((400, 500)), scan()
     model = make("beam", grid, backend)
     center = grid.cell_centers([200], [250])

@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial import cKDTree
 
 import gpusense as gs
-from gpusense import selftest
 from gpusense.backends import get_backend
-from gpusense.replay import Recorder, replay
-from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, scan_tolerance
-from gpusense.worlds import cloud_around, cloud_uniform, simulate_scan
+from gpusense.evaluation import selftest
+from gpusense.evaluation.replay import Recorder, replay
+from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, differing, scan_tolerance
+from gpusense.evaluation.worlds import cloud_around, cloud_uniform, simulate_scan
 
 # Every map of the recorded data: image sizes from 307 x 604 to 4729 x 5009 cells, and one of 10976 x 10976.
 SMALL = [

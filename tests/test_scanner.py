@@ -9,7 +9,7 @@ import pickle
 import numpy as np
 import pytest
 
-from gpusense.scanner import Reading, Scanner, classify
+from gpusense.world.scanner import Reading, Scanner, classify
 
 MISSING, MAX, HIT = Reading.MISSING, Reading.MAX, Reading.HIT
 

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 import gpusense as gs
-from gpusense import scoring
-from gpusense.cli import main
-from gpusense.worlds import building, free_pose, simulate_scan
+from gpusense.commands.cli import main
+from gpusense.evaluation import scoring
+from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 
 
 def score(log_p, poses=None):

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import cloud, selftest, stiff
 from gpusense.backends import get_backend
-from gpusense.backends._numpy import NumpyBackend
-from gpusense.cli import main
+from gpusense.backends.numpy.backend import NumpyBackend
+from gpusense.commands.cli import main
+from gpusense.evaluation import selftest, stiff
+from gpusense.evaluation.replay import Recorder, replay
+from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
+from gpusense.models import cloud
 from gpusense.reference import beam, distance, echo, mixture, order, ranges, sums
 from gpusense.reference.error_free import block_sums, strand_sums
-from gpusense.replay import Recorder, replay
-from gpusense.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
 
 INCIDENCE = gs.IncidenceParameters((0, 0.4, 1.0, math.pi / 2), (gs.BeamParameters(),) * 2 + (
     gs.BeamParameters(0.2, 0.1, 0.5, 0.2),))  # fmt: skip

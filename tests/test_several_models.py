@@ -11,7 +11,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.tolerances import differing
+from gpusense.evaluation.tolerances import differing
 
 RNG = np.random.default_rng(3)
 SCANNERS = [

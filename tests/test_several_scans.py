@@ -11,11 +11,13 @@ from conftest import on_every_backend
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import chunks, scan_call, scan_model
-from gpusense.scan import Batch, PreparedScan, prepare_scan
-from gpusense.scan_batch import join, part_of, prepare_batch, runs
-from gpusense.tolerances import differing
-from gpusense.workspace import Workspace
+from gpusense.backends.workspace import Workspace
+from gpusense.evaluation.tolerances import differing
+from gpusense.models import chunks
+from gpusense.models.scan import call as scan_call
+from gpusense.models.scan import model as scan_model
+from gpusense.models.scan.batch import join, part_of, prepare_batch, runs
+from gpusense.models.scan.readings import Batch, PreparedScan, prepare_scan
 
 BEAMS, RANGE = 37, 5.0
 RNG = np.random.default_rng(5)
@@ -120,7 +122,7 @@ def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
 def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
     # Particles in an order as well, which GPUs would make of many.
-    monkeypatch.setattr("gpusense.cloud.LEAST_ORDERED", (1, 1))
+    monkeypatch.setattr("gpusense.models.cloud.LEAST_ORDERED", (1, 1))
     model = MODELS[name][0](backend=device)
     z = scans_of(model.scanner)
     for count in (1, 63, 65, 130):
@@ -171,7 +173,7 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
 
 def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch):
     """Pieces of a launch on Warp's processor begin and end within scans."""
-    from gpusense.backends import _warp_pieces
+    from gpusense.backends.warp import pieces as _warp_pieces
 
     model = field()(backend=get_backend(needs("warp:cpu")))
     z, poses = scans_of()[5:], clouds(6, 333)

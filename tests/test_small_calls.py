@@ -10,11 +10,11 @@ import pytest
 from array_libraries import Array, installed
 
 import gpusense as gs
-from gpusense import arrays
-from gpusense.backends import get_backend
-from gpusense.models import chunks, scan_model
-from gpusense.tolerances import differing
-from gpusense.workspace import Workspace
+from gpusense.backends import arrays, get_backend
+from gpusense.backends.workspace import Workspace
+from gpusense.evaluation.tolerances import differing
+from gpusense.models import chunks
+from gpusense.models.scan import model as scan_model
 
 BEAMS, COUNT, RANGE = 37, 300, 5.0
 RNG = np.random.default_rng(7)
@@ -39,7 +39,7 @@ def scan(seed: int, readings: int = BEAMS) -> np.ndarray:
 @pytest.fixture
 def two_ways(needs, monkeypatch):
     """An OpenCL processor's backend that shares memory, and one that copies by commands."""
-    from gpusense.backends import _opencl
+    from gpusense.backends.opencl import backend as _opencl
 
     selection = needs("opencl")
     shared = get_backend(selection)
@@ -81,7 +81,7 @@ def test_what_is_started_sees_what_was_there(two_ways):
 
 def test_shared_memory_that_is_not_to_be_had(two_ways):
     """It is a MemoryError, and nothing else is said."""
-    from gpusense.backends._opencl_memory import SharedBuffer, driver_errors
+    from gpusense.backends.opencl.memory import SharedBuffer, driver_errors
 
     with pytest.raises(MemoryError, match="out of memory"), driver_errors():
         SharedBuffer(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
@@ -96,7 +96,7 @@ def gathering(needs, monkeypatch):
     needs("warp")
     import warp as wp
 
-    from gpusense.backends._warp_queue import Graphs
+    from gpusense.backends.warp.queue import Graphs
 
     installed(monkeypatch)
     monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
@@ -243,7 +243,7 @@ def test_several_models_are_gathered(count, gathering, monkeypatch):
 
 
 def test_arrays_that_are_too_large_are_copied_at_once(gathering, monkeypatch):
-    from gpusense.backends import _warp_queue
+    from gpusense.backends.warp import queue as _warp_queue
 
     device, _ = gathering
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
@@ -296,7 +296,7 @@ def test_threads_gather_on_their_own(gathering, monkeypatch):
 def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering, monkeypatch):
     import warp as wp
 
-    from gpusense.backends import _warp_queue
+    from gpusense.backends.warp import queue as _warp_queue
 
     device, started = gathering
     monkeypatch.setattr(_warp_queue, "_MOST_GRAPHS", 2)

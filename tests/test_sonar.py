@@ -14,11 +14,11 @@ from incidence_world import EDGES, INCIDENCE, KINDS, P, place
 from scipy.ndimage import distance_transform_edt
 
 import gpusense as gs
-from gpusense import cloud
-from gpusense.casters import Lookup
-from gpusense.reference.densities import log_mixture
-from gpusense.tolerances import differing, per_beam, per_scan
-from gpusense.worlds import simulate_scan
+from gpusense.evaluation.tolerances import differing, per_beam, per_scan
+from gpusense.evaluation.worlds import simulate_scan
+from gpusense.models import cloud
+from gpusense.models.scan.densities import log_mixture
+from gpusense.tables.casters import Lookup
 
 RANGE = 5.0
 RING = np.arange(8) * math.pi / 4 + 0.1

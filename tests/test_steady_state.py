@@ -7,10 +7,9 @@ import pytest
 from conftest import on_every_backend
 
 import gpusense as gs
-from gpusense import cloud
-from gpusense.models import chunks
+from gpusense.evaluation.tolerances import differing
+from gpusense.models import chunks, cloud
 from gpusense.reference.error_free import BLOCK_TERMS
-from gpusense.tolerances import differing
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
 BLOCKS = -(-BEAMS // BLOCK_TERMS)
@@ -71,7 +70,7 @@ class Watch:
     def _count_buffers(self, device, monkeypatch) -> None:
         """What the driver is asked for, whoever asks."""
         if device.info.backend == "opencl":
-            from gpusense.backends import _opencl
+            from gpusense.backends.opencl import backend as _opencl
 
             class Counted(_opencl.DeviceBuffer):
                 def __init__(own, context, flags, size, **options):

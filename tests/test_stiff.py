@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from oracles import Mixture
 
 import gpusense as gs
-from gpusense import stiff
 from gpusense.backends import get_backend
-from gpusense.reference.densities import log_mixture
-from gpusense.tolerances import TOLERANCES
+from gpusense.evaluation import stiff
+from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.models.scan.densities import log_mixture
 
 PRECISIONS = ("float32", "float64")
 PAGE = Path(__file__).parents[1] / "docs" / "numerics.md"

@@ -15,9 +15,8 @@ from conftest import on_every_backend
 from kernel_scenes import assert_near
 
 import gpusense as gs
-from gpusense import cloud
-from gpusense.models import chunks
-from gpusense.tolerances import differing, per_beam, per_scan
+from gpusense.evaluation.tolerances import differing, per_beam, per_scan
+from gpusense.models import chunks, cloud
 
 RANGE, BEAMS, COUNT = 5.0, 53, 150
 BEAM = {

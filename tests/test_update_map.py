@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense import casters, region
 from gpusense.backends import get_backend
+from gpusense.tables import casters
+from gpusense.world import windows
 
 RESOLUTION, RANGE_MAX = 0.1, 4.0
 BEARINGS = np.linspace(-3, 3, 9)
@@ -178,7 +179,7 @@ RANGES = np.linspace(0.3, 3.5, len(BEARINGS))
 
 def test_windows_of_the_map_follow(make, monkeypatch):
     """Edits in, across and beyond the window, and a cloud that moves on and comes back."""
-    monkeypatch.setattr(region, "SMALLEST_CELLS", 1)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     rng = np.random.default_rng(6)
     shape = (400, 500)
     grid = gs.OccupancyGrid(cells_of(rng, shape), RESOLUTION)
@@ -342,11 +343,11 @@ def test_a_grid_with_other_cells_is_read_only_and_keeps_the_rest():
 
 
 def test_windows_and_boxes():
-    window = region.Region(2, 3, 4, 5)
-    assert window.grown(3, (10, 9)) == region.Region(0, 0, 9, 9)
-    assert window.shared(region.Region(5, 0, 9, 4)) == region.Region(5, 3, 1, 1)
-    assert window.shared(region.Region(6, 3, 1, 1)) is None
+    window = windows.Region(2, 3, 4, 5)
+    assert window.grown(3, (10, 9)) == windows.Region(0, 0, 9, 9)
+    assert window.shared(windows.Region(5, 0, 9, 4)) == windows.Region(5, 3, 1, 1)
+    assert window.shared(windows.Region(6, 3, 1, 1)) is None
     cells = np.zeros((6, 7), bool)
-    assert region.box(cells) is None
+    assert windows.box(cells) is None
     cells[2, 5] = cells[4, 1] = True
-    assert region.box(cells) == region.Region(2, 1, 3, 5)
+    assert windows.box(cells) == windows.Region(2, 1, 3, 5)

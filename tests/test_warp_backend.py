@@ -129,7 +129,8 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     """A launcher of the field's scores that three threads share, and what runs a launcher on some particles."""
-    from gpusense.backends import _warp, _warp_pieces
+    from gpusense.backends.warp import backend as _warp
+    from gpusense.backends.warp import pieces as _warp_pieces
 
     monkeypatch.setattr(_warp_pieces, "_threads", lambda: 3)
     _warp_pieces._pool.cache_clear()

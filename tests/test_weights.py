@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpusense.weights import normalize_weights, resample
+from gpusense.localization.weights import normalize_weights, resample
 
 
 def test_weights_of_hand_computed_values():

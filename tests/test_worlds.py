@@ -9,8 +9,8 @@ import pytest
 from scipy import ndimage, stats
 
 import gpusense as gs
-from gpusense import worlds
-from gpusense.parameters import BeamParameters
+from gpusense.evaluation import worlds
+from gpusense.world.parameters import BeamParameters
 
 # A stochastic assertion draws SAMPLES readings from a fixed seed. 1.95 / sqrt(n) is the Kolmogorov-Smirnov bound that a
 # right sampler exceeds once in a thousand seeds, and five standard errors bound a mean or a share.

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from gpusense._checks import show
+from gpusense._util.checks import show
 from gpusense.backends import proof
 from gpusense.backends.base import Backend, BackendInfo, ProcessBound
 from gpusense.backends.proof import Verdict
@@ -155,7 +155,7 @@ def _module(backend: str) -> tuple[ModuleType | None, str]:
     if importlib.util.find_spec(library) is None:
         return None, f"{library} is not installed"
     try:
-        return importlib.import_module(f"gpusense.backends._{backend}"), ""
+        return importlib.import_module(f"gpusense.backends.{backend}.backend"), ""
     except (ImportError, OSError) as error:
         return None, f"{library} does not load ({error})"
 
@@ -200,7 +200,7 @@ def _opened(selection: str) -> Backend:
 
 
 def _of_queue(queue: Any) -> Backend:
-    from gpusense.backends import _opencl
+    from gpusense.backends.opencl import backend as _opencl
 
     with _LOCK:
         found = _OF_QUEUES.get(queue.int_ptr)
@@ -228,7 +228,7 @@ _OPENED: weakref.WeakSet[ProcessBound] = weakref.WeakSet()
 def _open(selection: str) -> Backend:
     backend = selection.partition(":")[0]
     if backend == "numpy":
-        from gpusense.backends._numpy import NumpyBackend
+        from gpusense.backends.numpy.backend import NumpyBackend
 
         return NumpyBackend()
     module, info, handle = _listed(selection)
@@ -248,9 +248,9 @@ def open_device(info: BackendInfo) -> Backend:
 
 def take_drivers(drivers: Any) -> None:
     """Load the drivers that a parent names in this process, which is its child."""
-    from gpusense.backends import _opencl_drivers
+    from gpusense.backends.opencl import drivers
 
-    _opencl_drivers.take(drivers)
+    drivers.take(drivers)
 
 
 def _listed(selection: str) -> tuple[ModuleType, BackendInfo, Any]:

@@ -86,7 +86,7 @@ def verdict_on(info: BackendInfo, *, drivers: Any = None, anew: bool = False) ->
 
     Args:
         info: The device.
-        drivers: The OpenCL drivers that the child loads; see ``_opencl_drivers.as_job``.
+        drivers: The OpenCL drivers that the child loads; see ``opencl.drivers.as_job``.
         anew: Whether the kept verdict is dropped.
     """
     if not child.can_start():

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense._files import check_writable, write_whole
-from gpusense.commands._common import (
+from gpusense._util.files import check_writable, write_whole
+from gpusense._util.progress import progress
+from gpusense.commands.common import (
     BACKEND_HELP,
     add_json,
     machine,
@@ -17,13 +18,12 @@ from gpusense.commands._common import (
     positive_number,
     print_json,
     print_table,
-    progress,
     whole_number,
 )
 
 if TYPE_CHECKING:
-    from gpusense.benchmark.candidates import Candidate
-    from gpusense.benchmark.runner import Plan
+    from gpusense.evaluation.benchmark.candidates import Candidate
+    from gpusense.evaluation.benchmark.runner import Plan
 
 NAME = "bench"
 HELP = "Measure error against run time of every caster and model, and write a report."
@@ -93,10 +93,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write the report and compare."""
-    from gpusense.benchmark import compare as comparing
-    from gpusense.benchmark.report import document, to_json
-    from gpusense.benchmark.runner import run as run_plan
-    from gpusense.benchmark.runner import steps
+    from gpusense.evaluation.benchmark import compare as comparing
+    from gpusense.evaluation.benchmark.report import document, to_json
+    from gpusense.evaluation.benchmark.runner import run as run_plan
+    from gpusense.evaluation.benchmark.runner import steps
 
     old, new = _reports(args)
     measured = new is None
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """The old report, and the new one where two are given."""
-    from gpusense.benchmark.compare import read_report
+    from gpusense.evaluation.benchmark.compare import read_report
 
     if not args.compare:
         return None, None
@@ -140,9 +140,9 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
     Raises:
         ValueError: an option names what is not here.
     """
-    from gpusense.benchmark.candidates import candidates
-    from gpusense.benchmark.runner import Plan
-    from gpusense.benchmark.scenes import sources
+    from gpusense.evaluation.benchmark.candidates import candidates
+    from gpusense.evaluation.benchmark.runner import Plan
+    from gpusense.evaluation.benchmark.scenes import sources
 
     before = old["arguments"] if old is not None else {}
     quick = args.quick or bool(before.get("quick"))
@@ -174,7 +174,7 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
 
 def _names(old: Mapping[str, Any] | None, args: argparse.Namespace) -> list[str] | None:
     """The scenes of an old report that this run can make too."""
-    from gpusense.benchmark.scenes import sources
+    from gpusense.evaluation.benchmark.scenes import sources
 
     if old is None or args.map:
         return None
@@ -184,7 +184,7 @@ def _names(old: Mapping[str, Any] | None, args: argparse.Namespace) -> list[str]
 
 def _outside(args: argparse.Namespace, problems: Sequence[str]) -> tuple[list[Candidate], list[str]]:
     """Outside candidates that can run, and why others cannot."""
-    from gpusense.benchmark import peers
+    from gpusense.evaluation.benchmark import peers
 
     if args.no_peers and args.peers is not None:
         raise ValueError("--no-peers: must not be given together with --peers")
@@ -220,10 +220,10 @@ def _check_folder(folder: Path) -> None:
 
 def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str) -> None:
     """Write the diagrams, then the report as Markdown and as JSON, each file whole or not at all."""
-    from gpusense.benchmark.diagrams import MEASURES, Style, profile_figure, work_precision
-    from gpusense.benchmark.profiles import profiles_of
-    from gpusense.benchmark.report import markdown
-    from gpusense.plots import save
+    from gpusense.evaluation.benchmark.profiles import profiles_of
+    from gpusense.evaluation.benchmark.report import markdown
+    from gpusense.plots.benchmark import MEASURES, Style, profile_figure, work_precision
+    from gpusense.plots.drawing import save
 
     folder.mkdir(exist_ok=True)
     points, images = report["points"], []
@@ -243,7 +243,7 @@ def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str
 
 
 def _print(report: Mapping[str, Any], folder: Path | None) -> None:
-    from gpusense.benchmark.report import COLUMNS, RANGE_COLUMNS, row
+    from gpusense.evaluation.benchmark.report import COLUMNS, RANGE_COLUMNS, row
 
     columns = ("scene", "cloud", "problem", *COLUMNS[:11], *RANGE_COLUMNS, *COLUMNS[11:])
     kept = [columns.index(name) for name in (

@@ -11,16 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from gpusense import plots, worlds
+from gpusense._util.progress import progress
 from gpusense.backends import Backend, Selection
-from gpusense.commands import _common
-from gpusense.commands._common import grouped
-from gpusense.grid import OccupancyGrid
-from gpusense.models.beam import BeamModel
-from gpusense.models.field import LikelihoodFieldModel
-from gpusense.parameters import BeamParameters
-from gpusense.scanner import Scanner
-from gpusense.scoring import evaluated_beams
+from gpusense.commands import common
+from gpusense.commands.common import grouped
+from gpusense.evaluation import worlds
+from gpusense.evaluation.scoring import evaluated_beams
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.plots import drawing as plots
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import BeamParameters
+from gpusense.world.scanner import Scanner
 
 NAME = "demo"
 HELP = "Localise a robot in a made-up building with every backend, compare them, and draw the result."
@@ -99,36 +101,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     parser.add_argument(
-        "--particles", type=_common.whole_number(low=1, high=100_000_000), default=100_000, metavar="N",
+        "--particles", type=common.whole_number(low=1, high=100_000_000), default=100_000, metavar="N",
         help="poses to score: half around the true one, half all over the building (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--beams", type=_common.whole_number(low=1, high=BEAMS), default=60, metavar="K",
+        "--beams", type=common.whole_number(low=1, high=BEAMS), default=60, metavar="K",
         help=f"how many of the scan's {BEAMS} beams the models use (default: %(default)s)",
     )  # fmt: skip
-    _common.add_seed(parser)
+    common.add_seed(parser)
     parser.add_argument(
         "--backend", action="append", metavar="DEVICE",
-        help=f"{_common.BACKEND_HELP}; give it again to compare several (default: every device found here)",
+        help=f"{common.BACKEND_HELP}; give it again to compare several (default: every device found here)",
     )  # fmt: skip
     parser.add_argument(
-        "--output", type=_common.output_path(".png", ".pdf", ".svg"), default=Path("gpusense-demo.png"),
+        "--output", type=common.output_path(".png", ".pdf", ".svg"), default=Path("gpusense-demo.png"),
         metavar="FILE", help="the picture (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    _common.add_json(parser)
+    common.add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Make the scene, score it everywhere, report and draw."""
     if not args.no_plot:
-        _common.check_writable(args.output)
-    backends, failures = _common.open_backends(args.backend)
+        common.check_writable(args.output)
+    backends, failures = common.open_backends(args.backend)
     scene = make_scene(args.seed, args.particles, args.beams)
     if not args.json:
         _introduce(scene, args.seed, backends)
     scores: list[Score] = []
-    with _common.progress(2 * len(backends) + 3) as step:
+    with progress(2 * len(backends) + 3) as step:
         for name in (BEAM, FIELD):
             step(f"{name}, float64 reference")
             truth = make_model(scene, name, "numpy", "float64")
@@ -147,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
             draw(scene, scores, args.output)
     written = args.output if drawn else None
     if args.json:
-        _common.print_json(_document(scene, args.seed, scores, failures, written))
+        common.print_json(_document(scene, args.seed, scores, failures, written))
     else:
         _report(scene, scores, failures, written)
     return 1 if failures else 0
@@ -234,7 +236,7 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
         steady = f"{one.steady_s:.3f}" if one.repetitions else "-"
         figures = [f"{one.first_s:.3f}", steady, f"{one.rate / 1e6:.1f}", f"{one.errors.max():.0e}", grouped(one.rank)]
         rows.append([one.model.device.selection, one.name, *figures])
-    _common.print_table(columns, rows, right=columns[2:])
+    common.print_table(columns, rows, right=columns[2:])
     every = f"{scene.checked.step}th pose".removeprefix("1th ")
     print(f"""
 first   the first call: constructor, compilation (or its cache on disk), map preparation, scoring
@@ -277,7 +279,7 @@ def _document(
             "best_pose_off_degrees": degrees, "explain": one.model.explain(),
         })  # fmt: skip
     return {
-        "machine": _common.machine(),
+        "machine": common.machine(),
         "seed": seed,
         "world": {"size_m": SIZE, "shape": scene.grid.shape, "resolution_m": scene.grid.resolution},
         "scan": {"beams": BEAMS, "beams_used": scene.beams, "range_max_m": RANGE_MAX, "ranges_m": scene.ranges},

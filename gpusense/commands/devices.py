@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from gpusense.commands._common import add_json, driver_text, machine, machine_line, print_json, print_table
+from gpusense.commands.common import add_json, driver_text, machine, machine_line, print_json, print_table
 
 if TYPE_CHECKING:
     from gpusense.backends import Device

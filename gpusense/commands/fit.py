@@ -8,7 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands._common import (
+from gpusense._util.progress import progress
+from gpusense.commands.common import (
     add_backend,
     add_json,
     add_seed,
@@ -18,16 +19,15 @@ from gpusense.commands._common import (
     positive_number,
     print_json,
     print_table,
-    progress,
     whole_number,
     write_whole,
 )
 
 if TYPE_CHECKING:
-    from gpusense.fitting import RangeData
-    from gpusense.held_out import HeldOut
-    from gpusense.learning.incidence import IncidenceFit
-    from gpusense.learning.result import BeamFit
+    from gpusense.evaluation.held_out import HeldOut
+    from gpusense.evaluation.range_data import RangeData
+    from gpusense.learning.beam.incidence import IncidenceFit
+    from gpusense.learning.beam.result import BeamFit
 
 NAME = "fit"
 HELP = "Learn the beam model's parameters from a recorded log in a map, or from pairs of readings."
@@ -140,9 +140,9 @@ def _check_sources(args: argparse.Namespace) -> None:
 
 
 def _read(args: argparse.Namespace) -> RangeData:
-    from gpusense import fitting
-    from gpusense.map_io import read_map
-    from gpusense.scoring import logged_scans
+    from gpusense.evaluation import range_data as fitting
+    from gpusense.evaluation.scoring import logged_scans
+    from gpusense.world.map_files import read_map
 
     chosen = {"every": args.every, "offset": args.offset, "limit": args.limit}
     range_min = args.range_min or 0.0
@@ -166,9 +166,9 @@ def _read(args: argparse.Namespace) -> RangeData:
 
 
 def _fit(args: argparse.Namespace, data: RangeData) -> Result:
-    from gpusense.held_out import compare_held_out
-    from gpusense.learning.fit import fit_beam_parameters
-    from gpusense.learning.incidence import fit_incidence_parameters
+    from gpusense.evaluation.held_out import compare_held_out
+    from gpusense.learning.beam.fit import fit_beam_parameters
+    from gpusense.learning.beam.incidence import fit_incidence_parameters
 
     data, rest = data.halves() if args.holdout else (data, None)
     sensor = {"range_max": data.range_max, "range_min": data.range_min, "backend": args.backend}
@@ -260,8 +260,8 @@ def parameters_yaml(result: Result) -> str:
 
 def _write(folder: Path, result: Result) -> list[Path]:
     """The files of a fit, each whole."""
-    from gpusense import fit_plots
-    from gpusense.plots import save
+    from gpusense.plots import fits as fit_plots
+    from gpusense.plots.drawing import save
 
     text = parameters_yaml(result).encode()
     file = folder / "parameters.yaml"

@@ -8,7 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands._common import (
+from gpusense._util.progress import progress
+from gpusense.commands.common import (
     add_backend,
     add_json,
     add_seed,
@@ -18,14 +19,14 @@ from gpusense.commands._common import (
     positive_number,
     print_json,
     print_table,
-    progress,
     whole_number,
 )
 
 if TYPE_CHECKING:
-    from gpusense.landmark_runs import LandmarkRun, Track
-    from gpusense.learning.landmark_result import LandmarkFit
-    from gpusense.learning.suspicious import Suspicions
+    from gpusense.evaluation.landmark_runs import Track
+    from gpusense.learning.landmark.result import LandmarkFit
+    from gpusense.learning.landmark.suspicious import Suspicions
+    from gpusense.logs.records import LandmarkRun
 
 NAME = "landmarks"
 HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
@@ -71,9 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, check, associate, localise, and print what came out."""
-    from gpusense import landmark_runs as lr
+    from gpusense.evaluation import landmark_runs as lr
     from gpusense.logs.mrclam import read_mrclam
-    from gpusense.models.landmark import LandmarkModel
+    from gpusense.models.landmark.model import LandmarkModel
 
     if args.field_of_view is not None and args.field_of_view > 2 * math.pi:
         raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
@@ -158,7 +159,7 @@ def _print(
 
 def draw(path: Path, own: LandmarkRun, track: Track, found: Suspicions) -> None:
     """Draw logged path, estimate and landmarks, and the error over time."""
-    from gpusense.plots import new_figure, save
+    from gpusense.plots.drawing import new_figure, save
 
     figure = new_figure(11.0, 6.0)
     axes = figure.subplot_mosaic([["map", "error"], ["map", "heading"]], width_ratios=(1.4, 1.0))

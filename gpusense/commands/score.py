@@ -10,7 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands._common import (
+from gpusense._util.progress import progress
+from gpusense.commands.common import (
     BACKEND_HELP,
     add_json,
     add_seed,
@@ -20,15 +21,14 @@ from gpusense.commands._common import (
     positive_number,
     print_json,
     print_table,
-    progress,
     whole_number,
 )
 
 if TYPE_CHECKING:
-    from gpusense.grid import OccupancyGrid
-    from gpusense.parameters import BeamParameters
-    from gpusense.scanner import Scanner
-    from gpusense.scoring import Agreement, BackendScore, Model, ScanScore
+    from gpusense.evaluation.scoring import Agreement, BackendScore, Model, ScanScore
+    from gpusense.world.grid import OccupancyGrid
+    from gpusense.world.parameters import BeamParameters
+    from gpusense.world.scanner import Scanner
 
 NAME = "score"
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
@@ -101,8 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print what came out."""
-    from gpusense.map_io import read_map
-    from gpusense.scoring import Cloud, logged_scans, score_log
+    from gpusense.evaluation.scoring import Cloud, logged_scans, score_log
+    from gpusense.world.map_files import read_map
 
     cloud = Cloud(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
@@ -127,9 +127,9 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner)
     Raises:
         ValueError: a backend is absent, or a parameter breaks its rule or is not the model's.
     """
-    from gpusense import scoring
-    from gpusense.models.beam import BeamModel
-    from gpusense.models.field import LikelihoodFieldModel
+    from gpusense.evaluation import scoring
+    from gpusense.models.scan.beam import BeamModel
+    from gpusense.models.scan.field import LikelihoodFieldModel
 
     given = {name: getattr(args, name) for name in (*_SHARED, *_OWN["beam"], *_OWN["field"])}
     given = {name: value for name, value in given.items() if value is not None}
@@ -162,13 +162,13 @@ def read_beam_parameters(path: Path) -> BeamParameters:
         FileNotFoundError: it is missing.
         ValueError: it holds no such parameters, or one of them breaks its rule.
     """
-    from gpusense import _checks
-    from gpusense._files import read_mapping
-    from gpusense.parameters import BeamParameters
+    from gpusense._util import checks
+    from gpusense._util.files import read_mapping
+    from gpusense.world.parameters import BeamParameters
 
-    values = read_mapping(_checks.existing_file(path)).get("beam_model")
+    values = read_mapping(checks.existing_file(path)).get("beam_model")
     if not isinstance(values, dict):
-        raise ValueError(f"{path}: must hold a mapping beam_model, got {_checks.show(values)}")
+        raise ValueError(f"{path}: must hold a mapping beam_model, got {checks.show(values)}")
     try:
         return BeamParameters.from_dict(values)
     except (TypeError, ValueError) as error:
@@ -262,7 +262,7 @@ def _verdict(a: Agreement) -> str:
 
 def draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
     """Draw the map with the logged poses and the weighted means, and how percentiles and errors are distributed."""
-    from gpusense.plots import draw_map, new_figure, save
+    from gpusense.plots.drawing import draw_map, new_figure, save
 
     figure = new_figure(11.0, 6.0)
     axes = figure.subplot_mosaic([["map", "percentile"], ["map", "error"]], width_ratios=(1.6, 1.0))

@@ -7,7 +7,8 @@ import time
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from gpusense.commands._common import (
+from gpusense._util.progress import progress
+from gpusense.commands.common import (
     BACKEND_HELP,
     add_json,
     driver_text,
@@ -15,15 +16,14 @@ from gpusense.commands._common import (
     machine_line,
     print_json,
     print_table,
-    progress,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from gpusense.backends import Backend
-    from gpusense.stiff import Row
-    from gpusense.tolerances import Check
+    from gpusense.evaluation.stiff import Row
+    from gpusense.evaluation.tolerances import Check
 
 NAME = "selftest"
 HELP = "Check that the backends present agree with the float64 truth and with one another."
@@ -35,7 +35,7 @@ On a made-up building, every backend present computes distance transforms, expec
 log-likelihoods of a laser and of a ring of sonars, in both precisions. 'truth' is the float64 reference on the
 backend's own rounded inputs and expected ranges; 'SciPy' is its distance transform; 'specialize=False' is the same
 model with nothing left out; 'float64' is the same backend's other precision. The tolerances and their reasons are in
-gpusense.tolerances, and in the JSON document.
+gpusense.evaluation.tolerances, and in the JSON document.
 
 Exit codes: 0 every difference is allowed, 1 one is not, 2 bad input or an absent device.
 
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_stiff(args: argparse.Namespace) -> int:
     """Run the catalogue of stiff cases; every row of every backend and precision must keep its bound."""
-    from gpusense import selftest, stiff
+    from gpusense.evaluation import selftest, stiff
 
     backends = selftest.chosen_backends(args.backend)
     jobs = [
@@ -118,8 +118,8 @@ def _print_head(backends: Sequence[Backend]) -> None:
 
 def _run_pairs(args: argparse.Namespace) -> int:
     """Compare the backends with the truth and with one another."""
-    from gpusense import selftest
     from gpusense.backends import devices
+    from gpusense.evaluation import selftest
 
     begin = time.perf_counter()
     backends = selftest.chosen_backends(args.backend)

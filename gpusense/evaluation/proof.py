@@ -14,13 +14,13 @@ import numpy as np
 
 from gpusense.backends import Backend, get_backend, open_device, take_drivers
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, info_of
-from gpusense.grid import OccupancyGrid
-from gpusense.models.beam import BeamModel
-from gpusense.models.caster import RayCaster
-from gpusense.models.field import LikelihoodFieldModel
-from gpusense.prepare import distance_transform
-from gpusense.scanner import Scanner
-from gpusense.tolerances import TOLERANCES, Tolerance, scan_tolerance
+from gpusense.evaluation.tolerances import TOLERANCES, Tolerance, scan_tolerance
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.caster import RayCaster
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.tables.distances import distance_transform
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Scanner
 
 Report = Callable[[dict[str, Any]], None]
 _BEAMS = 24

@@ -35,8 +35,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.logs import Odometry, Pose, Scan
-from gpusense.scanner import Scanner
+from gpusense.logs.records import Odometry, Pose, Scan
+from gpusense.world.scanner import Scanner
 
 _FRONT = (b"FLASER", b"ROBOTLASER1")
 _REAR = (b"RLASER", b"ROBOTLASER2")

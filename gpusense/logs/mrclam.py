@@ -26,9 +26,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gpusense import _checks
-from gpusense.landmark_runs import Floats, LandmarkRun
-from gpusense.landmarks import LandmarkMap
+from gpusense._util import checks
+from gpusense.logs.records import Floats, LandmarkRun
+from gpusense.world.landmarks import LandmarkMap
 
 _MAX_LINE = 10_000
 
@@ -48,8 +48,8 @@ def read_mrclam(
         FileNotFoundError: a file is missing.
         TypeError, ValueError: an argument breaks its rule, or a line the format; the message names file and line.
     """
-    base = _checks.path("folder", folder)
-    robot = _checks.integer("robot", robot, low=1)
+    base = checks.path("folder", folder)
+    robot = checks.integer("robot", robot, low=1)
     places, _ = _table(base / "Landmark_Groundtruth.dat", ("subject", "x", "y", "deviation", "deviation"))
     codes, code_lines = _table(base / "Barcodes.dat", ("subject", "barcode"))
     readings, lines = _table(base / f"Robot{robot}_Measurement.dat", ("time", "barcode", "range", "bearing"), True)
@@ -81,7 +81,7 @@ def read_mrclam(
     features = np.column_stack([readings[:, 2], np.arctan2(np.sin(readings[:, 3]), np.cos(readings[:, 3]))])
     if range_max is None:
         range_max = max(math.ceil(float(features[:, 0].max())), 1)
-    range_max = _checks.real("range_max", range_max, above=0)
+    range_max = checks.real("range_max", range_max, above=0)
     if field_of_view is None:
         field_of_view = min(2.1 * max(float(np.abs(features[:, 1]).max()), 0.1), 2 * math.pi)
     return LandmarkRun(
@@ -123,7 +123,7 @@ def _file(path: Path) -> Path:
 
 def _table(path: Path, columns: tuple[str, ...], ordered: bool = False) -> tuple[Floats, list[str]]:
     """The rows of a file, and where each stands; times must not fall where they are ordered."""
-    file = _checks.existing_file(_file(path))
+    file = checks.existing_file(_file(path))
     rows: list[list[float]] = []
     where: list[str] = []
     number = 0

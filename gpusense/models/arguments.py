@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense import _checks
+from gpusense._util import checks
 from gpusense.backends import Backend
-from gpusense.discrete import DiscreteBeamModel
-from gpusense.grid import OccupancyGrid
-from gpusense.scanner import Scanner
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Scanner
+from gpusense.world.sensor_table import SensorTable
 
 # Up to this many cells float32 knows the place of a crossing to 5/16 of a cell; from half a cell on, neighbouring
 # boundaries could be confused.
@@ -23,7 +23,7 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
         ValueError: more than 1 048 576 cells per range_max.
     """
     if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {_checks.show(grid)}")
+        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
     cells = range_max / grid.resolution
     if cells > _MOST_CELLS_PER_RANGE:
         raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.15g}")
@@ -36,13 +36,13 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     Raises:
         TypeError, ValueError: an unknown precision, or float64 on a device without it.
     """
-    dtype = np.dtype(_checks.choice("precision", precision, ("float32", "float64")))
+    dtype = np.dtype(checks.choice("precision", precision, ("float32", "float64")))
     if dtype == np.float64 and not backend.info.float64:
         raise ValueError(f"precision: must be 'float32' on {backend.info.name}, which has no float64, got 'float64'")
     return dtype
 
 
-def check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, sensor_table: object) -> None:
+def check_discrete(model: SensorTable, scanner: Scanner, compat: object, sensor_table: object) -> None:
     """See that nothing contradicts a discrete model.
 
     Raises:
@@ -50,7 +50,7 @@ def check_discrete(model: DiscreteBeamModel, scanner: Scanner, compat: object, s
     """
     for name, value in (("compat", compat), ("sensor_table", sensor_table)):
         if value is not None:
-            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {_checks.show(value)}")
+            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {checks.show(value)}")
     if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
         rule = f"must have the scanner's range_max = {scanner.range_max}"
         raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gpusense.backends import Backend
-from gpusense.models.reachable import TableMemoryError
-from gpusense.workspace import Workspace
+from gpusense.backends.workspace import Workspace
+from gpusense.tables.reachable import TableMemoryError
 
 # Particles of one launch: enough to fill a device, few enough for its memory (44 bytes each).
 CHUNK = 1 << 20

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense import _checks
+from gpusense._util import checks
 from gpusense.positions.closed_forms import EPS, Complexes, wrap
 from gpusense.positions.fix import STATUSES, PositionFix
 
@@ -206,9 +206,9 @@ def deviations(name: str, sigma: ArrayLike | None, count: int) -> Floats:
     """(M,) deviations from one, M of them, or None, which stands for 1."""
     if sigma is None:
         return np.ones(count)
-    values = _checks.array(name, sigma)
+    values = checks.array(name, sigma)
     if values.shape not in ((), (count,)):
-        raise ValueError(f"{name}: shape must be () or ({count},), got {_checks.shape_text(values.shape)}")
+        raise ValueError(f"{name}: shape must be () or ({count},), got {checks.shape_text(values.shape)}")
     if values.size and not values.min() > 0:
         raise ValueError(f"{name}: must be > 0, got {values.min()}")
     return np.broadcast_to(values, (count,)).astype(np.float64)
@@ -234,22 +234,22 @@ def make_problem(
     Raises:
         TypeError, ValueError: an argument breaks its rule.
     """
-    places = _checks.array("xy", xy, ("M", 2))
+    places = checks.array("xy", xy, ("M", 2))
     count = len(places)
     values = {}
     for name, given in (("ranges", ranges), ("bearings", bearings)):
-        values[name] = None if given is None else _checks.array(name, given, (count,))
+        values[name] = None if given is None else checks.array(name, given, (count,))
     lengths = values["ranges"]
     if lengths is not None and lengths.size and lengths.min() < 0:
         index = int(np.argmin(lengths))
         raise ValueError(f"ranges: must be >= 0, got {lengths[index]} at index {index}")
-    known = None if heading is None else _checks.real("heading", heading)
+    known = None if heading is None else checks.real("heading", heading)
     sigma_r, sigma_b = deviations(names[0], sigma_range, count), deviations(names[1], sigma_bearing, count)
-    factors = np.ones(count) if weights is None else _checks.array("weights", weights, (count,))
+    factors = np.ones(count) if weights is None else checks.array("weights", weights, (count,))
     if factors.size and factors.min() < 0:
         raise ValueError(f"weights: must be >= 0, got {factors.min()} at index {int(np.argmin(factors))}")
-    kind = _checks.choice("loss", loss, tuple(LOSSES))
-    bend = _checks.real("loss_scale", loss_scale, above=0)
+    kind = checks.choice("loss", loss, tuple(LOSSES))
+    bend = checks.real("loss_scale", loss_scale, above=0)
     keep = factors > 0
     if np.count_nonzero(keep) < least:
         noun = f"beacon{'s' * (least > 1)}"

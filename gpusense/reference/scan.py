@@ -1,6 +1,6 @@
 """Poses and readings that are on the device.
 
-Which readings count and where they go is as ``gpusense.scan`` finds it on the host.
+Which readings count and where they go is as ``gpusense.models.scan.readings`` finds it on the host.
 Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
 is left at the end are missing readings (nan), which add nothing.
 """

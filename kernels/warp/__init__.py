@@ -1,1 +1,1 @@
-"""Warp kernels, one concept a file; imported through ``gpusense._kernel_files.warp_module``."""
+"""Warp kernels, one concept a file; imported through ``gpusense.interface.kernel_files.warp_module``."""

@@ -1,6 +1,6 @@
 """What every kernel file begins with: the meaning of ``real``, and how a kernel is compiled.
 
-Flags are those of ``gpusense.signatures``. A factory turns them into closure constants; Warp drops the branches of
+Flags are those of ``gpusense.interface``. A factory turns them into closure constants; Warp drops the branches of
 ``if FLAG:`` whose condition is such a constant, so code that a set of flags does not need is never generated. Numbers
 are such constants too, negative ones of their own: some versions of Warp lose the sign of ``-ONE`` in float64.
 """

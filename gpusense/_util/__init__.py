@@ -1,0 +1,1 @@
+"""Check arguments, write files whole, show progress; no domain."""

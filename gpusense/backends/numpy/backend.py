@@ -1,0 +1,74 @@
+"""The NumPy reference as a backend: buffers are arrays, kernels are the functions of ``gpusense.reference``."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends.base import BackendInfo, Launcher
+from gpusense.interface.signatures import KERNELS
+
+
+def _memory() -> int:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 4 << 30
+
+
+class NumpyBackend:
+    """Runs the reference kernels on the host."""
+
+    def __init__(self) -> None:
+        memory = _memory()
+        self.info = BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
+
+    def upload(self, array: np.ndarray, out: np.ndarray | None = None, *, wait: bool = True) -> np.ndarray:
+        """See Backend.upload."""
+        buffer = self.empty(array.size, array.dtype) if out is None else out
+        buffer[: array.size] = array.ravel()
+        return buffer
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> np.ndarray:
+        """See Backend.empty."""
+        size = count * np.dtype(dtype).itemsize
+        if size > self.info.max_buffer:
+            raise MemoryError(
+                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
+            )
+        return np.zeros(count, dtype) if zero else np.empty(count, dtype)
+
+    def download(self, buffer: np.ndarray, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download."""
+        out.reshape(-1)[...] = buffer[: out.size]
+        return out
+
+    def part(self, buffer: np.ndarray, first: int, count: int, dtype: np.dtype) -> np.ndarray:
+        """See Backend.part."""
+        return buffer.view(dtype)[first : first + count]
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """See Backend.compile."""
+        row = KERNELS[kernel]
+        body = getattr(importlib.import_module(f"gpusense.reference.{row.file}"), kernel)
+        real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
+
+        def launch(size: tuple[int, ...], *arguments: Any) -> None:
+            bound = []
+            for declared, value in zip(row.arguments, arguments, strict=True):
+                if declared.shape is None:
+                    dtype = declared.dtype(real)
+                    bound.append(int(value) if dtype.kind == "i" else dtype.type(value))
+                else:
+                    whole = value.size // declared.width * declared.width
+                    bound.append(value[:whole].reshape(-1, declared.width) if declared.width > 1 else value)
+            with np.errstate(all="ignore"):
+                body(flags, *bound)
+
+        return launch
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""

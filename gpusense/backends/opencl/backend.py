@@ -1,0 +1,301 @@
+"""OpenCL backend: any vendor's driver through pyopencl."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import re
+import threading
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from gpusense.backends.base import Adopted, BackendInfo, Buffer, Launcher, ProcessBound
+from gpusense.backends.cache import ProgramCache
+from gpusense.backends.opencl import arrays, pocl, pocl_kernels
+from gpusense.backends.opencl.caches import new_kernel, without_caches
+from gpusense.backends.opencl.devices import (
+    absent_drivers,
+    info_of,
+    list_devices,
+    shares_memory,
+    trouble_of,
+)
+from gpusense.backends.opencl.drivers import as_job as drivers_as_job
+from gpusense.backends.opencl.launch import Launch
+from gpusense.backends.opencl.memory import DeviceBuffer, SharedBuffer, driver_errors
+from gpusense.backends.opencl.replay import KeptLaunch, Repeated
+from gpusense.interface.signatures import KERNELS
+from gpusense.interface.sources import assemble, relevant, uses_double, with_places
+
+__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "drivers_as_job", "info_of", "list_devices", "trouble_of"]
+
+# One driver's own clearing hangs beyond 2 GiB.
+_CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
+_CLEARED_WORDS = 1 << 28
+# Bytes of copies to a GPU that take NVIDIA's driver nearly twice as long where they are not waited for.
+_SLOW = (64 << 10, 256 << 10)
+_ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
+
+
+def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
+    """Return where programs are kept; None for PoCL, whose kernels are kept one by one.
+
+    Asked for a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size. That
+    takes three times as long as all it does unasked.
+    """
+    return None if pocl.is_pocl(device) else ProgramCache(info)
+
+
+class OpenCLBackend(ProcessBound):
+    """One OpenCL device: a context, an in-order queue and the programs compiled for it.
+
+    A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, copies are
+    NumPy's instead: they wait for all commands before them, and are done when they return.
+    """
+
+    def __init__(self, info: BackendInfo, device: cl.Device, queue: cl.CommandQueue | None = None) -> None:
+        super().__init__()
+        self.info = info
+        self._device = device
+        pocl.fit_target(device)
+        # Intel's driver does not keep the context of a queue alive.
+        self._context = cl.Context([device]) if queue is None else queue.context
+        self._queue = cl.CommandQueue(self._context) if queue is None else queue
+        self._shared = shares_memory(device)
+        # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
+        self._count = threading.RLock()
+        self._queued = self._ended = 0
+        # The launches that a thread records, if it does.
+        self._thread = threading.local()
+        self.alignment = arrays.alignment_of(device)
+        self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
+        self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
+        self._keys = ProgramCache(info)
+        self._cache = _program_cache(info, device)
+        self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
+        # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
+        rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
+        self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
+        if self._pocl is not None:
+            # PoCL writes the number of warnings to the terminal. It tells kernels apart by their options, not by the
+            # processor they are for.
+            self.options += ["-w", f"-DTARGET_{re.sub(r'[^a-z0-9]', '_', info.target)}"]
+
+    @property
+    def queue(self) -> cl.CommandQueue:
+        """Where commands go: arrays of pyopencl that are made with it stay where they are."""
+        return self._queue
+
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
+        """See Backend.upload."""
+        self.check_process()
+        self._check_recording()
+        buffer = self.empty(array.size, array.dtype) if out is None else out
+        if array.size:
+            array = np.ascontiguousarray(array)
+            if isinstance(buffer, SharedBuffer):
+                self._settle()
+                buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
+                return buffer
+            with driver_errors():
+                blocking = wait or _SLOW[0] < array.nbytes <= _SLOW[1]
+                cl.enqueue_copy(self._queue, buffer, array, is_blocking=blocking)
+        return buffer
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
+        """See Backend.empty."""
+        size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
+        self._check_size(size)
+        with driver_errors():
+            if self._shared:
+                shared = SharedBuffer(self._context, size, self._settle)
+                if zero:
+                    shared.bytes[:] = 0
+                return shared
+            buffer = DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
+            if zero:
+                self._clear(buffer, size)
+        return buffer
+
+    def _check_size(self, size: int) -> None:
+        if size > self.info.max_buffer:
+            raise MemoryError(
+                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
+            )
+
+    def _clear(self, buffer: cl.Buffer, size: int) -> None:
+        if size <= 4 * _CLEARED_WORDS:
+            cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
+            return
+        kernel, words = new_kernel(self._built(cl.Program(self._context, _CLEAR)), "clear"), size // 4
+        for first in range(0, words, _CLEARED_WORDS):
+            kernel.set_args(buffer, np.uint64(first))
+            cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
+
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download."""
+        self._check_recording()
+        if out.size:
+            if isinstance(buffer, SharedBuffer):
+                self._settle()
+                out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
+                return out
+            with driver_errors():
+                cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
+        return out
+
+    def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
+        """See Backend.part."""
+        size = np.dtype(dtype).itemsize
+        return arrays.part_of(buffer, first * size, count * size, self.alignment)
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """See Sharing.adopt."""
+        return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
+
+    def blank(self, count: int, dtype: np.dtype) -> Buffer:
+        """See Sharing.blank; not memory that is shared, of which arrays may not outlive the backend's launches."""
+        size = max(count, 1) * np.dtype(dtype).itemsize
+        self._check_size(size)
+        with driver_errors():
+            return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
+
+    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """See Sharing.copy."""
+        self._check_recording()
+        if not size:
+            return
+        with driver_errors():
+            if isinstance(target, SharedBuffer):
+                self._settle()
+                cl.enqueue_copy(self._queue, target.bytes[to : to + size], source, src_offset=begin)
+            else:
+                cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
+
+    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+        """See Sharing.lend."""
+        return arrays.lent(buffer, self._queue, shape, dtype)
+
+    @property
+    def stages(self) -> bool:
+        """See Recording.stages."""
+        return self.info.kind == "gpu"
+
+    def record(self, run: Callable[[], None]) -> Repeated:
+        """See Recording.record."""
+        kept: list[KeptLaunch] = []
+        self._thread.kept = kept
+        try:
+            run()
+        finally:
+            self._thread.kept = None
+        return Repeated(self._queue, kept, self._counted)
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """See Backend.compile."""
+        self.check_process()
+        launcher = self._launchers.get((kernel, flags))
+        if launcher is None:
+            launcher = self._launchers[kernel, flags] = self._launcher(kernel, flags)
+        return launcher
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""
+        with self._count:
+            queued = self._queued
+        with driver_errors():
+            self._queue.finish()
+        with self._count:
+            self._ended = max(self._ended, queued)
+        if self._pocl is not None and self._pocl.changed:
+            self._pocl.save()
+
+    def _check_recording(self) -> None:
+        if self.recording() is not None:
+            raise RuntimeError("only launches can be recorded")
+
+    def recording(self) -> list[KeptLaunch] | None:
+        """Where this thread keeps launches in place of starting them, if it does."""
+        return getattr(self._thread, "kept", None)
+
+    def _settle(self) -> None:
+        """Wait until no command of this thread can be under way."""
+        if self._ended != self._queued:
+            self.synchronize()
+
+    def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
+        """Queue a launch of a kernel whose arguments are set."""
+        cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+        self._counted(1)
+
+    def _counted(self, launches: int) -> None:
+        with self._count:
+            self._queued += launches
+
+    def _launcher(self, kernel: str, flags: frozenset[str]) -> Launch:
+        row = KERNELS[kernel]
+        flags = relevant(row.file, flags)
+        program = self._programs.get((row.file, flags))
+        if program is None:
+            program = self._programs[row.file, flags] = self._build(row.file, flags)
+        return Launch(self, new_kernel(program, kernel), row, flags, self._kernel_runs(row.file, flags))
+
+    def _kernel_runs(self, file: str, flags: frozenset[str]) -> Callable[[], None] | None:
+        """Return what is to be called when a kernel of a program is launched for the first time."""
+        if self._pocl is None:
+            return None
+        return functools.partial(self._pocl.mark, self._program_key(assemble(file, flags)))
+
+    def _program_key(self, source: str) -> str:
+        return self._keys.key(source, self.options)
+
+    def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
+        if "FLOAT64" in flags and not self.info.float64:
+            raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
+        if not self.info.float64 and uses_double(file, flags):
+            raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
+        source = assemble(file, flags)
+        if (program := self._kept(source)) is not None:
+            return program
+        kept = contextlib.nullcontext() if self._pocl is None else self._pocl.building(self._program_key(source))
+        try:
+            with kept:
+                program = self._built(cl.Program(self._context, source))
+        except cl.RuntimeError as error:
+            log = with_places(str(error), source)
+            raise RuntimeError(f"{file}.cl did not compile on {self.info.name}: {log}") from error
+        if self._cache is not None:
+            binaries: Any = program.get_info(cl.program_info.BINARIES)
+            devices: Any = program.get_info(cl.program_info.DEVICES)
+            self._cache.store(source, self.options, binaries[devices.index(self._device)])
+        return program
+
+    def _kept(self, source: str) -> cl.Program | None:
+        """The program as an earlier run compiled it, where there is one that the driver still takes."""
+        binary = None if self._cache is None else self._cache.load(source, self.options)
+        if self._cache is None or binary is None:
+            return None
+        try:
+            return self._built(cl.Program(self._context, [self._device], [binary]))
+        except cl.Error:
+            self._cache.discard(source, self.options)
+            return None
+
+    def _built(self, program: cl.Program) -> cl.Program:
+        with warnings.catch_warnings(), without_caches():
+            # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            return program.build(self.options, [self._device])
+
+
+def backend_of(queue: cl.CommandQueue, info: BackendInfo) -> OpenCLBackend:
+    """Return a backend that works on a user's queue, and so on the arrays that were made with it.
+
+    Raises:
+        ValueError: the queue does not do commands in their order.
+    """
+    return OpenCLBackend(info, queue.device, arrays.queue_of(queue))

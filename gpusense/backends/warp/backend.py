@@ -1,0 +1,278 @@
+"""Warp backend: NVIDIA GPUs through CUDA, and the processor.
+
+Warp's last thread index runs fastest, a signature row's first axis does: launches pass their size reversed, and the
+kernels unpack ``wp.tid()`` in that order.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from gpusense.backends.base import Adopted, BackendInfo, Launcher, ProcessBound
+from gpusense.backends.numpy.backend import _memory
+from gpusense.backends.warp.arrays import adopted
+from gpusense.backends.warp.launch import SCALARS, Launch, LaunchStep, host_view
+from gpusense.backends.warp.pieces import shared
+from gpusense.backends.warp.queue import Graphs, Group, Queue, Recording, Repeated, Step
+from gpusense.backends.warp.settings import LOCK, initialize, load, settings
+from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.signatures import KERNELS, Kernel
+from gpusense.interface.sources import relevant
+
+_MOST_NUMBERS = (1 << 31) - 1
+
+
+def list_devices() -> list[tuple[BackendInfo, str]]:
+    """Warp's devices of this machine and their names within Warp."""
+    initialize()
+    return [(_describe(device), device.alias) for device in wp.get_devices()]
+
+
+def _describe(device: wp.Device) -> BackendInfo:
+    memory, driver = _memory(), f"Warp {wp.__version__}"
+    if device.is_cuda:
+        memory = int(device.total_memory)
+        driver += " CUDA {}.{}".format(*wp.get_cuda_driver_version())
+    return BackendInfo(
+        selection=f"warp:{device.alias}",
+        backend="warp",
+        name=device.name,
+        kind="gpu" if device.is_cuda else "cpu",
+        driver=driver,
+        memory=memory,
+        max_buffer=memory,
+        float64=True,
+        vector_loops=not device.is_cuda,
+    )
+
+
+class WarpBackend(ProcessBound):
+    """One Warp device: flat arrays of numbers as buffers, launches on the device's current stream."""
+
+    alignment = 1
+
+    def __init__(self, info: BackendInfo, device: str) -> None:
+        super().__init__()
+        initialize()
+        self.info = info
+        self._device = wp.get_device(device)
+        self._gathers = self._device.is_cuda
+        self._graphs = Graphs(self._device)
+        # One for each thread of a call, and those that no call has now.
+        self._thread = threading.local()
+        self._queues: list[Queue] = []
+        # By the flags that change code, and by those that were asked for.
+        self._launchers: dict[tuple[str, frozenset[str]], Launcher] = {}
+        self._asked: dict[tuple[str, frozenset[str]], Launcher] = {}
+
+    def upload(self, array: np.ndarray, out: wp.array | None = None, *, wait: bool = True) -> wp.array:
+        """See Backend.upload."""
+        self.check_process()
+        array = np.ascontiguousarray(array)
+        buffer = self.empty(array.size, array.dtype) if out is None else out
+        if array.size:
+            queue = self.gathering()
+            if queue is not None:
+                if not wait and queue.upload(array, buffer):
+                    return buffer
+                self._flush(queue)
+            wp.copy(buffer, host_view(array), count=array.size)
+            if wait:
+                # Page-locked host memory is still being read when the copy returns.
+                self._wait()
+        return buffer
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> wp.array:
+        """See Backend.empty."""
+        count, dtype = max(count, 1), np.dtype(dtype)
+        size = count * dtype.itemsize
+        if size > self.info.max_buffer or count > _MOST_NUMBERS:
+            raise MemoryError(
+                f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes "
+                f"and {_MOST_NUMBERS} numbers"
+            )
+        make = wp.zeros if zero else wp.empty
+        try:
+            return make(count, dtype=SCALARS[dtype], device=self._device)
+        except RuntimeError as error:
+            if "Failed to allocate" in str(error):
+                raise MemoryError(f"{self.info.name} is out of memory: {error}") from error
+            raise
+
+    def download(self, buffer: wp.array, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download."""
+        if out.size:
+            queue = self.gathering()
+            if queue is not None:
+                if not wait and queue.download(buffer, out):
+                    return out
+                self._flush(queue)
+            wp.copy(host_view(out), buffer, count=out.size)
+            if wait:
+                self._wait()
+        return out
+
+    def part(self, buffer: wp.array, first: int, count: int, dtype: np.dtype) -> wp.array:
+        """See Backend.part."""
+        kind = SCALARS[np.dtype(dtype)]
+        if kind is not buffer.dtype:
+            view = wp.array(
+                ptr=buffer.ptr + first * np.dtype(dtype).itemsize, dtype=kind, shape=(count,), device=self._device
+            )
+            view._gpusense_owner = buffer
+            return view
+        return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """See Sharing.adopt; all that lies on the device can be used in place."""
+        return adopted(array, self._device, name)
+
+    def blank(self, count: int, dtype: np.dtype) -> wp.array:
+        """See Sharing.blank."""
+        return self.part(self.empty(count, dtype), 0, count, dtype)
+
+    def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """See Sharing.copy."""
+        if not size:
+            # To Warp a count of 0 is all.
+            return
+        queue = self.gathering()
+        if queue is not None:
+            # After all that was gathered before.
+            self._flush(queue)
+        from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
+        wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
+
+    def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
+        """See Sharing.lend."""
+        return buffer if buffer.shape == shape else buffer.reshape(shape)
+
+    @property
+    def stages(self) -> bool:
+        """See Recording.stages."""
+        return self._gathers
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """See Backend.compile."""
+        self.check_process()
+        launcher = self._asked.get((kernel, flags))
+        if launcher is None:
+            row = KERNELS[kernel]
+            key = (kernel, relevant(row.file, flags))
+            with LOCK:
+                launcher = self._launchers.get(key)
+                if launcher is None:
+                    launcher = self._launchers[key] = self._build(row, *key)
+            self._asked[kernel, flags] = launcher
+        return launcher
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""
+        queue = self.gathering()
+        if queue is not None:
+            self._flush(queue)
+        self._wait()
+        if queue is not None:
+            queue.deliver()
+
+    def gather(self) -> None:
+        """See Gathering.gather."""
+        if not self._gathers:
+            return
+        try:
+            queue = self._queues.pop()
+        except IndexError:
+            queue = Queue(self._device, SCALARS)
+        if not queue.settled:
+            # An error ended the call before, and something of it may be under way.
+            self._wait()
+        queue.begin()
+        self._thread.queue = queue
+
+    def start(self) -> None:
+        """See Gathering.start."""
+        queue = self.gathering()
+        if queue is not None:
+            self._flush(queue)
+
+    def scatter(self) -> None:
+        """See Gathering.scatter."""
+        queue = self.gathering()
+        if queue is not None:
+            self._thread.queue = None
+            try:
+                self._flush(queue)
+            finally:
+                self._queues.append(queue)
+
+    def mark(self) -> object | None:
+        """See Gathering.mark."""
+        queue = self.gathering()
+        return None if queue is None else (queue.started, len(queue.steps))
+
+    def kept(self, mark: object) -> object | None:
+        """See Gathering.kept."""
+        queue = self.gathering()
+        assert queue is not None and isinstance(mark, tuple)
+        started, first = mark
+        steps = queue.steps[first:]
+        if started != queue.started or not all(isinstance(step, LaunchStep) for step in steps):
+            return None
+        group = Group([step.alone() for step in steps if isinstance(step, LaunchStep)])
+        queue.steps[first:] = [group]
+        return group
+
+    def repeat(self, kept: object) -> None:
+        """See Gathering.repeat."""
+        queue = self.gathering()
+        assert queue is not None and isinstance(kept, Group)
+        queue.steps.append(kept)
+
+    def address(self, buffer: wp.array) -> int:
+        """See Gathering.address."""
+        return int(buffer.ptr or 0)
+
+    def record(self, run: Callable[[], None]) -> Repeated:
+        """See Recording.record."""
+        before, recording = self.gathering(), Recording()
+        self._thread.queue = recording
+        try:
+            run()
+        finally:
+            self._thread.queue = before
+        steps: list[Step] = [step.alone() for step in recording.steps if isinstance(step, LaunchStep)]
+        if recording.started or len(steps) < len(recording.steps):
+            raise RuntimeError("only launches can be recorded")
+        return Repeated(self._device, self._graphs, steps)
+
+    def gathering(self) -> Queue | None:
+        """What this thread gathers in, if it does."""
+        return getattr(self._thread, "queue", None)
+
+    def _flush(self, queue: Queue) -> None:
+        """Start what was gathered."""
+        if queue.steps:
+            steps, queue.steps = queue.steps, []
+            queue.started += 1
+            self._graphs.start(steps)
+
+    def _wait(self) -> None:
+        """Wait for the current stream; the processor has none and works at once."""
+        if self._device.is_cuda:
+            wp.synchronize_stream(self._device)
+
+    def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launcher:
+        group = row.group if self._device.is_cuda else 1
+        with settings():
+            made = warp_module(row.file).make(kernel, flags)
+            try:
+                load(made.module, self._device, group)
+            except Exception as error:
+                raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
+        launch = Launch(self._device, made, row, group, self.gathering)
+        return launch if self._device.is_cuda else shared(launch, row)

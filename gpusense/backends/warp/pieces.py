@@ -1,0 +1,151 @@
+"""Launches on the processor that several threads share.
+
+Warp runs a launch on the processor in the calling thread. Large launches over particles are therefore cut into pieces,
+each with its own part of the arrays, that threads of ours run side by side: Warp releases Python's lock while a kernel
+runs, and its kernels keep no state. A particle's result does not depend on the piece.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import functools
+import math
+import os
+import threading
+from typing import Any
+
+from gpusense.backends.base import Launcher
+from gpusense.backends.warp.launch import Launch, slice_of
+from gpusense.backends.warp.queue import HELPERS
+from gpusense.interface.signatures import Argument, Kernel
+
+# The axes of a launch that threads may share, and the argument that counts each.
+_SHARED = {"particle": "particles", "block": "blocks"}
+# Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: threads
+# that others hold up take fewer.
+_PIECE_WORK = 1 << 16
+_PIECES = 2
+
+
+def shared(launch: Launch, row: Kernel) -> Launcher:
+    """The launch, in pieces where several threads may share it."""
+    return launch if _threads() == 1 or not _independent(row) else _Pieces(launch, row)
+
+
+def _shared_axis(row: Kernel) -> str | None:
+    """The axis of a launch, particles or blocks of pairs, that threads may share."""
+    return next((axis for axis in _SHARED if axis in row.launch), None)
+
+
+def _has_rows(argument: Argument, axis: str) -> bool:
+    """Whether an argument has one row for each index of an axis."""
+    return argument.shape is not None and argument.shape.split(" ")[0] == _SHARED[axis]
+
+
+def _independent(row: Kernel) -> bool:
+    """Whether a kernel writes to nothing but the rows of its own particles or blocks."""
+    axis = _shared_axis(row)
+    return axis is not None and all(_has_rows(argument, axis) for argument in row.arguments if argument.output)
+
+
+@functools.cache
+def _threads() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
+    """The threads of a process, all launches'; the calling thread works as well."""
+    return concurrent.futures.ThreadPoolExecutor(_threads() - 1, HELPERS)
+
+
+class _Pieces:
+    """A launch over particles or blocks of pairs, cut into pieces that several threads take one after the other."""
+
+    def __init__(self, launch: Launch, row: Kernel) -> None:
+        self._launch, self._row = launch, row
+        self._name = _shared_axis(row) or ""
+        self._axis = row.launch.index(self._name)
+        self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
+        # Which scan a particle belongs to follows from its number in the whole launch.
+        self._ahead = next((i for i, argument in enumerate(row.arguments) if argument.name == "ahead"), None)
+        self._work = [
+            i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
+        ]
+
+    def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
+        particles = size[self._axis]
+        work = particles * max((int(arguments[i]) for i in self._work), default=1)
+        count = min(_PIECES * _threads(), work // _PIECE_WORK, particles)
+        if count < 2:
+            self._launch(size, *arguments)
+            return
+        step = -(-particles // count)
+        rows = self._rows(arguments)
+        begins = iter(range(0, particles, step))
+        lock = threading.Lock()
+
+        def pieces() -> None:
+            while True:
+                with lock:
+                    begin = next(begins, None)
+                if begin is None:
+                    return
+                count = min(step, particles - begin)
+                self._launch(
+                    (*size[: self._axis], count, *size[self._axis + 1 :]), *self._piece(arguments, rows, begin, count)
+                )
+
+        helpers = []
+        # Where there are no more threads to be had, those that there are do the work.
+        with contextlib.suppress(RuntimeError):
+            for _ in range(min(_threads(), count) - 1):
+                helpers.append(_pool(os.getpid()).submit(pieces))
+        try:
+            pieces()
+        finally:
+            # Whatever happened, nobody may still write when this returns: what has not begun never does.
+            with lock:
+                begins = iter(())
+            _finish(helpers)
+        for helper in helpers:
+            if not helper.cancelled():
+                helper.result()
+
+    def _rows(self, arguments: tuple[Any, ...]) -> list[tuple[int, int]]:
+        """The arrays that hold something of every particle or block, and how many numbers of each."""
+        named = {argument.name: value for argument, value in zip(self._row.arguments, arguments, strict=True)}
+        found = []
+        for i, argument in enumerate(self._row.arguments):
+            if argument.shape is not None and _has_rows(argument, self._name):
+                factors = argument.shape.split(" * ")[1:]
+                each = math.prod(int(factor) if factor.isdigit() else int(named[factor]) for factor in factors)
+                if arguments[i].size >= argument.width * each * arguments[self._count]:
+                    found.append((i, argument.width * each))
+        return found
+
+    def _piece(self, arguments: tuple[Any, ...], rows: list[tuple[int, int]], begin: int, count: int) -> list[Any]:
+        """The arguments of a launch of some particles."""
+        cut = list(arguments)
+        cut[self._count] = count
+        if self._ahead is not None:
+            cut[self._ahead] += begin
+        for i, each in rows:
+            cut[i] = slice_of(arguments[i], begin * each, count * each)
+        return cut
+
+
+def _finish(helpers: list[concurrent.futures.Future[None]]) -> None:
+    """Wait for all helpers, interrupted or not; those that have not begun are cancelled."""
+    interrupted: BaseException | None = None
+    for helper in helpers:
+        helper.cancel()
+    while any(not helper.done() for helper in helpers):
+        try:
+            concurrent.futures.wait(helpers)
+        except KeyboardInterrupt as error:
+            interrupted = error
+    if interrupted is not None:
+        raise interrupted

@@ -1,0 +1,246 @@
+"""What a point gave up: errors of ranges, of log-likelihoods and of the posterior, against the float64 truth.
+
+The truth is the exact caster and the models in float64, on the fastest device here that has float64. A test holds it to
+the NumPy reference.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.backends import SPEED_CLASSES, Backend, devices, get_backend
+from gpusense.evaluation.benchmark.scenes import Scene
+from gpusense.localization.weights import normalize_weights
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.caster import RayCaster
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.reference.mixture import log_density
+from gpusense.world.parameters import BeamParameters
+from gpusense.world.scanner import Reading, Scanner, classify
+
+Floats = NDArray[np.float64]
+
+SHARING = 0.1
+"""The share of the particles that is to carry the weight in the tempered posterior."""
+_HALVINGS = 60
+
+# Particles of one piece in which ranges are scored on the host.
+_PIECE = 256
+
+
+class UnstableError(ValueError):
+    """A result that is not finite, or of the wrong shape."""
+
+
+def truth_device() -> Backend:
+    """The fastest device with float64, NumPy in the worst case; simulators are left alone."""
+    best, rank = get_backend("numpy"), len(SPEED_CLASSES)
+    for device in devices():
+        place = SPEED_CLASSES.index((device.backend, device.kind)) if device.kind != "simulator" else rank
+        if device.available and place < rank and (backend := get_backend(device.selection)).info.float64:
+            best, rank = backend, place
+    return best
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is right for the first particles of a cloud.
+
+    Attributes:
+        scene: The scene.
+        poses: (M, 3) the particles that are checked.
+        device: Where it is computed.
+    """
+
+    scene: Scene
+    poses: Floats
+    device: Backend
+
+    @functools.cached_property
+    def ranges(self) -> Floats:
+        """(M, K) exact expected ranges."""
+        caster = RayCaster(self.scene.grid, self.scene.scanner.range_max, backend=self.device, precision="float64")
+        return caster.cast(self.poses, self.scene.scanner.bearings)
+
+    @functools.cached_property
+    def beam(self) -> Floats:
+        """(M,) log-likelihoods of the beam model."""
+        scene = self.scene
+        model = BeamModel(scene.grid, scene.scanner, scene.beam, backend=self.device, precision="float64")
+        return model.log_likelihood(self.poses, scene.readings)
+
+    @functools.cached_property
+    def field(self) -> Floats:
+        """(M,) log-likelihoods of the likelihood field."""
+        scene = self.scene
+        model = LikelihoodFieldModel(scene.grid, scene.scanner, scene.field, backend=self.device, precision="float64")
+        return model.log_likelihood(self.poses, scene.readings)
+
+    def log_p(self, problem: str) -> Floats:
+        """(M,) log-likelihoods that belong to a problem: those of the beam model for ranges too."""
+        return self.field if problem == "field" else self.beam
+
+    @functools.cached_property
+    def temperatures(self) -> dict[str, float]:
+        """By problem: what makes a tenth of the particles share in the truth's weight; see ``temperature_of``."""
+        beam = temperature_of(self.beam)
+        return {"ranges": beam, "beam": beam, "field": temperature_of(self.field)}
+
+
+def temperature_of(log_p: Floats) -> float:
+    """The factor in (0, 1] of log-likelihoods at which the effective sample size is a tenth of the particles.
+
+    With the plain product over beams nearly all weight lies on one particle, and a posterior says little of errors.
+
+    Args:
+        log_p: (M,) log-likelihoods, finite.
+    """
+
+    def enough(factor: float) -> bool:
+        return normalize_weights(factor * log_p).effective_sample_size >= SHARING * len(log_p)
+
+    if enough(1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if enough(middle) else (low, middle)
+    return low
+
+
+def errors(
+    truth: Truth, problem: str, *, ranges: NDArray[np.floating] | None, log_p: NDArray[np.floating] | None
+) -> dict[str, dict[str, float]]:
+    """All errors of a point.
+
+    Args:
+        truth: What is right.
+        problem: ``"ranges"``, ``"beam"`` or ``"field"``.
+        ranges: (M, K) what the candidate found, if it finds ranges.
+        log_p: (M,) its log-likelihoods; those that follow from its ranges, by the float64 mixture, if None.
+
+    Returns:
+        ``"ranges"`` where there are some, ``"log_p"``, ``"posterior"`` and ``"tempered"``, the posterior at the
+        temperature of ``Truth.temperatures``.
+
+    Raises:
+        UnstableError: a value is not finite, or an array has the wrong shape.
+    """
+    scene, found = truth.scene, {}
+    if ranges is not None:
+        found["ranges"] = range_errors(_checked("ranges", ranges, truth.ranges), truth.ranges, scene.grid.resolution)
+        if log_p is None:
+            log_p = score_ranges(ranges, scene.readings, scene.scanner, scene.beam)
+    if log_p is None:
+        raise UnstableError("nothing was computed")
+    right = truth.log_p(problem)
+    scores = _checked("log-likelihoods", log_p, right)
+    found["log_p"] = log_p_errors(scores, right)
+    found["posterior"] = posterior_errors(scores, right, truth.poses)
+    factor = truth.temperatures[problem]
+    found["tempered"] = posterior_errors(factor * scores, factor * right, truth.poses)
+    return found
+
+
+def _checked(what: str, found: NDArray[np.floating], right: Floats) -> Floats:
+    values = np.asarray(found, np.float64)
+    if values.shape != right.shape:
+        raise UnstableError(f"{what} have the shape {values.shape}, must have {right.shape}")
+    wrong = int(np.count_nonzero(~np.isfinite(values)))
+    if wrong:
+        raise UnstableError(f"{wrong} of {values.size} {what} are not finite")
+    return values
+
+
+def range_errors(found: Floats, right: Floats, resolution: float) -> dict[str, float]:
+    """Errors of ranges in cells: median, p99, max, mean, and the shares wrong by more than one and two cells."""
+    apart = np.abs(found - right) / resolution
+    if apart.size == 0:
+        return dict.fromkeys(("median", "p99", "max", "mean", "wrong_1", "wrong_2"), 0.0)
+    return {
+        "median": float(np.median(apart)),
+        "p99": float(np.quantile(apart, 0.99)),
+        "max": float(apart.max()),
+        "mean": float(apart.mean()),
+        "wrong_1": np.count_nonzero(apart > 1) / apart.size,
+        "wrong_2": np.count_nonzero(apart > 2) / apart.size,
+    }
+
+
+def log_p_errors(found: Floats, right: Floats) -> dict[str, float]:
+    """Largest and root-mean-square error of log-likelihoods [nats]."""
+    apart = np.abs(found - right)
+    return {"max": float(apart.max(initial=0.0)), "rms": math.sqrt(float(np.sum(apart * apart)) / max(len(apart), 1))}
+
+
+def posterior_errors(found: Floats, right: Floats, poses: Floats) -> dict[str, float]:
+    """How far the normalised weights are from the right ones.
+
+    Args:
+        found: (M,) log-likelihoods, finite; M > 0.
+        right: (M,) the right ones, finite.
+        poses: (M, 3) the particles [m, m, rad].
+
+    Returns:
+        ``kl``: the Kullback-Leibler divergence ``sum p log(p / q)`` of the weights found, q, from the right ones, p
+        [nats]; ``tv``: their total variation ``sum |p - q| / 2``; ``shift_m`` and ``shift_rad``: how far the weighted
+        mean of the poses moves.
+    """
+    p, q = normalize_weights(right).weights, normalize_weights(found).weights
+    log_p, log_q = (values - _log_sum(values) for values in (right, found))
+    mean_p, mean_q = mean_pose(poses, p), mean_pose(poses, q)
+    turn = math.remainder(mean_q[2] - mean_p[2], 2 * math.pi)
+    return {
+        # It cannot be negative; the rounding of its terms can.
+        "kl": max(float(np.sum(p * (log_p - log_q))), 0.0),
+        "tv": float(0.5 * np.sum(np.abs(p - q))),
+        "shift_m": math.hypot(mean_q[0] - mean_p[0], mean_q[1] - mean_p[1]),
+        "shift_rad": abs(turn),
+    }
+
+
+def _log_sum(values: Floats) -> float:
+    largest = float(values.max())
+    return largest + math.log(float(np.sum(np.exp(values - largest))))
+
+
+def mean_pose(poses: Floats, weights: Floats) -> tuple[float, float, float]:
+    """Weighted mean of x and y, and the direction of the weighted mean of the headings [m, m, rad]."""
+    # From the first particle on: far from the origin a sum would lose digits.
+    x, y = poses[0, :2] + weights @ (poses[:, :2] - poses[0, :2])
+    theta = math.atan2(float(weights @ np.sin(poses[:, 2])), float(weights @ np.cos(poses[:, 2])))
+    return float(x), float(y), theta
+
+
+def score_ranges(
+    ranges: NDArray[np.floating], readings: Floats, scanner: Scanner, parameters: BeamParameters
+) -> Floats:
+    """The beam model's log-likelihoods that follow from expected ranges, in float64 on the host.
+
+    Args:
+        ranges: (M, K) expected ranges, clipped to [0, range_max] here [m].
+        readings: (K,) the scan.
+        scanner: The scanner.
+        parameters: The mixture, with ``z_rand`` > 0.
+
+    Returns:
+        (M,) log-likelihoods; ``log z_max`` for each max reading where z_max > 0.
+    """
+    kinds, p, limit = classify(readings, scanner), parameters, scanner.range_max
+    hit = np.flatnonzero(kinds == Reading.HIT)
+    log_p = np.full(len(ranges), np.count_nonzero(kinds == Reading.MAX) * math.log(p.z_max) if p.z_max > 0 else 0.0)
+    scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+    shape = (0.5 / p.sigma_hit**2, math.sqrt(0.5) / p.sigma_hit)
+    terms = np.array([scale, *shape, p.z_short, p.lambda_short, p.z_rand / limit, limit, 0.0, 0.0, 0.0])
+    flags = frozenset({"LINEAR", "HIT", "SHORT", "RAND"})
+    for begin in range(0, len(ranges), _PIECE):
+        expected = np.clip(np.asarray(ranges[begin : begin + _PIECE, hit], np.float64), 0, limit)
+        z = np.broadcast_to(readings[hit], expected.shape)
+        with np.errstate(under="ignore"):
+            log_p[begin : begin + _PIECE] += log_density(flags, z, expected, terms).sum(axis=1)
+    return log_p

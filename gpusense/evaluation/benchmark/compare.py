@@ -1,0 +1,148 @@
+"""Two reports of the same scenes: what got slower, and what got less exact."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gpusense._util.checks import existing_file, show
+from gpusense.evaluation.benchmark.profiles import error_of, label, setting, time_of
+from gpusense.evaluation.benchmark.report import SCHEMA
+
+SLOWER = 1.3
+"""A point is slower when the least and the median of its times both grew by more than this factor."""
+_LESS_EXACT = 1.05
+_KINDS = {
+    "ranges": ("median", "p99", "max", "mean", "wrong_1", "wrong_2"), "log_p": ("max", "rms"),
+    "posterior": ("kl", "tv", "shift_m", "shift_rad"), "tempered": ("kl", "tv", "shift_m", "shift_rad"),
+}  # fmt: skip
+# Growth below this is rounding, in cells, shares, nats, metres and radians.
+_FLOORS = {"ranges": 1e-4, "log_p": 1e-3, "posterior": 1e-5, "tempered": 1e-5}
+
+_IDENTITY = ("scene", "cloud", "problem", "backend", "method", "variant", "knob", "value", "precision", "checked")
+
+
+@dataclass
+class Comparison:
+    """What changed from an old report to a new one: a line for each, and how much could be compared.
+
+    Attributes:
+        slower: Points whose times grew.
+        faster: Points whose times shrank by as much.
+        less_exact: Points an error of which grew, or that no longer work.
+        untimed: Points whose times are not comparable: another device or number of particles.
+        compared: Points in both.
+        gone: Points of the old report that the new one lacks.
+        others: Scenes of one name whose map, scan or particles differ; their points are not compared.
+    """
+
+    slower: list[str] = field(default_factory=list)
+    faster: list[str] = field(default_factory=list)
+    less_exact: list[str] = field(default_factory=list)
+    untimed: int = 0
+    compared: int = 0
+    gone: int = 0
+    others: list[str] = field(default_factory=list)
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """A report that ``gpusense bench`` wrote.
+
+    Raises:
+        OSError, ValueError: there is no such file, or it is no such report.
+    """
+    try:
+        report = json.loads(existing_file(path).read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        report = None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: must be a report of gpusense bench, got no JSON ({error})") from None
+    wanted = {"points": list, "scenes": list, "arguments": dict, "machine": dict}
+    if not isinstance(report, dict) or any(not isinstance(report.get(key), kind) for key, kind in wanted.items()):
+        raise ValueError(f"{path}: must be a report of gpusense bench, got another document")
+    if report.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: schema must be {SCHEMA}, got {show(report.get('schema'))}")
+    return report
+
+
+def compare(old: Mapping[str, Any], new: Mapping[str, Any], slower: float = SLOWER) -> Comparison:
+    """Compare the points that two reports share.
+
+    Args:
+        old: A report.
+        new: A later one.
+        slower: The factor above which a point counts as slower, > 1.
+    """
+    found = Comparison()
+    before = {scene["name"]: scene["fingerprint"] for scene in old["scenes"]}
+    found.others = [s["name"] for s in new["scenes"] if before.get(s["name"], s["fingerprint"]) != s["fingerprint"]]
+    known = {_identity(point): point for point in new["points"]}
+    same_machine = old["machine"].get("processor") == new["machine"].get("processor")
+    for point in old["points"]:
+        if point["scene"] in found.others or point["status"] == "left out":
+            continue
+        now = known.get(_identity(point))
+        if now is None or now["status"] == "left out":
+            found.gone += 1
+            continue
+        found.compared += 1
+        found.less_exact += _less_exact(point, now)
+        if same_machine and all(point[name] == now[name] for name in ("device", "particles", "beams")):
+            _compare_times(found, point, now, slower)
+        else:
+            found.untimed += 1
+    return found
+
+
+def _compare_times(found: Comparison, old: Mapping[str, Any], new: Mapping[str, Any], slower: float) -> None:
+    before, now = time_of(old, "call"), time_of(new, "call")
+    if before is None or now is None:
+        return
+    # On a shared machine either of the two alone is chance.
+    growths = [new["time"][name] / old["time"][name] for name in ("call_min_s", "call_median_s")]
+    line = f"{name_of(new)}: {before * 1e3:.4g} ms, now {now * 1e3:.4g} ms ({now / before:.2f} times)"
+    if min(growths) > slower:
+        found.slower.append(line)
+    elif max(growths) < 1 / slower:
+        found.faster.append(line)
+
+
+def _less_exact(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    if old["status"] == "ok" and new["status"] != "ok":
+        return [f"{name_of(new)}: {new['status']}: {new['reason']}"]
+    lines = []
+    for kind, names in _KINDS.items():
+        for name in names:
+            before, now = error_of(old, kind, name), error_of(new, kind, name)
+            if before is not None and now is not None and now > _LESS_EXACT * before + _FLOORS[kind]:
+                lines.append(f"{name_of(new)}: {kind} {name} {before:.4g}, now {now:.4g}")
+    return lines
+
+
+def _identity(point: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(point[name] for name in _IDENTITY)
+
+
+def name_of(point: Mapping[str, Any]) -> str:
+    """A point in words."""
+    words = (point["scene"], point["cloud"], point["problem"], point["backend"], point["precision"], label(point))
+    return ", ".join(word for word in (*words, setting(point)) if word)
+
+
+def lines_of(found: Comparison, slower: float = SLOWER) -> list[str]:
+    """The comparison for reading."""
+    lines = [f"{found.compared} points compared, {found.gone} of the old report not measured now"]
+    if found.others:
+        lines.append(f"not comparable, another map, scan or cloud: {', '.join(found.others)}")
+    if found.untimed:
+        lines.append(f"{found.untimed} points with another device or size: their times are not compared")
+    for title, entries in (
+        (f"slower by more than {slower:g} times", found.slower),
+        (f"faster by more than {slower:g} times", found.faster),
+        ("less exact", found.less_exact),
+    ):
+        lines += ["", f"{title}: {len(entries) or 'none'}", *(f"  {entry}" for entry in entries)]
+    return lines

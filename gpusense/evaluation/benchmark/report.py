@@ -1,0 +1,228 @@
+"""The report of a run: one JSON document, and the same as Markdown."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import subprocess
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from gpusense.evaluation.benchmark import peers
+from gpusense.evaluation.benchmark.profiles import label, profiles_of, setting
+from gpusense.evaluation.benchmark.runner import Outcome, Plan
+
+SCHEMA = 1
+"""Raised when a field changes its meaning or goes; ``--compare`` takes reports of its own schema only."""
+
+_DIGITS = 6
+
+_READING = """\
+Times are nanoseconds per particle-beam: a ray for *ranges*, a reading that is a range for *beam* and *field*, whose
+scans are scored. *call* is a call with NumPy arrays in and out, the least and the median of the calls after a warm-up;
+a star marks a single call, as those of more than two seconds are. *launch* is the least of the launches alone, with
+everything left on the device. *build* is what the tables of the map take, *compile* how much longer the first call in
+this process took (kernels may come from a cache on disk, and later rows find them compiled; where building takes more
+than five seconds, it holds compiling). *table* and *device* are bytes on the device: of the map's tables, and of
+everything that is alive after a call.
+
+Errors are against the exact caster and the models in float64. Of ranges: median, 99th percentile and largest in cells,
+and the shares wrong by more than one and two cells. Of the scan's log-likelihood: root mean square and largest, in
+nats; for *ranges* it follows from them by the float64 mixture. Of the posterior, the normalised weights: KL, the
+Kullback-Leibler divergence from the right ones in nats; TV, their total variation; and how far the weighted mean of the
+poses moves. *tempered* is the posterior at the temperature where a tenth of the particles share in the weight, as a
+filter that works would have it. *fewer beams* and *compat* compute something else than the book's model on all beams,
+and are shown as what they are."""
+
+
+def document(
+    plan: Plan, outcome: Outcome, arguments: Mapping[str, Any], machine: Mapping[str, Any], absent: Sequence[str]
+) -> dict[str, Any]:
+    """The report as plain values; non-finite numbers are None."""
+    value = {
+        "schema": SCHEMA,
+        "date": time.strftime("%Y-%m-%d"),
+        "commit": commit(),
+        "arguments": dict(arguments),
+        "machine": dict(machine),
+        "devices": [asdict(backend.info) for backend in plan.backends],
+        "absent": list(absent),
+        "truth": outcome.truth,
+        "scenes": outcome.scenes,
+        "points": outcome.points,
+        "profiles": profiles_of(outcome.points),
+    }
+    return {key: plain(item) for key, item in value.items()}
+
+
+def plain(value: Any) -> Any:
+    """A value in JSON's own types; numbers are rounded to six digits, those that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
+    return value
+
+
+def to_json(report: Mapping[str, Any]) -> str:
+    """The JSON document: every element of a list on a line of its own, so that two reports can be diffed."""
+    parts = []
+    for key, value in report.items():
+        if isinstance(value, list) and value:
+            lines = ",\n".join(f"  {json.dumps(item, allow_nan=False)}" for item in value)
+            parts.append(f"{json.dumps(key)}: [\n{lines}\n ]")
+        else:
+            parts.append(f"{json.dumps(key)}: {json.dumps(value, allow_nan=False)}")
+    return "{\n " + ",\n ".join(parts) + "\n}\n"
+
+
+def commit() -> str | None:
+    """The commit of the checkout that the package is imported from, with a plus if files differ; None elsewhere."""
+    root = peers.checkout()
+    if root is None:
+        return None
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(root), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=20).stdout.strip()
+
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        return git("rev-parse", "--short=12", "HEAD") + ("+" if git("status", "--porcelain", "-uno") else "")
+    return None
+
+
+def markdown(report: Mapping[str, Any], images: Sequence[tuple[str, str]] = ()) -> str:
+    """The report for reading.
+
+    Args:
+        report: What ``document`` returned.
+        images: Title and file name of each diagram.
+    """
+    machine, truth = report["machine"], report["truth"]
+    facts = ", ".join(f"{name} {value}" for name, value in machine.items())
+    lines = [
+        "# Error against run time", "", f"{report['date']}, commit {report['commit'] or 'unknown'}. {facts}.", "",
+        *(f"- {d['selection']}: {d['name']} ({d['driver']})" for d in report["devices"]),
+        *(f"- absent: {text}" for text in report["absent"]), "",
+        f"Truth: {truth['backend']} ({truth['device']}), {truth['precision']}: {truth['note']}.",
+        f"Arguments: {', '.join(f'{key} {value}' for key, value in report['arguments'].items())}.", "", _READING, "",
+        "## Scenes", "", *_scene_table(report["scenes"]), "",
+    ]  # fmt: skip
+    if images:
+        lines += ["## Diagrams", ""]
+        for title, name in images:
+            lines += [f"![{title}]({name})", ""]
+    points = report["points"]
+    lines += _profile_table(report["profiles"])
+    for status, title in (("failed", "Failed"), ("unstable", "Unstable"), ("left out", "Left out")):
+        lines += _reasons(title, [point for point in points if point["status"] == status])
+    groups = dict.fromkeys((p["problem"], p["scene"], p["cloud"]) for p in points)
+    for problem, scene, cloud in groups:
+        own = [p for p in points if (p["problem"], p["scene"], p["cloud"]) == (problem, scene, cloud)]
+        lines += [f"## {problem}: {scene}, {cloud}", "", *_point_table(own, problem), ""]
+    return "\n".join(lines)
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -> list[str]:
+    """Lines of a Markdown table whose columns from ``numbers`` on are aligned to the right."""
+    rule = [" --- " if i < numbers else " ---: " for i in range(len(columns))]
+    cells = [columns, *([text.replace("|", "\\|") for text in row] for row in rows)]
+    lines = [f"| {' | '.join(row)} |" for row in cells]
+    return [lines[0], f"|{'|'.join(rule)}|", *lines[1:]]
+
+
+def _scene_table(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
+    columns = ("scene", "map", "cells", "resolution m", "beams, hits", "cloud", "checked", "rays that hit",
+               "mean range m", "effective sample size beam, field", "temperature beam, field")  # fmt: skip
+    rows = [
+        (
+            s["name"], s["map"], f"{s['rows']} x {s['cols']}", f"{s['resolution']:g}", f"{s['beams']}, {s['hits']}",
+            name, str(c["checked"]), f"{c['rays_that_hit']:.3f}", f"{c['mean_range']:.2f}",
+            ", ".join(f"{c['effective_sample_size'][k]:.3g}" for k in ("beam", "field")),
+            ", ".join(f"{c['temperature'][k]:.2g}" for k in ("beam", "field")),
+        )
+        for s in scenes for name, c in s["clouds"].items()
+    ]  # fmt: skip
+    return table(columns, rows, 2)
+
+
+def _profile_table(profiles: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Where each curve of the performance profiles begins and ends."""
+    lines = []
+    for profile in profiles:
+        rows = []
+        for curve in profile["curves"]:
+            steps = curve["steps"]
+            first = next((share for ratio, share in steps if ratio == 1), 0.0)
+            rows.append((curve["backend"], curve["method"], curve["setting"], curve["precision"], f"{first:.2g}",
+                         f"{steps[-1][1]:.2g}", f"{steps[-1][0]:.3g}"))  # fmt: skip
+        rows.sort(key=lambda row: (-float(row[5]), float(row[6])))
+        columns = ("backend", "method", "knob", "precision", "share where fastest", "share solved", "within times")
+        title = f"{profile['problem']} on a {profile['kind']}, {profile['limit']}, {len(profile['problems'])} problems"
+        lines += [f"### Profile: {title}", "", *table(columns, rows, 4), ""]
+    return ["## Performance profiles", "", *lines] if lines else []
+
+
+def _reasons(title: str, points: Sequence[Mapping[str, Any]]) -> list[str]:
+    if not points:
+        return []
+    where: dict[tuple[str, ...], list[str]] = {}
+    for p in points:
+        key = (p["backend"], p["problem"], label(p), setting(p), p["precision"], p["reason"])
+        where.setdefault(key, []).append(f"{p['scene']}, {p['cloud']}")
+    columns = ("backend", "problem", "method", "knob", "precision", "why", "where")
+    return [f"## {title}", "", *table(columns, [(*key, "; ".join(places)) for key, places in where.items()], 7), ""]
+
+
+COLUMNS = (
+    "backend", "method", "knob", "precision", "call ns", "median ns", "launch ns", "build s", "compile s", "table MB",
+    "device MB", "log p rms", "max", "KL", "TV", "shift m", "rad", "tempered KL", "TV", "shift m",
+)  # fmt: skip
+RANGE_COLUMNS = ("median", "p99", "max", "> 1 cell", "> 2 cells")
+
+
+def _point_table(points: Sequence[Mapping[str, Any]], problem: str) -> list[str]:
+    extra = () if problem == "field" else RANGE_COLUMNS
+    columns = (*COLUMNS[:11], *extra, *COLUMNS[11:])
+    return table(columns, [row(point, extra=bool(extra)) for point in points], 4)
+
+
+def row(point: Mapping[str, Any], *, extra: bool) -> list[str]:
+    """A point's cells of ``COLUMNS``, with those of ``RANGE_COLUMNS`` in between where ``extra`` is True."""
+    time_s, memory, errors = (point[name] or {} for name in ("time", "memory", "errors"))
+    backend = f"{point['backend']}: {point['device']}" if point["outside"] else point["backend"]
+    name = f"**{label(point)}**" if point["exact"] else label(point)
+    cells = [backend, name, setting(point), point["precision"]]
+    if point["status"] != "ok":
+        cells[1] += f" ({point['status']})"
+    star = "*" if time_s.get("calls") == 1 else ""
+    cells += [_per_beam(point, f"{which}_s") + star for which in ("call_min", "call_median")]
+    cells += [_per_beam(point, "launch_min_s"), _text(time_s.get("build_s")), _text(time_s.get("compile_s"))]
+    cells += [_text(memory.get(f"{which}_bytes"), 1e-6) for which in ("table", "device")]
+    if extra:
+        of = errors.get("ranges") or {}
+        cells += [_text(of.get(name)) for name in ("median", "p99", "max")]
+        cells += [_share(of.get(name)) for name in ("wrong_1", "wrong_2")]
+    for kind, names in (("log_p", ("rms", "max")), ("posterior", ("kl", "tv", "shift_m", "shift_rad")),
+                        ("tempered", ("kl", "tv", "shift_m"))):  # fmt: skip
+        of = errors.get(kind) or {}
+        cells += [_text(of.get(name)) for name in names]
+    return cells
+
+
+def _per_beam(point: Mapping[str, Any], name: str) -> str:
+    seconds = (point["time"] or {}).get(name)
+    return _text(None if seconds is None else seconds / max(point["work"], 1), 1e9)
+
+
+def _text(value: float | None, scale: float = 1.0) -> str:
+    return "-" if value is None else f"{value * scale:.3g}"
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else "0" if value == 0 else f"{100 * value:.2g} %"

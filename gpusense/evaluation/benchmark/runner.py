@@ -1,0 +1,250 @@
+"""The run: every candidate in every cloud of every scene on every device, failures included."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors, truth_device
+from gpusense.evaluation.benchmark.candidates import Candidate
+from gpusense.evaluation.benchmark.measure import Cost, Runner, measure
+from gpusense.evaluation.benchmark.scenes import CLOUDS, MapSource, Scene, make_scene
+from gpusense.localization.weights import normalize_weights
+
+PRECISIONS = ("float32", "float64")
+
+# Particles of a call where none are asked for: enough for the device to show its pace.
+PARTICLES = {"gpu": 4096, "cpu": 1024}
+# The NumPy reference is written for reading: it gets fewer.
+NUMPY_SHARE = 8
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run.
+
+    Attributes:
+        sources: Maps.
+        backends: Devices.
+        candidates: This package's, and outside ones.
+        precisions: Of this package's candidates.
+        particles: N of a timed call; None for a number that suits the device.
+        checked: Particles whose results are checked, at most.
+        beams: K.
+        repeats: Calls that are timed.
+        seed: Of everything random.
+        build_limit: A table that would take longer to build is left out [s].
+        deadline: What has not begun after so many seconds of measuring, compiling not counted, is left out.
+    """
+
+    sources: Sequence[MapSource]
+    backends: Sequence[Backend]
+    candidates: Sequence[Candidate]
+    precisions: Sequence[str] = PRECISIONS
+    particles: int | None = None
+    checked: int = 512
+    beams: int = 360
+    repeats: int = 20
+    seed: int = 0
+    build_limit: float = 60.0
+    deadline: float = float("inf")
+
+    def particles_on(self, backend: Backend | None) -> int:
+        """N of a timed call on a device."""
+        kind = "cpu" if backend is None else backend.info.kind
+        count = PARTICLES[kind] if self.particles is None else self.particles
+        numpy = backend is not None and backend.info.backend == "numpy"
+        return max(count // NUMPY_SHARE, 1) if numpy else count
+
+    @property
+    def cloud(self) -> int:
+        """Particles of a cloud: enough for every device and for the check."""
+        return max([self.checked, *(self.particles_on(backend) for backend in (None, *self.backends))])
+
+
+@dataclass(frozen=True)
+class Job:
+    """A candidate on a device."""
+
+    candidate: Candidate
+    backend: Backend | None
+    precision: str
+
+
+@dataclass
+class Outcome:
+    """What a run found.
+
+    Attributes:
+        scenes: Descriptions of the scenes.
+        points: One for each scene, cloud and job: see ``point_of``.
+        truth: The device of the truth.
+    """
+
+    scenes: list[dict[str, Any]]
+    points: list[dict[str, Any]]
+    truth: dict[str, Any] = field(default_factory=dict)
+
+
+def jobs(plan: Plan) -> list[Job]:
+    """What is measured in every cloud, devices innermost, so that each candidate meets them under the same load."""
+    found = []
+    for candidate in plan.candidates:
+        if candidate.outside:
+            found.append(Job(candidate, None, candidate.precision))
+            continue
+        for precision in plan.precisions:
+            able = (b for b in plan.backends if precision == "float32" or b.info.float64)
+            found += [Job(candidate, backend, precision) for backend in able]
+    return found
+
+
+def steps(plan: Plan) -> int:
+    """How many points the plan has."""
+    return len(plan.sources) * len(CLOUDS) * len(jobs(plan))
+
+
+def run(plan: Plan, step: Callable[[str], None] = lambda text: None) -> Outcome:
+    """Measure everything.
+
+    Args:
+        plan: What.
+        step: Gets a text before each point.
+
+    Raises:
+        OSError, ValueError: a map cannot be read, or has no room for a robot.
+    """
+    device, spent = truth_device(), 0.0
+    info = device.info
+    note = "exact caster and models in float64; tests hold this device to the NumPy reference"
+    outcome = Outcome([], [], {"backend": info.selection, "device": info.name, "precision": "float64", "note": note})
+    for source in plan.sources:
+        scene = make_scene(source, device, beams=plan.beams, particles=plan.cloud, seed=plan.seed)
+        outcome.scenes.append(_description(scene))
+        paces: dict[tuple[str, str], float] = {}
+        built: dict[tuple[str, ...], float] = {}
+        for cloud in CLOUDS:
+            truth = Truth(scene, scene.clouds[cloud][: plan.checked], device)
+            outcome.scenes[-1]["clouds"][cloud] = _cloud_description(truth)
+            for job in jobs(plan):
+                step(f"{scene.name}, {cloud}, {job.candidate.label}")
+                reason = _left_out(plan, job, scene, paces, built, spent)
+                begin = time.perf_counter()
+                point = point_of(plan, job, truth, cloud, reason)
+                outcome.points.append(point)
+                spent += time.perf_counter() - begin
+                if point["time"]:
+                    # A run that must compile its kernels measures about as many points as the next one.
+                    spent -= point["time"]["compile_s"] or 0.0
+                    built[*_place(job), job.candidate.label] = point["time"]["build_s"]
+                    if job.candidate.method == "exact" and job.candidate.problem == "ranges":
+                        paces[_place(job)] = point["work"] / point["time"]["call_min_s"]
+    return outcome
+
+
+def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -> dict[str, Any]:
+    """Measure one point; whatever goes wrong becomes its status and reason.
+
+    Returns:
+        Plain values. ``status`` is ``"ok"``; ``"failed"`` after an exception; ``"unstable"`` for results that are not
+        finite; ``"left out"`` for what was not tried. ``reason`` says why.
+    """
+    scene, candidate, backend = truth.scene, job.candidate, job.backend
+    particles = plan.particles_on(backend)
+    beams = scene.scanner.count if candidate.problem == "ranges" else scene.hits
+    point: dict[str, Any] = {
+        "scene": scene.name, "cloud": cloud, "problem": candidate.problem,
+        "backend": backend.info.selection if backend else "outside",
+        "device": backend.info.name if backend else candidate.outside,
+        "kind": backend.info.kind if backend else "cpu",
+        "method": candidate.method, "variant": candidate.variant, "knob": candidate.knob, "value": candidate.value,
+        "precision": job.precision, "exact": candidate.exact, "outside": bool(candidate.outside),
+        "particles": particles, "beams": beams, "work": particles * beams, "checked": len(truth.poses),
+        "status": "left out" if reason else "ok", "reason": reason, "time": None, "memory": None, "errors": None,
+    }  # fmt: skip
+    if reason:
+        return point
+    try:
+        cost, runner = measure(
+            lambda device: candidate.make(scene, device, job.precision), backend, scene.clouds[cloud][:particles],
+            plan.repeats,
+        )  # fmt: skip
+        point |= _split(cost)
+        point["errors"] = _errors(truth, candidate.problem, runner)
+    except UnstableError as error:
+        point |= {"status": "unstable", "reason": str(error)}
+    except Exception as error:
+        point |= {"status": "failed", "reason": " ".join(f"{type(error).__name__}: {error}".split())}
+    return point
+
+
+def _errors(truth: Truth, problem: str, runner: Runner) -> dict[str, dict[str, float]]:
+    result = runner.run(truth.poses)
+    if problem == "ranges":
+        return errors(truth, problem, ranges=result, log_p=None)
+    find = getattr(runner, "ranges", None) if problem == "beam" else None
+    return errors(truth, problem, ranges=None if find is None else find(truth.poses), log_p=result)
+
+
+def _split(cost: Cost) -> dict[str, dict[str, Any]]:
+    """Seconds and bytes apart."""
+    values = asdict(cost)
+    memory = {name: values.pop(name) for name in list(values) if name.endswith("_bytes")}
+    return {"time": values, "memory": memory}
+
+
+def _place(job: Job) -> tuple[str, str]:
+    return (job.backend.info.selection if job.backend else "outside", job.precision)
+
+
+def _left_out(
+    plan: Plan,
+    job: Job,
+    scene: Scene,
+    paces: Mapping[tuple[str, str], float],
+    built: Mapping[tuple[str, ...], float],
+    spent: float,
+) -> str:
+    """Why a point is not tried; empty if it is. ``built`` says what tables have taken in this scene."""
+    if job.candidate.missing:
+        return job.candidate.missing
+    if spent > plan.deadline:
+        return f"the {plan.deadline:g} s of this run were over"
+    rays = job.candidate.table_rays(scene) if job.candidate.table_rays else 0.0
+    pace = paces.get(_place(job))
+    if pace and rays / pace > plan.build_limit:
+        return f"building its table would take about {rays / pace:.0f} s, more than {plan.build_limit:g} s"
+    seconds = built.get((*_place(job), job.candidate.label))
+    if seconds is not None and seconds > plan.build_limit:
+        return f"building its table has taken {seconds:.0f} s in this scene, more than {plan.build_limit:g} s"
+    return ""
+
+
+def _description(scene: Scene) -> dict[str, Any]:
+    rows, cols = scene.grid.shape
+    return {
+        "name": scene.name, "map": scene.origin, "rows": rows, "cols": cols, "resolution": scene.grid.resolution,
+        "occupied": int(np.count_nonzero(scene.grid.occupied)), "free": int(np.count_nonzero(scene.grid.free)),
+        "range_max": scene.scanner.range_max, "beams": scene.scanner.count, "hits": scene.hits,
+        "pose": scene.pose.tolist(), "beam": scene.beam.to_dict(), "field": scene.field.to_dict(),
+        "fingerprint": scene.fingerprint, "clouds": {},
+    }  # fmt: skip
+
+
+def _cloud_description(truth: Truth) -> dict[str, Any]:
+    """What the truth says of a cloud: how many rays end in the map, and how many particles share in the weight."""
+    ranges = truth.ranges
+    return {
+        "checked": len(truth.poses),
+        "rays_that_hit": float(np.mean(ranges < truth.scene.scanner.range_max)),
+        "mean_range": float(ranges.mean()),
+        "effective_sample_size": {
+            problem: normalize_weights(truth.log_p(problem)).effective_sample_size for problem in ("beam", "field")
+        },
+        "temperature": {problem: truth.temperatures[problem] for problem in ("beam", "field")},
+    }

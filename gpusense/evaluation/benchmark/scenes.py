@@ -1,0 +1,250 @@
+"""Scenes of the benchmark: a map, a scanner, a true pose, a scan simulated there, and two clouds of particles."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import math
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.backends import Backend
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, sample_readings
+from gpusense.models.scan.caster import RayCaster
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
+from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.world.scanner import Reading, Scanner, classify
+
+Floats = NDArray[np.float64]
+
+CLOUDS = ("global", "tracking")
+"""Uniform over the free cells and all headings; normal around the true pose, cut to free space."""
+SIGMA_POSITION, SIGMA_HEADING = 0.5, 0.25  # of the tracking cloud [m, rad]
+RANGE_MAX = 30.0
+
+DATA = "GPUSENSE_DATA"
+RECORDED = {
+    "basement": "ros_maps/basement_hallways_5cm.yaml",
+    "spielberg": "ros_maps/Spielberg_map.yaml",
+    "willow": "ros_maps/willow-full.yaml",
+    "intel": "carmen_logs/derived_maps/intel_even_05cm.yaml",
+}
+"""Maps of real places, by the name of their scene: files below the folder that GPUSENSE_DATA names."""
+
+# Width and height of the generated maps [m], and those of a quick run.
+_SIZES = {"building": (50.0, 50.0), "clutter": (50.0, 50.0)}
+_QUICK_SIZES = {"building": (20.0, 14.0), "clutter": (15.0, 15.0)}
+GENERATED = tuple(_SIZES)
+_RESOLUTION = 0.05
+_CLEARANCE = 0.4  # from the true pose to anything that is not free [m]
+_TRIED_POSES = 32
+_MOST_ROUNDS = 1000
+
+
+@dataclass(frozen=True)
+class MapSource:
+    """Where the map of a scene comes from.
+
+    Attributes:
+        name: The scene's name.
+        origin: How the map is generated, or its file's name.
+        path: The map_server YAML; None for a generated map.
+        size: Width and height of a generated map [m].
+    """
+
+    name: str
+    origin: str
+    path: Path | None = None
+    size: tuple[float, float] = (0.0, 0.0)
+
+    def grid(self, seed: int) -> OccupancyGrid:
+        """The map; generated ones follow from the seed."""
+        if self.path is not None:
+            return read_map(self.path)
+        make = {"building": building, "clutter": clutter}[self.name]
+        return make(seed, self.size, _RESOLUTION)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is computed: all candidates get the same.
+
+    Attributes:
+        name: Its name.
+        origin: How its map is generated, or the map's file name.
+        grid: The map; unknown cells and what lies outside are free.
+        scanner: K beams all around.
+        pose: (3,) where the scan was taken [m, m, rad].
+        readings: (K,) the scan, drawn from the beam model [m]; +inf where there is no return.
+        clouds: (N, 3) particles by the cloud's name [m, m, rad].
+        beam: Parameters of the beam model, also those that the scan was drawn with.
+        field: Parameters of the likelihood field.
+    """
+
+    name: str
+    origin: str
+    grid: OccupancyGrid
+    scanner: Scanner
+    pose: Floats
+    readings: Floats
+    clouds: Mapping[str, Floats]
+    beam: BeamParameters
+    field: LikelihoodFieldParameters
+
+    @functools.cached_property
+    def hits(self) -> int:
+        """How many readings are ranges: those that a model evaluates for each particle."""
+        return int(np.count_nonzero(classify(self.readings, self.scanner) == Reading.HIT))
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Sixteen digits that tell whether two reports speak of the same map, scan and particles."""
+        digest = hashlib.sha256()
+        grid = self.grid
+        placed = (grid.resolution, *grid.origin, float(grid.occupied_threshold), self.scanner.range_max)
+        for part in (grid.cells, np.array(placed), self.scanner.bearings, self.readings, *self.clouds.values()):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        digest.update(repr((grid.shape, self.beam, self.field)).encode())
+        return digest.hexdigest()[:16]
+
+
+def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, quick: bool = False) -> list[MapSource]:
+    """The maps of a run.
+
+    Args:
+        names: Names of scenes; None for all that are here, or, where maps are given, for those maps alone.
+        maps: map_server YAML files of further scenes, named by their stems.
+        quick: Small generated maps, and no recorded ones unless they are named.
+
+    Raises:
+        ValueError: a name is no scene's, or not here; two scenes would have one name.
+    """
+    sizes = _QUICK_SIZES if quick else _SIZES
+    known = {name: MapSource(name, f"generated, {w:g} x {h:g} m", None, (w, h)) for name, (w, h) in sizes.items()}
+    folder = os.environ.get(DATA, "")
+    if folder:
+        present = {name: Path(folder, file) for name, file in RECORDED.items()}
+        known |= {name: MapSource(name, RECORDED[name], path) for name, path in present.items() if path.is_file()}
+    for name in names or ():
+        if name in known:
+            continue
+        absent = f"; {name!r} is below the folder that {DATA} names, got {folder!r}" if name in RECORDED else ""
+        raise ValueError(f"scene: must be one of {', '.join(known)}, got {name!r}{absent}")
+    if names:
+        chosen = [known[name] for name in dict.fromkeys(names)]
+    elif maps:
+        chosen = []
+    else:
+        chosen = [source for source in known.values() if source.path is None or not quick]
+    chosen += [MapSource(path.stem, path.name, path) for path in maps]
+    if len({source.name for source in chosen}) < len(chosen):
+        raise ValueError(f"map: every scene must have a name of its own, got {', '.join(s.name for s in chosen)}")
+    return chosen
+
+
+def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int, seed: int) -> Scene:
+    """The scene of a map; the same arguments make the same scene, whatever others are made.
+
+    Args:
+        source: The map.
+        device: Where the beams of the scan are cast, in its best precision.
+        beams: K.
+        particles: N of each cloud.
+        seed: Of map, pose, scan and clouds.
+
+    Raises:
+        ValueError: the map has no room for a robot.
+        OSError: the map cannot be read.
+    """
+    grid = source.grid(seed)
+    scanner = Scanner.uniform(
+        angle_min=-math.pi, angle_increment=2 * math.pi / max(beams, 1), count=beams, range_max=RANGE_MAX
+    )
+    names = ("pose", "scan", *CLOUDS)
+    key = zlib.crc32(source.name.encode())
+    rng = {name: np.random.default_rng([seed, key, i]) for i, name in enumerate(names)}
+    pose, expected = _true_pose(source.name, grid, scanner, device, rng["pose"])
+    # A tenth of a millimetre, as scanners give them: the same on every device that casts them.
+    readings = np.round(sample_readings(expected, RANGE_MAX, BeamParameters(), rng["scan"]), 4)
+    clouds = {
+        "global": cloud_uniform(grid, particles, rng["global"]),
+        "tracking": _cloud_in_free_space(grid, pose, particles, rng["tracking"]),
+    }
+    return Scene(
+        source.name, source.origin, grid, scanner, pose, readings, clouds, BeamParameters(), LikelihoodFieldParameters()
+    )
+
+
+def _true_pose(
+    name: str, grid: OccupancyGrid, scanner: Scanner, device: Backend, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """A pose away from walls at which most beams meet something, and its expected ranges."""
+    from scipy.ndimage import distance_transform_edt
+
+    wanted = _CLEARANCE / grid.resolution + math.sqrt(2)
+    clear = distance_transform_edt(np.pad(grid.free, 1))[1:-1, 1:-1] >= wanted
+    if not clear.any():
+        raise ValueError(f"scene {name}: the map must have a place {_CLEARANCE} m away from everything, got none")
+    room = OccupancyGrid(np.where(clear, 0, 100).astype(np.int8), grid.resolution, grid.origin)
+    poses = cloud_uniform(room, _TRIED_POSES, rng)
+    precision = "float64" if device.info.float64 else "float32"
+    caster = RayCaster(grid, scanner.range_max, backend=device, precision=precision)
+    expected = np.minimum(caster.cast(poses, scanner.bearings).astype(np.float64), scanner.range_max)
+    seen = np.count_nonzero(expected < scanner.range_max, axis=1)
+    # The first that is good enough: the best would always stand in the smallest room.
+    chosen = int(np.argmax(seen >= min(2 * scanner.count / 3, seen.max())))
+    return poses[chosen], expected[chosen]
+
+
+def _cloud_in_free_space(grid: OccupancyGrid, pose: Floats, n: int, rng: np.random.Generator) -> Floats:
+    """(n, 3) particles of the tracking cloud: those that fall on other than free cells are drawn again."""
+    kept, count = [np.empty((0, 3))], 0
+    for _ in range(_MOST_ROUNDS):
+        if count >= n:
+            break
+        drawn = cloud_around(pose, n, SIGMA_POSITION, SIGMA_HEADING, rng)
+        kept.append(drawn[is_free(grid, drawn)])
+        count += len(kept[-1])
+    return np.concatenate(kept)[:n]
+
+
+def is_free(grid: OccupancyGrid, poses: Floats) -> NDArray[np.bool]:
+    """(N,) whether each of (N, 3) poses stands on a free cell."""
+    col, row = np.floor(grid.world_to_cells(poses[:, :2])).astype(np.int64).T
+    rows, cols = grid.shape
+    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+    free: NDArray[np.bool] = inside & grid.free[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
+    return free
+
+
+def clutter(seed: int = 0, size: tuple[float, float] = (50.0, 50.0), resolution: float = 0.05) -> OccupancyGrid:
+    """A walled hall full of boxes: a few shelves, some crates, and many small things no larger than a few cells.
+
+    Args:
+        seed: The same seed makes the same hall.
+        size: (W, H) of the grid along x and y [m].
+        resolution: The side of a cell [m].
+
+    Returns:
+        A grid with its origin at (0, 0, 0) whose cells are 0 (free) or 100 (occupied).
+    """
+    rng = np.random.default_rng(seed)
+    cols, rows = (round(side / resolution) for side in size)
+    cells = np.zeros((rows, cols), np.int8)
+    area = size[0] * size[1]
+    # Number per square metre, and the shortest and longest side [m].
+    for density, shortest, longest in ((0.01, 0.8, 4.0), (0.05, 0.3, 1.0), (0.3, resolution, 4 * resolution)):
+        for _ in range(round(density * area)):
+            height, width = np.maximum(np.rint(rng.uniform(shortest, longest, 2) / resolution), 1).astype(int)
+            row, col = rng.integers(0, max(rows - height, 1)), rng.integers(0, max(cols - width, 1))
+            cells[row : row + height, col : col + width] = 100
+    wall = max(round(0.2 / resolution), 1)
+    cells[:wall], cells[-wall:], cells[:, :wall], cells[:, -wall:] = 100, 100, 100, 100
+    return OccupancyGrid(cells, resolution)

@@ -1,0 +1,1 @@
+"""What host and kernels agree on: signatures of kernels, flags, and specialised sources."""

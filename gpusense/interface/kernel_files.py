@@ -1,0 +1,80 @@
+"""Where the kernel sources are, and how they are read and imported.
+
+The kernels are written in the top-level folder ``kernels/`` of a checkout and ship inside the wheel as
+``gpusense/kernels``. Both layouts, and an editable install of a checkout, give the same module names
+(``gpusense.kernels.warp.<name>``), so that caches keyed by module name and relative imports between kernel
+modules do not depend on how the package was installed.
+"""
+
+import importlib
+import importlib.util
+import sys
+import threading
+from pathlib import Path
+from types import ModuleType
+
+_PACKAGE = "gpusense.kernels"
+_LOCK = threading.Lock()
+
+
+def kernel_root() -> Path:
+    """Return the folder that holds ``opencl/`` and ``warp/``.
+
+    Raises:
+        FileNotFoundError: If the folder is neither inside the package nor beside it.
+    """
+    package = Path(__file__).resolve().parents[1]
+    candidates = (package / "kernels", package.parent / "kernels")
+    for root in candidates:
+        if (root / "__init__.py").is_file():
+            return root
+    places = " or ".join(f"'{root}'" for root in candidates)
+    raise FileNotFoundError(f"the kernel sources must be in {places}; neither is there: install gpusense again")
+
+
+def opencl_source(name: str) -> str:
+    """Return the text of ``opencl/<name>.cl``.
+
+    Args:
+        name: The file's name without its ending.
+
+    Raises:
+        FileNotFoundError: If there is no such file; the message lists the names there are.
+    """
+    folder = kernel_root() / "opencl"
+    try:
+        return (folder / f"{name}.cl").read_text(encoding="utf-8")
+    except FileNotFoundError:
+        names = ", ".join(sorted(path.stem for path in folder.glob("*.cl")))
+        raise FileNotFoundError(f"name must be an OpenCL kernel file ({names}), got {name!r}") from None
+
+
+def warp_module(name: str) -> ModuleType:
+    """Import ``warp/<name>.py`` as ``gpusense.kernels.warp.<name>``.
+
+    Args:
+        name: The file's name without its ending.
+
+    Raises:
+        ModuleNotFoundError: If there is no such file, or the Warp library is not installed.
+    """
+    _register_package()
+    return importlib.import_module(f"{_PACKAGE}.warp.{name}")
+
+
+def _register_package() -> None:
+    """Import the kernel folder as the package ``gpusense.kernels``, wherever it lies."""
+    with _LOCK:
+        if _PACKAGE in sys.modules:
+            return
+        root = kernel_root()
+        spec = importlib.util.spec_from_file_location(
+            _PACKAGE, root / "__init__.py", submodule_search_locations=[str(root)]
+        )
+        if spec is None or spec.loader is None:
+            raise ImportError(f"cannot import '{root / '__init__.py'}'", name=_PACKAGE)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        sys.modules[_PACKAGE] = module
+        parent, _, child = _PACKAGE.rpartition(".")
+        setattr(sys.modules[parent], child, module)

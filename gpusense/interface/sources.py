@@ -1,0 +1,127 @@
+"""OpenCL source of one program: prelude, the files a kernel requires in order, and only the branches its spec needs."""
+
+from __future__ import annotations
+
+import re
+
+from gpusense.interface.kernel_files import opencl_source
+from gpusense.interface.signatures import CASTER_FLAGS, FLAGS
+
+_PRELUDE = """\
+#pragma OPENCL FP_CONTRACT OFF
+{extension}typedef {real} real;
+typedef {real}2 real2;
+typedef {real}4 real4;
+#define FLOAT64 {float64}
+#define SPLITTER ((real){splitter})
+"""
+_REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
+_CONDITION = re.compile(r"#if (!?)([A-Z0-9_]+)$")
+
+
+def prelude(*, float64: bool, doubles: bool = False) -> str:
+    """What every program begins with: no contraction, and the meaning of ``real``.
+
+    Args:
+        float64: Whether ``real`` is float64.
+        doubles: Whether the program uses float64 whatever ``real`` is.
+    """
+    return _PRELUDE.format(
+        extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 or doubles else "",
+        real="double" if float64 else "float",
+        float64=int(float64),
+        splitter="134217729" if float64 else "4097",
+    )
+
+
+def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
+    """Kernel files that a file needs, itself last; ``caster`` stands for the caster that the flags mean."""
+    files: list[str] = []
+    for needed in _requirements(name):
+        if needed == "caster":
+            needed = next((CASTER_FLAGS[flag] for flag in CASTER_FLAGS if flag in flags), "raycast")
+        files += [file for file in required_files(needed, flags) if file not in files]
+    return [*files, name]
+
+
+def _requirements(name: str) -> list[str]:
+    match = _REQUIRES.search(opencl_source(name))
+    return match.group(1).split() if match else []
+
+
+def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
+    """Keep the taken branches of ``#if FLAG``, ``#if !FLAG``, ``#else``, ``#endif``; the rest becomes empty lines.
+
+    Lines keep their numbers, so that a compiler's message names the place in the file.
+
+    Raises:
+        ValueError: a condition that is not a single known flag, or unbalanced directives.
+    """
+    kept: list[str] = []
+    taken: list[bool] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        directive = line.strip()
+        if directive.startswith("#if"):
+            match = _CONDITION.match(directive)
+            if match is None or match.group(2) not in FLAGS:
+                raise ValueError(f"{name}:{number}: condition must be one known flag, got {directive!r}")
+            taken.append((match.group(2) in flags) != (match.group(1) == "!"))
+        elif directive in ("#else", "#endif"):
+            if not taken:
+                raise ValueError(f"{name}:{number}: {directive} without #if")
+            last = taken.pop()
+            if directive == "#else":
+                taken.append(not last)
+        keep = all(taken) and not directive.startswith(("#if", "#else", "#endif"))
+        kept.append(line if keep else "")
+    if taken:
+        raise ValueError(f"{name}: #if without #endif")
+    return "\n".join(kept) + "\n"
+
+
+def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
+    """Whether a kernel file computes in float64 whatever the precision of the model."""
+    kept = (resolve(opencl_source(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
+    texts = (re.sub(r"//.*", "", text) for text in kept)
+    return any(re.search(r"\bdouble[24]?\b", text) for text in texts)
+
+
+def assemble(file: str, flags: frozenset[str]) -> str:
+    """Complete OpenCL C source of a kernel file for a set of flags."""
+    parts = [prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))]
+    for needed in required_files(file, flags):
+        parts += [f'#line 1 "{needed}.cl"\n', resolve(opencl_source(needed), flags, f"{needed}.cl")]
+    return "".join(parts)
+
+
+def with_places(log: str, source: str) -> str:
+    """A compiler's log with places in the assembled source, ``<kernel>:114:``, as ``raycast.cl:48:``.
+
+    Most drivers heed the ``#line`` directives of a source; NVIDIA's counts the lines of the whole.
+    """
+
+    def place(match: re.Match[str]) -> str:
+        number = int(match.group(1))
+        above = source.splitlines()[:number]
+        marks = [i for i, line in enumerate(above, 1) if line.startswith("#line 1 ")]
+        if not marks:
+            return match.group(0)
+        file = above[marks[-1] - 1].split('"')[1]
+        return f"{file}:{number - marks[-1]}:"
+
+    return re.sub(r"<\w+>:(\d+):", place, log)
+
+
+def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
+    """The flags that change a kernel file's code, so that one program serves all specs that agree on them."""
+    files = required_files(file, flags)
+    text = "".join(opencl_source(needed) for needed in files)
+    words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
+    if any("caster" in _requirements(needed) for needed in files):
+        words |= CASTER_FLAGS.keys()
+    unknown = flags - FLAGS.keys()
+    if unknown:
+        raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")
+    if re.search(r"\breal\b", text):
+        words.add("FLOAT64")
+    return flags & words

@@ -1,0 +1,1 @@
+"""Parameters of the beam model from readings and expected ranges."""

@@ -1,0 +1,129 @@
+"""Sums over all pairs, taken on a device: pairs are uploaded once, a pass brings back a row for each block."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.backends import Backend
+from gpusense.interface.lanes import widened
+from gpusense.interface.signatures import LANES
+from gpusense.interface.terms import log_weight, rounded_terms
+from gpusense.learning.beam.pairs import Pairs
+from gpusense.learning.beam.point import Point
+
+# Numbers in a row of sums; see kernels/opencl/learning.cl.
+_SUMS = {False: 14, True: 40}
+# Blocks of a pass at most, pairs of a block at least, and pairs that lie together on a device at most.
+_BLOCKS = {"cpu": 4096, "gpu": 32768}
+_SHORTEST = 16
+_CHUNK = 1 << 26
+_FLAGS = frozenset({"HIT", "SHORT", "RAND"})
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Some pairs on the device: ``blocks`` blocks of ``readings`` pairs, of which the last may be filled up."""
+
+    reading: Any
+    expected: Any
+    count: int
+    blocks: int
+    readings: int
+    across: int
+    along: int
+
+    @property
+    def layout(self) -> tuple[int, int, int, int]:
+        return self.blocks, self.readings, self.across, self.along
+
+
+class DeviceSums:
+    """The pairs on a device, and what may be asked about them.
+
+    Args:
+        backend: The device.
+        real: Precision of the kernels, float32 or float64.
+        pairs: Readings and expected ranges.
+
+    Attributes:
+        real: That precision.
+        passes: How often the pairs were summed over.
+    """
+
+    def __init__(self, backend: Backend, real: np.dtype, pairs: Pairs) -> None:
+        self._backend, self.real = backend, real
+        self._range_max = pairs.range_max
+        self._flags = _FLAGS | (frozenset({"FLOAT64"}) if real == np.float64 else frozenset())
+        self.passes = 0
+        # The NumPy reference goes through a block's places one after the other, over all blocks at once.
+        gpu = backend.info.kind == "gpu"
+        most = min(_CHUNK, backend.info.max_buffer // (8 * real.itemsize))
+        self._chunks = [
+            self._upload(pairs.reading[first : first + most], pairs.expected[first : first + most], gpu)
+            for first in range(0, pairs.hits, most)
+        ]
+        self._most_blocks = max((chunk.blocks for chunk in self._chunks), default=0)
+        self._rows = backend.empty(self._most_blocks * _SUMS[True], real) if self._chunks else None
+
+    def _upload(self, reading: NDArray[np.floating], expected: NDArray[np.floating], gpu: bool) -> _Chunk:
+        count = len(reading)
+        length = max(_SHORTEST, -(-count // _BLOCKS["gpu" if gpu else "cpu"]))
+        # A processor's lanes take pairs that lie side by side, and are always full.
+        length += 0 if gpu else -length % LANES
+        blocks = -(-count // length)
+        filled = np.full((2, blocks * length), np.nan, self.real)
+        filled[0, :count], filled[1, :count] = reading, expected
+        # On a GPU neighbouring work-items read neighbouring pairs, on a processor each reads its own stretch.
+        across, along = (1, blocks) if gpu else (length, 1)
+        z, ahead = (self._backend.upload(np.ascontiguousarray(row)) for row in filled)
+        return _Chunk(z, ahead, count, blocks, length, across, along)
+
+    @property
+    def selection(self) -> str:
+        """What selects the device."""
+        return self._backend.info.selection
+
+    def terms(self, point: Point) -> NDArray[np.floating]:
+        """(12,) the kernels' numbers of a set of parameters."""
+        hit, short, top, rand = point.weights
+        log_scale = log_weight(hit) - math.log(point.sigma) - 0.5 * math.log(2 * math.pi)
+        shape = (0.5 / point.sigma / point.sigma, math.sqrt(0.5) / point.sigma)
+        heads = (log_weight(short), point.rate, log_weight(rand) - math.log(self._range_max))
+        terms = rounded_terms([log_scale, *shape, *heads, self._range_max, log_weight(top)], self.real)
+        return np.append(terms, np.array([point.bias, 1 / point.sigma]).astype(self.real))
+
+    def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:
+        """(14,) or, with second derivatives, (40,) sums over the hits in float64; the order of addition is fixed."""
+        width = _SUMS[information]
+        flags = self._flags | (frozenset({"INFORMATION"}) if information else frozenset())
+        total = np.zeros(width)
+        self.passes += 1
+        if not self._chunks:
+            return total
+        backend = self._backend
+        launch = backend.compile("e_step", widened(backend.info.lanes, "e_step", flags))
+        terms = backend.upload(self.terms(point))
+        for chunk in self._chunks:
+            launch((chunk.blocks,), chunk.reading, chunk.expected, terms, self._rows, *chunk.layout, width)
+            rows = backend.download(self._rows, np.empty((chunk.blocks, width), self.real))
+            total += np.ascontiguousarray(rows.T, np.float64).sum(axis=1)
+        # An impossible pair has log p = -inf, which compensated sums turn into nan.
+        total[0] = -math.inf if math.isnan(total[0]) else total[0]
+        return total
+
+    def causes(self, point: Point) -> NDArray[np.float64]:
+        """(M, 4) log p and the responsibilities of hit, short and rand for each hit."""
+        backend = self._backend
+        found = [np.empty((0, 4))]
+        terms = backend.upload(self.terms(point)) if self._chunks else None
+        for chunk in self._chunks:
+            out = backend.empty(4 * chunk.blocks * chunk.readings, self.real)
+            launch = backend.compile("pair_causes", self._flags)
+            launch((chunk.blocks,), chunk.reading, chunk.expected, terms, out, *chunk.layout)
+            found.append(backend.download(out, np.empty((chunk.count, 4), self.real)).astype(np.float64))
+        return np.concatenate(found)

@@ -1,0 +1,171 @@
+"""Expectation maximisation with the exact M-step, and Newton steps where EM becomes slow.
+
+The book's M-step (table 6.2, lines 14 and 15) leaves out that p_hit is truncated to [0, range_max] and p_short to
+[0, z*]: what it maximises is not the likelihood, which then falls. The exact one solves, for the responsibilities r,
+
+    sum r u^2 = sum r E[u^2]            sigma_hit: squares are as large as a truncated normal's, E[u^2] = 1 - T
+    lambda sum r z = sum r (1 - v)      lambda_short: lengths are as large as a truncated exponential's
+
+(T, v: see ``gpusense.reference.learning``). Both sides' logarithms are nearly linear in log sigma and log lambda, so
+one Newton step of their difference is a good solution; without truncation it is the exact one, and the book's. The step
+is halved until the log-likelihood does not fall: a generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
+
+EM is slow where causes are hard to tell apart. The same pass over the pairs gives the observed information, so that a
+Newton step of the log-likelihood itself is tried once EM gains little; it is taken if the log-likelihood rises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gpusense.learning.beam.point import BIAS, HIT, RATE, SHORT, SIGMA, Floats, Point
+from gpusense.learning.beam.problem import NOTHING, Problem, Value
+
+# Steps of log shapes are at most this long.
+_LONGEST = 2.0
+# Newton steps begin once an EM step gains less than this, or after so many EM steps.
+_LITTLE, _MANY = 0.5, 20
+_HALVINGS = 30
+# Nats left to gain below which a Newton step is trusted.
+_NEAR = 1e-4
+
+Watch = Callable[[int, Value], None]
+
+
+@dataclass
+class Climb:
+    """Where a search ended, and how it went.
+
+    Attributes:
+        value: The end.
+        trace: Objectives from the start on, one an iteration.
+        converged: Whether the search says that it ended at an optimum.
+        notes: What is to be said of the way.
+    """
+
+    value: Value
+    trace: list[float]
+    converged: bool
+    notes: list[str] = field(default_factory=list)
+
+
+def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
+    """Climb from a start until less than ``tolerance`` nats are left, as far as the information matrix can tell."""
+    value = problem.value(start)
+    trace = [value.objective]
+    newton = False
+    for iteration in range(1, max_iterations + 1):
+        before = value.objective
+        value = em_step(problem, value, second=newton)
+        value = without_needless(problem, value)
+        newton |= value.objective - before < _LITTLE or iteration >= _MANY
+        left = math.inf
+        if newton:
+            if value.hessian is None:
+                value = problem.value(value.point, second=True)
+            value, left = newton_step(problem, value)
+        trace.append(value.objective)
+        watch(iteration, value)
+        if left <= tolerance:
+            return Climb(value, trace, True)
+    return Climb(value, trace, False, [f"no convergence within {max_iterations} iterations"])
+
+
+def em_step(problem: Problem, value: Value, *, second: bool = False) -> Value:
+    """One generalised EM step; the objective does not fall by more than rounding."""
+    step = m_step(problem, value)
+    weights = value.totals / problem.total
+    for _ in range(_HALVINGS):
+        found = problem.value(_shaped(problem, value.point, weights, step), second=second)
+        if found.objective >= value.objective - problem.noise(value):
+            return found
+        step = step / 2
+    return problem.value(_shaped(problem, value.point, weights, 0 * step), second=second)
+
+
+def _shaped(problem: Problem, point: Point, weights: Floats, step: Floats) -> Point:
+    """The point with new weights and moved shapes."""
+    return replace(point.moved(step, problem.bounds), weights=weights)
+
+
+def m_step(problem: Problem, value: Value) -> Floats:
+    """(7,) the M-step of the shapes; a shape that no reading is accounted for by stays."""
+    sums, point, prior = value.sums, value.point, problem.prior
+    free = problem.free(value)
+    step = np.zeros(7)
+    pseudo, pseudo_squares = prior.of_hits(point)
+    if value.totals[HIT] > NOTHING:
+        squares = (sums[11] - 2 * point.bias * sums[12] + point.bias**2 * sums[1]) / point.sigma**2
+        likely = squares - sums[4]
+        slope = -2 * squares - sums[7]
+        step[SIGMA] = _log_step(squares + pseudo_squares, likely + pseudo, 2 + slope / max(likely + pseudo, 1e-300))
+        curve = sums[9] - pseudo
+        if free[BIAS] and curve < 0:
+            step[BIAS] = -value.gradient[BIAS] * point.sigma**2 / curve
+    if free[RATE] or value.totals[SHORT] > NOTHING:
+        count = float(prior.counts[SHORT])
+        lengths = point.rate * sums[13]
+        likely = sums[6] + lengths
+        slope = sums[10] + lengths
+        step[RATE] = _log_step(
+            likely + count, lengths + count * point.rate / prior.rate, 1 - slope / max(likely + count, 1e-300)
+        )
+    return step
+
+
+def _log_step(above: float, below: float, slope: float) -> float:
+    """log(above / below) / slope, at most _LONGEST; towards the bound where a side is 0."""
+    if above <= 0 or below <= 0:
+        return _LONGEST if above > below else -_LONGEST if above < below else 0.0
+    rise = math.log(above) - math.log(below)
+    return math.copysign(min(abs(rise) / max(slope, 1e-9), _LONGEST), rise)
+
+
+def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
+    """A Newton step where it raises the objective, and how many nats were left at most by the quadratic model."""
+    step, left = newton_direction(problem, value)
+    if left <= 0:
+        return value, 0.0
+    longest = float(np.abs(step[: RATE + 1]).max())
+    scale = min(1.0, _LONGEST / max(longest, 1e-300))
+    # Near the optimum the gain is less than rounding, and the step is right all the same.
+    least = value.objective - (problem.noise(value) if left < _NEAR else 0.0)
+    for _ in range(5):
+        found = problem.value(value.point.moved(scale * step, problem.bounds), second=True)
+        if found.objective > least:
+            return found, left
+        scale /= 4
+    return value, left
+
+
+def newton_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
+    """(7,) the Newton step, uphill even where the objective is not concave, and half its slope: nats left to gain."""
+    assert value.hessian is not None
+    places = np.flatnonzero(problem.free(value))
+    step = np.zeros(7)
+    if not len(places):
+        return step, 0.0
+    curve = -value.hessian[np.ix_(places, places)]
+    gradient = value.gradient[places]
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), 1e-12 * problem.total + 1e-300))
+    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+    slope = axes.T @ (scale * gradient)
+    along = slope / np.maximum(np.abs(size), 1e-9)
+    step[places] = scale * (axes @ along)
+    return step, 0.5 * float(slope @ along)
+
+
+def without_needless(problem: Problem, value: Value) -> Value:
+    """The point without causes that account for hardly any reading, where the objective does not fall."""
+    weights = value.point.weights
+    for cause in range(4):
+        if weights[cause] > 0 and value.totals[cause] < NOTHING and problem.prior.counts[cause] == 0:
+            fewer = np.where(np.arange(4) == cause, 0, value.point.weights)
+            found = problem.value(replace(value.point, weights=fewer / fewer.sum()), second=value.hessian is not None)
+            if found.objective >= value.objective - problem.noise(value):
+                value = found
+    return value

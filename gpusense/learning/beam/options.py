@@ -1,0 +1,123 @@
+"""What a user may ask of a fit, checked: options, device, bounds and start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Backend, Selection, get_backend
+from gpusense.learning.beam.pairs import Pairs
+from gpusense.learning.beam.point import Bounds, Point, possible_causes
+from gpusense.world.parameters import BeamParameters
+
+METHODS = ("em", "em-book", "gradient", "hill_climb", "genetic")
+Callback = Callable[[int, float, BeamParameters], object]
+
+# By default sigma_hit is at least the deviation of rounding to the sensor's step, or this part of range_max.
+_SMALLEST_SIGMA = 1e-6
+# lambda_short range_max: from hardly distinguishable from uniform to readings within 1e-4 range_max.
+_RATES = (1e-3, 1e4)
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a fit is made; see :func:`fit_beam_parameters`."""
+
+    method: str
+    max_iterations: int
+    tolerance: float
+    restarts: int
+    seed: int
+    range_bias: bool
+    progress: bool
+    callback: Callback | None
+    responsibilities: bool
+
+
+def check_options(
+    method: str,
+    max_iterations: int | None,
+    tolerance: float,
+    restarts: int,
+    seed: int,
+    range_bias: bool,
+    progress: bool,
+    callback: Callback | None,
+    responsibilities: bool,
+) -> Options:
+    """The options of a fit, checked.
+
+    Raises:
+        TypeError, ValueError: as :func:`fit_beam_parameters`.
+    """
+    method = checks.choice("method", method, METHODS)
+    if max_iterations is None:
+        max_iterations = {"em": 500, "em-book": 60}.get(method, 1000)
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback: must be callable, got {checks.show(callback)}")
+    for name, flag in (("range_bias", range_bias), ("progress", progress), ("responsibilities", responsibilities)):
+        if not isinstance(flag, (bool, np.bool)):
+            raise TypeError(f"{name}: must be True or False, got {checks.show(flag)}")
+    if method == "em-book" and range_bias:
+        raise ValueError("range_bias: must be False with method 'em-book', which has no offset, got True")
+    return Options(
+        method,
+        checks.integer("max_iterations", max_iterations, low=1),
+        checks.real("tolerance", tolerance, above=0),
+        checks.integer("restarts", restarts, low=0),
+        checks.integer("seed", seed, low=0),
+        bool(range_bias),
+        bool(progress),
+        callback,
+        bool(responsibilities),
+    )
+
+
+def open_device(backend: Selection, precision: str | None) -> tuple[Backend, np.dtype]:
+    """The device and the precision of its kernels."""
+    opened = get_backend(backend)
+    if precision is None:
+        precision = "float64" if opened.info.float64 else "float32"
+    real = np.dtype(checks.choice("precision", precision, ("float64", "float32")))
+    if real == np.float64 and not opened.info.float64:
+        raise ValueError(f"precision: must be 'float32' on {opened.info.name}, which has no float64, got 'float64'")
+    return opened, real
+
+
+def make_bounds(
+    pairs: Pairs, sigma: tuple[float, float] | None = None, rate: tuple[float, float] | None = None
+) -> Bounds:
+    """Bounds of the shapes: the user's, or those that the readings allow."""
+    range_max = pairs.range_max
+    smallest = max(pairs.quantum / math.sqrt(12), _SMALLEST_SIGMA * range_max)
+    return Bounds(
+        _bounds("sigma_bounds", sigma, (min(smallest, range_max), range_max)),
+        _bounds("lambda_bounds", rate, (_RATES[0] / range_max, _RATES[1] / range_max)),
+        range_max,
+    )
+
+
+def _bounds(name: str, given: tuple[float, float] | None, default: tuple[float, float]) -> tuple[float, float]:
+    if given is None:
+        return default
+    low, high = checks.array(name, given, (2,)).tolist()
+    if not 0 < low <= high:
+        raise ValueError(f"{name}: must be two numbers, 0 < smallest <= largest, got {checks.show(given)}")
+    return low, high
+
+
+def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds) -> Point:
+    """Where a user's parameters begin: without the causes that no reading can have.
+
+    Raises:
+        ValueError: the causes that are left do not explain the readings.
+    """
+    point = bounds.hold(Point.of(initial))
+    weights = np.where(possible_causes(pairs), point.weights, 0)
+    if (pairs.hits and not weights[[0, 1, 3]].any()) or (pairs.max_readings and not weights[2]):
+        raise ValueError(f"initial: must give every reading a cause, got {checks.show(initial)}")
+    return replace(point, weights=weights / weights.sum())

@@ -1,0 +1,203 @@
+"""Searches that climb the log-likelihood itself: by its gradient, without it, and over a population; SciPy's."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gpusense.learning.beam.em import Climb, Watch, newton_direction, without_needless
+from gpusense.learning.beam.point import BIAS, RAND, Floats, Point
+from gpusense.learning.beam.problem import Problem, Value
+
+# A weight is between e^-25 and e^25 times the one that follows from the others.
+_WIDEST = 25.0
+# So often hill climbing turns its directions where it is stuck.
+_TURNS = 5
+
+
+class _Coordinates:
+    """The free coordinates of a search as a vector.
+
+    They are the logarithms of the weights but the largest at the start, which follows from the normalisation, and log
+    sigma_hit, log lambda_short and the bias in metres / range_max. Causes that the start leaves out stay out.
+    """
+
+    def __init__(self, problem: Problem, start: Point) -> None:
+        self._problem, self._start = problem, start
+        self._origin = start.coordinates()
+        weights = start.weights
+        reference = int(np.argmax(weights))
+        free = np.append(weights > 0, [weights[0] > 0, weights[1] > 0, problem.fit_bias and weights[0] > 0])
+        free[reference] = False
+        self.places = np.flatnonzero(free)
+        self.reference = reference
+        bounds = problem.bounds
+        shift = self._origin[reference]
+        limits = [(shift - _WIDEST, shift + _WIDEST)] * 4
+        limits += [(math.log(low), math.log(high)) for low, high in (bounds.sigma, bounds.rate)]
+        limits.append((-bounds.bias, bounds.bias))
+        self.unit = np.where(np.arange(7) == BIAS, problem.pairs.range_max, 1.0)[self.places]
+        self.limits = np.array([limits[place] for place in self.places]).reshape(-1, 2) / self.unit[:, None]
+
+    def vector(self, point: Point) -> Floats:
+        """A point's free coordinates, within their limits."""
+        logs = point.coordinates()
+        logs[:4] += self._origin[self.reference] - logs[self.reference]
+        return np.clip(logs[self.places] / self.unit, self.limits[:, 0], self.limits[:, 1])
+
+    def point(self, vector: Floats) -> Point:
+        """The point of free coordinates."""
+        step = np.zeros(7)
+        step[self.places] = vector * self.unit - self._origin[self.places]
+        return self._start.moved(step, self._problem.bounds)
+
+
+class _Search:
+    """A search's function of a vector, which keeps the best point and the trace."""
+
+    def __init__(self, problem: Problem, start: Point, watch: Watch) -> None:
+        self.problem, self.watch = problem, watch
+        self.coordinates = _Coordinates(problem, start)
+        self.best = problem.value(start)
+        self.trace = [self.best.objective]
+
+    def value(self, vector: Floats) -> Value:
+        found = self.problem.value(self.coordinates.point(vector))
+        if found.objective > self.best.objective:
+            self.best = found
+        return found
+
+    def cost(self, vector: Floats) -> float:
+        """Minus the objective a reading."""
+        return -self.value(vector).objective / self.problem.total
+
+    def cost_and_gradient(self, vector: Floats) -> tuple[float, Floats]:
+        found = self.value(vector)
+        slope = found.gradient[self.coordinates.places] * self.coordinates.unit
+        return -found.objective / self.problem.total, -slope / self.problem.total
+
+    def end_iteration(self, *_: Any) -> None:
+        """Note where an iteration ended."""
+        self.trace.append(self.best.objective)
+        self.watch(len(self.trace) - 1, self.best)
+
+    def left(self) -> float:
+        """Nats that the quadratic model still sees to gain."""
+        self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
+        return newton_direction(self.problem, self.best)[1]
+
+
+def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
+    """L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, begun anew while that still gains."""
+    search = _Search(problem, start, watch)
+    return _refine(search, max_iterations, tolerance)
+
+
+def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
+    from scipy.optimize import minimize
+
+    coordinates = search.coordinates
+    if not len(coordinates.places):
+        return Climb(search.best, search.trace, True)
+    while len(search.trace) <= max_iterations:
+        before = search.best.objective
+        found = minimize(
+            search.cost_and_gradient,
+            coordinates.vector(search.best.point),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=coordinates.limits,
+            callback=search.end_iteration,
+            options={
+                "maxiter": max_iterations + 1 - len(search.trace),
+                "maxfun": 20 * max_iterations,
+                "maxcor": 20,
+                "ftol": 1e-15,
+                "gtol": 1e-12,
+            },
+        )
+        gained = search.best.objective - before
+        if found.nit == 0:
+            search.end_iteration()
+        if gained <= max(tolerance, search.problem.noise(search.best)):
+            left = search.left()
+            if left <= max(1e3 * tolerance, search.problem.noise(search.best)):
+                return Climb(search.best, search.trace, True)
+            return Climb(search.best, search.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
+    return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
+
+
+def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
+    """Powell's method (1964) without derivatives, within bounds, begun anew until that gains nothing.
+
+    Its line searches keep their grip in the long, narrow valleys of this likelihood, where a simplex (Nelder and Mead)
+    collapses; it also takes bounds. It begins along the coordinates. Where all of these lead down but the end is no
+    optimum, as the derivatives there tell, it begins anew along others, which are turned at random.
+    """
+    from scipy.optimize import minimize
+
+    search = _Search(problem, start, watch)
+    coordinates = search.coordinates
+    if not len(coordinates.places):
+        return Climb(search.best, search.trace, True)
+    rng = np.random.default_rng(0)
+    directions, turns = np.eye(len(coordinates.places)), 0
+    while len(search.trace) <= max_iterations:
+        before = search.best.objective
+        minimize(
+            search.cost,
+            coordinates.vector(search.best.point),
+            method="Powell",
+            bounds=coordinates.limits,
+            callback=search.end_iteration,
+            options={
+                "maxiter": max_iterations + 1 - len(search.trace),
+                "xtol": 1e-4,
+                "ftol": 1e-13,
+                "direc": directions,
+            },
+        )
+        if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):
+            left = search.left()
+            if left <= max(1e3 * tolerance, problem.noise(search.best)):
+                return Climb(search.best, search.trace, True)
+            if turns == _TURNS:
+                return Climb(search.best, search.trace, False, [f"no progress, with {left:.2g} nats left to gain"])
+            turns += 1
+            directions = np.linalg.qr(rng.normal(size=directions.shape))[0]
+    return Climb(search.best, search.trace, False, [f"no convergence within {max_iterations} iterations"])
+
+
+def climb_genetic(
+    problem: Problem, start: Point, *, seed: int, max_iterations: int, tolerance: float, watch: Watch
+) -> Climb:
+    """Differential evolution (Storn and Price 1997) over all the bounds, finished by L-BFGS-B."""
+    from scipy.optimize import differential_evolution
+
+    search = _Search(problem, start, watch)
+    coordinates = search.coordinates
+    if len(coordinates.places):
+        # Weights far below one reading in all are not searched: the end of it moves them there if that is better.
+        narrow = np.log(10 * problem.total)
+        middle = coordinates.vector(start)
+        limits = coordinates.limits.copy()
+        for i, place in enumerate(coordinates.places):
+            if place <= RAND:
+                limits[i] = np.clip((middle[i] - narrow, middle[i] + narrow), *coordinates.limits[i])
+        differential_evolution(
+            search.cost,
+            limits,
+            x0=middle,
+            rng=seed,
+            maxiter=max_iterations,
+            popsize=10,
+            tol=1e-6,
+            atol=1e-9,
+            polish=False,
+            callback=search.end_iteration,
+        )
+    climb = _refine(search, max_iterations + len(search.trace), tolerance)
+    climb.notes.append("the last steps are of method 'gradient'")
+    return climb

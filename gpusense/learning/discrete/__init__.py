@@ -1,0 +1,1 @@
+"""The discrete model of proximity sensors, and its causes from readings."""

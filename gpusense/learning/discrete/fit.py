@@ -1,0 +1,203 @@
+"""Maximum likelihood for the causes of the discrete model, from counts of (step of z*, step of z)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from gpusense._util import checks
+from gpusense.learning.discrete.probabilities import separate_causes
+from gpusense.learning.discrete.table import MOST_BINS, DiscreteCauses, DiscreteFit, bins_of, check_pairs
+
+Floats = NDArray[np.float64]
+
+NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
+# Readings that are counted at once.
+_BLOCK = 1 << 20
+# Steps of central differences of the mean log-likelihood: where its rounding and its next derivatives weigh alike.
+_FIRST, _SECOND = 1e-5, 1e-3
+# A gradient of the mean log-likelihood up to this is 0: it moves a parameter by less than a hundredth of the standard
+# error that ten million readings leave.
+_FLAT = 2e-6
+# Steps with which the search begins where there are many.
+_FEW = 100
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Readings as counts: ``counts[k]`` of them fall into step ``steps[k]`` where ``rows[k]`` was expected."""
+
+    rows: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    counts: Floats
+    missing: int
+    bins: int
+    width: float
+
+    @property
+    def total(self) -> float:
+        """Readings that are not missing."""
+        return float(self.counts.sum())
+
+    def log_likelihood(self, causes: DiscreteCauses) -> float:
+        """Of all readings: logarithms of their steps' probabilities."""
+        log_p = separate_causes(self.bins, self.width, **causes.to_dict(), rows=self.rows, steps=self.steps)
+        return float(self.counts @ log_p)
+
+    def coarser(self, bins: int) -> Counts:
+        """About the same readings in fewer steps."""
+        scale = bins / self.bins
+        both = np.trunc(np.stack([self.rows, self.steps]) * scale).astype(np.int64)
+        cells, inverse = np.unique(both, axis=1, return_inverse=True)
+        counts = np.bincount(inverse.ravel(), self.counts).astype(np.float64)
+        return Counts(cells[0], cells[1], counts, self.missing, bins, self.bins * self.width / bins)
+
+
+def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -> Counts:
+    """Count readings; see ``DiscreteBeamModel.learn`` for the arguments and errors."""
+    range_max = checks.real("range_max", range_max, above=0)
+    bins = checks.integer("bins", bins, low=1, high=MOST_BINS)
+    z, z_exp = (checks.as_array(name, value) for name, value in (("ranges", ranges), ("expected", expected)))
+    if z.shape != z_exp.shape:
+        shapes = checks.shape_text(z.shape), checks.shape_text(z_exp.shape)
+        raise ValueError(f"expected: shape must be {shapes[0]}, got {shapes[1]}")
+    z, z_exp = z.reshape(-1), z_exp.reshape(-1)
+    table, missing = np.zeros((bins + 1) ** 2, np.int64), 0
+    for first in range(0, max(len(z), 1), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        own, own_exp = check_pairs(z[block], z_exp[block], range_max)
+        i, j = bins_of(own, range_max, bins), bins_of(own_exp, range_max, bins)
+        missing += int(np.count_nonzero(i < 0))
+        # A bin that does not occur makes bincount's result shorter.
+        found = np.bincount((j * (bins + 1) + i)[i >= 0])
+        table[: len(found)] += found
+    cells = np.flatnonzero(table)
+    if cells.size == 0:
+        raise ValueError(f"ranges: must have a reading that is not missing, got {missing} missing ones")
+    return Counts(cells // (bins + 1), cells % (bins + 1), table[cells].astype(float), missing, bins, range_max / bins)
+
+
+def learn_causes(ranges: object, expected: object, range_max: float, bins: int) -> tuple[DiscreteCauses, DiscreteFit]:
+    """The most likely causes; see ``DiscreteBeamModel.learn``.
+
+    The search is a quasi-Newton one over logarithms of rates and deviation and the log odds of detection, within bounds
+    beyond which the table does not change. It begins at the best two of a few starts, or, for many steps, where that
+    search ended for few of them.
+    """
+    data = count_pairs(ranges, expected, range_max, bins)
+    if bins > 2 * _FEW:
+        coarse = data.coarser(_FEW)
+        theta = min((_search(coarse, start) for start in _starts(coarse)[:2]), key=lambda found: found[0])[1]
+        theta[3] = max(theta[3], math.log(0.2 * data.width))
+        value, theta, trace = _search(data, theta)
+    else:
+        value, theta, trace = min((_search(data, start) for start in _starts(data)[:2]), key=lambda found: found[0])
+    return _causes(theta), _fit(data, value, theta, trace)
+
+
+def _search(data: Counts, start: Floats) -> tuple[float, Floats, list[float]]:
+    """Mean negative log-likelihood, where it is least, and its values on the way."""
+    trace = [_loss(data, start)]
+    found = minimize(
+        lambda theta: _loss(data, theta), start, jac=lambda theta: _gradient(data, theta), method="L-BFGS-B",
+        bounds=_bounds(data), callback=lambda theta: trace.append(_loss(data, theta)),
+        options={"maxiter": 300, "ftol": 0.0, "gtol": 0.1 * _FLAT},
+    )  # fmt: skip
+    return float(found.fun), np.array(found.x), trace
+
+
+def _loss(data: Counts, theta: Floats) -> float:
+    return -data.log_likelihood(_causes(theta)) / data.total
+
+
+def _gradient(data: Counts, theta: Floats) -> Floats:
+    steps = _FIRST * np.eye(len(NAMES))
+    return np.array([(_loss(data, theta + step) - _loss(data, theta - step)) / (2 * _FIRST) for step in steps])
+
+
+def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> DiscreteFit:
+    low, high = np.transpose(_bounds(data))
+    slope = _gradient(data, theta)
+    # Against a bound the likelihood may still rise.
+    at_low, at_high = theta <= low + 1e-9, theta >= high - 1e-9
+    pushed = (at_low & (slope > 0)) | (at_high & (slope < 0))
+    converged = bool((np.abs(slope)[~pushed] <= _FLAT).all())
+    errors = _standard_errors(data, theta, ~(at_low | at_high))
+    status = "the gradient vanishes" if converged else "the search ended before the gradient vanished"
+    ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
+    unknown = [name for name, error in errors.items() if math.isnan(error) and name not in ends]
+    if ends:
+        status += f"; at an end of what is possible: {', '.join(ends)}"
+    if unknown:
+        status += f"; the readings do not determine {', '.join(unknown)}"
+    none = data.steps == data.bins
+    return DiscreteFit(
+        log_likelihood=-value * data.total,
+        converged=converged,
+        standard_errors=errors,
+        trace=tuple(-each * data.total for each in trace),
+        hits=int(data.counts[~none].sum()),
+        max=int(data.counts[none].sum()),
+        missing=data.missing,
+        status=status,
+    )
+
+
+def _causes(theta: Floats) -> DiscreteCauses:
+    short, rand, odds, sigma = (float(value) for value in theta)
+    return DiscreteCauses(math.exp(short), math.exp(rand), 1 / (1 + math.exp(-odds)), math.exp(sigma))
+
+
+def _bounds(data: Counts) -> list[tuple[float, float]]:
+    """Beyond these a table is the same to a part in a million."""
+    reach = data.bins * data.width
+    rates = math.log(1e-9 / reach), math.log(30 / data.width)
+    return [rates, rates, (-25.0, 25.0), (math.log(1e-6 * data.width), math.log(10 * reach))]
+
+
+def _starts(data: Counts) -> list[Floats]:
+    """Shares of readings before, at and behind the expected step, at several deviations; the best first."""
+    reach, total = data.bins * data.width, data.total
+    known, none = data.rows < data.bins, data.steps == data.bins
+    starts = []
+    for near in sorted({0, 1, 3, max(data.bins // 30, 1), max(data.bins // 8, 1)}):
+        at = known & ~none & (np.abs(data.rows - data.steps) <= near)
+        short, behind = (float(data.counts[where & ~at].sum()) / total for where in (data.steps < data.rows, ~none))
+        expected = float(data.counts[known].sum())
+        detected = float(data.counts[at].sum()) / expected if expected else 0.5
+        guess = [
+            math.log(max(short, 1e-3) / (0.5 * reach)), math.log(max(behind - short, 1e-3) / reach),
+            math.log((detected + 0.01) / (1.01 - detected)), math.log(max(0.5 * near, 0.2) * data.width),
+        ]  # fmt: skip
+        starts.append(np.clip(guess, *np.transpose(_bounds(data))))
+    return sorted(starts, key=lambda theta: _loss(data, theta))
+
+
+def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dict[str, float]:
+    """From the observed information, in the parameters' own units; NaN where the data do not tell."""
+
+    def loss(*shifts: Floats) -> float:
+        return _loss(data, theta + np.sum(shifts, axis=0))
+
+    places = np.flatnonzero(free)
+    steps = _SECOND * np.eye(len(theta))[places]
+    information = np.zeros((len(places), len(places)))
+    middle = _loss(data, theta)
+    for a, one in enumerate(steps):
+        information[a, a] = (loss(one) - 2 * middle + loss(-one)) / _SECOND**2
+        for b, two in enumerate(steps[:a]):
+            mixed = loss(one, two) - loss(one, -two) - loss(-one, two) + loss(-one, -two)
+            information[a, b] = information[b, a] = mixed / (4 * _SECOND**2)
+    # Of a parameter without influence differences are nothing but rounding.
+    told = np.diagonal(information) > 1e-8
+    errors = np.full(len(theta), np.nan)
+    inner = information[np.ix_(told, told)] * data.total
+    if told.any() and np.linalg.eigvalsh(inner).min() > 0:
+        errors[places[told]] = np.sqrt(np.diagonal(np.linalg.inv(inner)))
+    causes = _causes(theta)
+    scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
+    return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}

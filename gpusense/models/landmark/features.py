@@ -1,0 +1,308 @@
+"""Features on their way to a device: what was measured, their numbers, and how far a landmark can be off and matter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.reference import landmarks as at
+from gpusense.world.frames import Mount, split
+from gpusense.world.landmarks import LandmarkMap
+from gpusense.world.parameters import LandmarkParameters
+
+_SPREAD = 4.0
+# Bounds of what can matter are a little wider than they need be, for what rounding takes from distances.
+_WIDER = 1e-5
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What a model knows of its sensor and map, in float64.
+
+    Attributes:
+        scales: 1 / (sigma sqrt 2) of range, bearing and signature; 0 for what is left out.
+        peaks: Logarithms of the components' largest densities, before the mass is divided out.
+        least_masses: Logarithms of the least mass that each can have, that of a bearing on a full circle included.
+        uniforms: Logarithms of the uniform densities of range, bearing and signature.
+        span: The smallest and largest signature.
+    """
+
+    scales: tuple[float, float, float]
+    peaks: tuple[float, float, float]
+    least_masses: tuple[float, float, float]
+    uniforms: tuple[float, float, float]
+    span: tuple[float, float]
+
+
+def span_of(p: LandmarkParameters, landmarks: LandmarkMap) -> tuple[float, float]:
+    """The smallest and largest signature of a feature."""
+    if p.signature_span is not None or p.sigma_signature is None:
+        return p.signature_span or (0.0, 1.0)
+    own = landmarks.signatures if landmarks.signatures is not None and len(landmarks) else np.zeros(1)
+    return float(own.min()) - _SPREAD * p.sigma_signature, float(own.max()) + _SPREAD * p.sigma_signature
+
+
+def signature_mass(p: LandmarkParameters, landmarks: LandmarkMap) -> np.ndarray:
+    """Mass that each landmark's signature has on the span; that of its nearest end for one beyond."""
+    from scipy.special import erf  # loads SciPy
+
+    if p.sigma_signature is None or landmarks.signatures is None:
+        return np.ones(len(landmarks))
+    (low, high), scale = span_of(p, landmarks), math.sqrt(0.5) / p.sigma_signature
+    own = np.clip(landmarks.signatures, low, high)
+    mass: np.ndarray = 0.5 * (erf((own - low) * scale) + erf((high - own) * scale))
+    return mass
+
+
+def describe(p: LandmarkParameters, landmarks: LandmarkMap) -> Sensor:
+    """The sensor of these parameters."""
+    span = span_of(p, landmarks)
+    lengths = (p.range_max, p.field_of_view, span[1] - span[0])
+    deviations = (p.sigma_range, p.sigma_bearing, p.sigma_signature)
+    scales = tuple(0.0 if sigma is None else math.sqrt(0.5) / sigma for sigma in deviations)
+    peaks = tuple(math.log(scale / math.sqrt(math.pi)) if scale else 0.0 for scale in scales)
+    masses = [0.5 * math.erf(min(length, cut) * scale) for length, cut, scale in
+              zip(lengths, (math.inf, math.pi, math.inf), scales, strict=True)]  # fmt: skip
+    if full_circle(p):
+        masses[1] = math.erf(math.pi * scales[1])
+    least = tuple(math.log(mass) if mass > 0 else 0.0 for mass in masses)
+    uniforms = tuple(-math.log(length) for length in lengths)
+    return Sensor(_three(scales), _three(peaks), _three(least), _three(uniforms), span)
+
+
+def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
+    first, second, third = values
+    return first, second, third
+
+
+def full_circle(p: LandmarkParameters) -> bool:
+    """Whether the sensor sees all around."""
+    return p.field_of_view >= 2 * math.pi
+
+
+def _read(features: object, p: LandmarkParameters) -> np.ndarray:
+    """(F, 3) float64 features; NaN is what was not measured or is left out. Finite bearings are in [-pi, pi]."""
+    given = checks.as_array("features", features)
+    given = np.zeros((0, 2)) if given.shape == (0,) else checks.array("features", given, finite=False)
+    if given.ndim != 2 or given.shape[1] not in (2, 3):
+        raise ValueError(f"features: shape must be (F, 2) or (F, 3), got {checks.shape_text(given.shape)}")
+    full = np.full((len(given), 3), np.nan)
+    full[:, : given.shape[1]] = given
+    for column, sigma in enumerate((p.sigma_range, p.sigma_bearing, p.sigma_signature)):
+        if sigma is None:
+            full[:, column] = np.nan
+    finite = np.isfinite(full[:, 1])
+    full[finite, 1] = wrapped(full[finite, 1])
+    return full
+
+
+def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
+    """(F, 3) which parts are outside what the sensor can measure."""
+    half = math.inf if full_circle(p) else p.field_of_view / 2
+    low, high = np.array([0.0, -half, span[0]]), np.array([p.range_max, half, span[1]])
+    bad: np.ndarray = (full < low) | (full > high) | np.isinf(full)
+    return bad
+
+
+def possible_features(
+    features: object, p: LandmarkParameters, span: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) features, all NaN where the sensor cannot have measured a part of one, and (F,) which are so.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: another shape.
+    """
+    full = _read(features, p)
+    bad = np.asarray(_impossible(full, p, span).any(axis=1))
+    full[bad] = np.nan
+    return full, bad
+
+
+def check_features(features: object, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
+    """(F, 3) float64 features; NaN is what was not measured or is left out. Bearings are in [-pi, pi].
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: another shape, or a value outside what the sensor can measure.
+    """
+    full = _read(features, p)
+    half, rules = p.field_of_view / 2, [f"range must be in [0, {p.range_max:.15g}] (range_max)"]
+    if full_circle(p):
+        rules.append("bearing must be finite, or NaN where it was not measured")
+    else:
+        rules.append(f"bearing must be in [-{half:.15g}, {half:.15g}] (field_of_view)")
+    rules.append(f"signature must be in [{span[0]:.15g}, {span[1]:.15g}] (signature_span)")
+    bad = _impossible(full, p, span)
+    for column, rule in enumerate(rules):
+        at = np.flatnonzero(bad[:, column])
+        if len(at):
+            raise ValueError(f"features: {rule}, got {checks.show(float(full[at[0], column]))} at index {at[0]}")
+    return full
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Angles in [-pi, pi], those that are there already as they are."""
+    turned = np.arctan2(np.sin(angle), np.cos(angle))
+    return np.where(np.abs(angle) <= np.pi, angle, turned)
+
+
+def check_correspondence(correspondence: object, count: int, landmarks: int) -> np.ndarray:
+    """(F,) landmark of each feature, -1 for none.
+
+    Raises:
+        TypeError: not integers.
+        ValueError: another shape, or an index that is no landmark's.
+    """
+    found = checks.array("correspondence", correspondence, (count,), dtype=np.int64)
+    bad = np.flatnonzero((found < -1) | (found >= landmarks))
+    if len(bad):
+        rule = f"indices must be in [-1, {landmarks})"
+        raise ValueError(f"correspondence: {rule}, got {found[bad[0]]} at index {bad[0]}")
+    return found
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Landmarks that can matter to a feature lie within ``radius`` of the point ``reach`` ahead, beyond ``hole``."""
+
+    reach: float
+    radius: float
+    hole: float
+
+
+def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
+    """The disc outside which exponents are larger than ``bound``.
+
+    Args:
+        p: Deviations and limits.
+        sensor: What is made of them.
+        z: The range, of no meaning where there is none.
+        measured: Whether range, bearing and signature are there.
+        bound: Exponents above this do not matter; infinite where all do.
+    """
+    if bound < 0:
+        return Reach(0.0, -1.0, 0.0)
+    wide = math.sqrt(bound)
+    near, far = 0.0, p.range_max
+    if measured[0]:
+        near, far = max(z - wide / sensor.scales[0], 0.0), z + wide / sensor.scales[0]
+    elif not measured[1]:
+        return Reach(0.0, far, 0.0)
+    angle = min(wide / sensor.scales[1], math.pi) if measured[1] else math.pi
+    around = Reach(0.0, far, near)
+    if not measured[1]:
+        return around
+    if math.isinf(far):
+        # Everything may matter until a landmark is found that is likelier than all beyond some distance.
+        return Reach(z, far, 0.0)
+    # Of the points of a ring's sector, a corner is farthest from its middle.
+    if measured[0]:
+        ahead = z
+    else:
+        ahead = far / (2 * math.cos(angle)) if angle <= math.pi / 4 else far * math.cos(min(angle, math.pi / 2))
+    cosine = math.cos(angle)
+    radius = math.sqrt(max(max(ahead**2 + d**2 - 2 * ahead * d * cosine for d in (near, far)), 0.0))
+    if not measured[0]:
+        radius = max(radius, abs(far - ahead))
+    return Reach(ahead, radius, near) if radius < far else around
+
+
+@dataclass(frozen=True)
+class PreparedFeatures:
+    """Features as kernels take them.
+
+    Attributes:
+        columns: (K,) positions of the features that are evaluated.
+        numbers: (K, FEATURE) in the model's precision; see ``gpusense.reference.landmarks``.
+        measured: (K, 3) whether range, bearing and signature are there.
+        false: (F,) float64 log densities of each feature as a false positive; 0 where nothing was measured.
+    """
+
+    columns: np.ndarray
+    numbers: np.ndarray
+    measured: np.ndarray
+    false: np.ndarray
+
+    @property
+    def radius(self) -> np.ndarray:
+        """(K,) radius of each feature's disc [m]; negative where no landmark matters."""
+        return self.numbers[:, at.RADIUS]
+
+
+def prepare_features(
+    features: np.ndarray,
+    p: LandmarkParameters,
+    sensor: Sensor,
+    mount: Mount,
+    real: np.dtype,
+    *,
+    extent: float,
+    norm: float,
+    gated: bool,
+) -> PreparedFeatures:
+    """The numbers of (F, 3) checked features.
+
+    Args:
+        features: Range, bearing and signature, NaN where not measured.
+        p: The parameters.
+        sensor: What is made of them.
+        mount: The sensor's pose on the robot.
+        real: Precision of the numbers.
+        extent: Largest coordinate of the landmarks in their buckets' frame [m].
+        norm: Largest -log of the mass of a landmark's signature.
+        gated: Whether to bound what can matter.
+    """
+    there = ~np.isnan(features)
+    says = there.any(axis=1)
+    false = np.where(says, _log(p.z_false) + (there * sensor.uniforms).sum(axis=1), 0.0)
+    columns = np.flatnonzero(says)
+    numbers = np.zeros((len(columns), at.FEATURE))
+    measured, kept = there[columns], features[columns]
+    values = np.where(measured, kept, 0.0)
+    bearing = values[:, 1] + mount[2]
+    scales = measured * np.array(sensor.scales)
+    peak = _log(p.z_detect) + (measured * sensor.peaks).sum(axis=1)
+    if full_circle(p):
+        peak = peak - measured[:, 1] * sensor.least_masses[1]
+    numbers[:, [at.RANGE_AT, at.SIGNATURE_AT]] = values[:, [0, 2]]
+    numbers[:, at.COSINE], numbers[:, at.SINE] = np.cos(bearing), np.sin(bearing)
+    numbers[:, [at.RANGE_SCALE, at.BEARING_SCALE, at.SIGNATURE_SCALE]] = scales
+    numbers[:, at.PEAK], numbers[:, at.FALSE_POSITIVE] = peak, false[columns]
+    numbers[:, at.UPPER] = p.field_of_view / 2 - values[:, 1]
+    numbers[:, at.FARTHEST] = np.where(measured[:, 0], np.inf, p.range_max)
+    limited = ~measured[:, 1] & (not full_circle(p))
+    numbers[:, at.AXIS] = np.where(limited, math.cos(p.field_of_view / 2), -2.0)
+    least = np.array(sensor.least_masses) * (1.0, not full_circle(p), 0.0)
+    highest = peak - (measured * least).sum(axis=1) + measured[:, 2] * norm
+    with np.errstate(divide="ignore"):
+        numbers[:, at.RANGE_SPREAD], numbers[:, at.BEARING_SPREAD] = 1 / scales[:, 0], 1 / scales[:, 1]
+    numbers[:, at.MOST] = highest
+    # A landmark below this adds less than eps to what a false positive alone has.
+    smallest = false[columns] + math.log(np.finfo(real).eps) - 1
+    slack = 16 * np.finfo(real).eps * (extent + 2 * p.range_max)
+    # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
+    numbers[:, at.SLACK] = 101 * slack**2
+    for i in range(len(columns)):
+        bound = -math.inf if np.isneginf(highest[i]) else float(highest[i] - smallest[i])
+        reach = reach_of(p, sensor, float(values[i, 0]), measured[i], bound if gated else math.inf)
+        radius = reach.radius if reach.radius < 0 else reach.radius * (1 + _WIDER) + slack
+        numbers[i, at.REACH : at.HOLE + 1] = reach.reach, radius, max(reach.hole * (1 - _WIDER) - slack, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        high, rest = split(numbers, real)
+        low = np.where(np.isfinite(numbers), rest, 0).astype(real)
+    for column, of in (
+        (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
+        (at.SIGNATURE_LOW, at.SIGNATURE_AT), (at.RANGE_SCALE_LOW, at.RANGE_SCALE),
+        (at.BEARING_SCALE_LOW, at.BEARING_SCALE), (at.SIGNATURE_SCALE_LOW, at.SIGNATURE_SCALE),
+        (at.PEAK_LOW, at.PEAK), (at.UPPER_LOW, at.UPPER),
+    ):  # fmt: skip
+        high[:, column] = low[:, of]
+    return PreparedFeatures(columns, high, measured, false)
+
+
+def _log(weight: float) -> float:
+    return math.log(weight) if weight > 0 else -math.inf

@@ -1,0 +1,309 @@
+"""The landmark model, *Probabilistic Robotics* section 6.6: features against a map of landmarks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Selection, arrays
+from gpusense.backends.base import Buffer
+from gpusense.interface.lanes import widened
+from gpusense.interface.plan import Omission
+from gpusense.interface.terms import log_weight
+from gpusense.models.cloud import Cloud, Placed
+from gpusense.models.landmark.features import (
+    PreparedFeatures,
+    check_correspondence,
+    describe,
+    full_circle,
+    possible_features,
+    prepare_features,
+)
+from gpusense.models.landmark.plan import feature_omissions, looked_at, parameter_omissions
+from gpusense.models.landmark.tables import upload_tables
+from gpusense.models.point.base import Part, PointModel
+from gpusense.world.landmarks import LandmarkMap, make_buckets
+from gpusense.world.parameters import LandmarkParameters
+from gpusense.world.windows import Region
+
+# Limits of the joint association: 2^features sets, and every landmark is tried with each of them.
+JOINT_FEATURES = 8
+JOINT_LANDMARKS = 1024
+_INT = np.dtype(np.int32)
+# Landmarks of a launch that cost what a reading of a scan does.
+_PER_READING = 8
+
+
+@dataclass(frozen=True)
+class _Call:
+    """What all particles of a call share: features that are evaluated, and for known ones the landmarks' places."""
+
+    prepared: PreparedFeatures
+    places: np.ndarray
+    fixed: float
+    flags: frozenset[str]
+    joint: bool
+
+    @property
+    def count(self) -> int:
+        """Features that are evaluated."""
+        return len(self.prepared.columns)
+
+
+class LandmarkModel(PointModel):
+    """log p(f | x, m) of the features that a sensor finds, by the landmarks that they may be.
+
+    Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; what p(f | j) and p_uniform are stands in
+    docs/landmarks.md. Which landmark j a feature is, is given, or chosen by ``association`` (tables 6.4 and 6.5).
+
+    Args:
+        landmarks: The map.
+        parameters: Deviations, weights and limits of the sensor.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        precision: ``"float32"`` or ``"float64"``.
+        association: What a feature without a known landmark is: ``"nearest"`` is the likeliest landmark of each
+            by itself (the book's maximum likelihood); ``"sum"`` sums over all landmarks, each with the prior 1 / M;
+            ``"joint"`` is the likeliest assignment in which no two features are the same landmark, for at most 8
+            features and 1024 landmarks.
+        negative: Whether landmarks in view that no feature is add ``log(1 - p_detect)`` each; not with ``"sum"``.
+        mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
+        temperature: In (0, 1]: multiplies the sum over features. 1 is the book's plain product.
+        specialize: False leaves nothing out: same numbers, slower.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        landmarks: LandmarkMap,
+        parameters: LandmarkParameters | None = None,
+        *,
+        backend: Selection = "auto",
+        precision: str = "float32",
+        association: str = "nearest",
+        negative: bool = False,
+        mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        temperature: float = 1.0,
+        specialize: bool = True,
+    ) -> None:
+        if not isinstance(landmarks, LandmarkMap):
+            raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
+        self.landmarks = landmarks
+        self.parameters = LandmarkParameters() if parameters is None else parameters
+        if not isinstance(self.parameters, LandmarkParameters):
+            raise TypeError(f"parameters: must be LandmarkParameters, got {checks.show(parameters)}")
+        p = self.parameters
+        if p.sigma_signature is not None and landmarks.signatures is None:
+            rule = "must be None for a map without signatures"
+            raise ValueError(f"sigma_signature: {rule}, got {p.sigma_signature}")
+        self.association = checks.choice("association", association, ("nearest", "sum", "joint"))
+        for name, value in (("negative", negative), ("specialize", specialize)):
+            if not isinstance(value, bool):
+                raise TypeError(f"{name}: must be True or False, got {checks.show(value)}")
+        if negative and self.association == "sum":
+            raise ValueError("association: must be 'nearest' or 'joint' with negative=True, got 'sum'")
+        if self.association == "joint" and len(landmarks) > JOINT_LANDMARKS:
+            rule = f"must be at most {JOINT_LANDMARKS} with association='joint'"
+            raise ValueError(f"landmarks: {rule}, got {len(landmarks)}")
+        self.negative = negative
+        x, y, yaw = (float(value) for value in checks.array("mount", mount, (3,)))
+        self.mount = (x, y, yaw)
+        super().__init__(backend, precision, temperature)
+        self._specialize = specialize
+        self._sensor = describe(p, landmarks)
+        tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
+        if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
+            raise ValueError(f"parameters: deviations must fit {self._real.name}, got {p}")
+        self._buckets = make_buckets(landmarks)
+        self._tables = upload_tables(self._backend, self._real, landmarks, self._buckets, p, self._sensor)
+
+    def log_likelihood(
+        self, poses: object, features: object, correspondence: object = None, *, out: Any = None
+    ) -> np.ndarray:
+        """log p(f_1 ... f_F | x, m) for each particle, natural logarithm.
+
+        A feature of which nothing was measured, or of which a part is outside what the sensor can measure, says
+        nothing: it is left out as if it had not been given.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN is what was not measured.
+            correspondence: None, or (F,) indices of the landmarks that the features are, -1 for a false positive.
+            out: Where to write the result, in the memory where the poses are.
+
+        Returns:
+            (N,) log-likelihoods in the model's precision: densities in 1/m, 1/rad and 1/unit of the signature for what
+            was measured.
+
+        Raises:
+            TypeError: an argument does not hold numbers, or indices that are no integers.
+            ValueError: a wrong shape, a pose that is not finite, an index that is no landmark's, or more than 8
+                features for a joint association.
+        """
+        return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
+
+    def associate(self, poses: object, features: object) -> tuple[np.ndarray, np.ndarray]:
+        """The landmark that each feature is, for each particle.
+
+        With ``association="sum"`` it is the landmark with the largest part of the sum.
+
+        Args:
+            poses: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``.
+            features: (F, 2) or (F, 3), as in ``log_likelihood``.
+
+        Returns:
+            (N, F) int32 indices in the map, -1 where a false positive is likelier or a feature is left out, and (N, F)
+            what each feature adds to the log-likelihood before the temperature. NumPy arrays, wherever the poses are.
+
+        Raises:
+            TypeError, ValueError: as ``log_likelihood``.
+        """
+        _, which, parts = self._evaluate(poses, features, None, each=True)
+        return which, parts
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        found = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)
+        return f"landmark model, {self.association}", found
+
+    def _code(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
+        """The flags of the kernels."""
+        names = ("RANGE", "BEARING", "SIGNATURE")
+        there = np.asarray(prepared.measured.any(axis=0))
+        flags = {name for name, used in zip(names, there.tolist(), strict=True) if used or not self._specialize}
+        flags |= {"FIELD"} if not full_circle(self.parameters) else set()
+        flags |= {"KNOWN"} if known else {"MARGINAL"} if self.association == "sum" else set()
+        return self._flags | flags | ({"PER_BEAM"} if each else set())
+
+    def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> _Call:
+        """What kernels need of (F, 3) features that are possible."""
+        known = correspondence is not None
+        prepared = prepare_features(
+            full, self.parameters, self._sensor, self.mount, self._real,
+            extent=max(self._buckets.shape) * self._buckets.resolution, norm=self._tables.norm,
+            gated=self._specialize and not known,
+        )  # fmt: skip
+        fixed, places = 0.0, np.zeros(0, _INT)
+        joint = not known and self.association == "joint"
+        if known:
+            partner = check_correspondence(correspondence, len(full), len(self.landmarks))[prepared.columns]
+            # False positives are the same at every pose.
+            mine = partner >= 0
+            fixed = float(prepared.false[prepared.columns[~mine]].sum())
+            places = self._buckets.place_of[partner[mine]]
+            prepared = PreparedFeatures(
+                prepared.columns[mine], prepared.numbers[mine], prepared.measured[mine], prepared.false
+            )
+        elif joint and len(prepared.columns) > JOINT_FEATURES:
+            rule = f"must be at most {JOINT_FEATURES} with association='joint'"
+            raise ValueError(f"features: {rule}, got {len(prepared.columns)}")
+        return _Call(prepared, places, fixed, self._code(prepared, known, each or self.negative), joint)
+
+    def _evaluate(
+        self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
+    ) -> tuple[Any, np.ndarray, np.ndarray]:
+        """log p of each particle, and with ``each`` the (N, F) landmarks and what features add."""
+        host = arrays.copied_to_host(features, self._backend, "features")
+        full, impossible = possible_features(host, self.parameters, self._sensor.span)
+        call = self._prepare(full, correspondence, each)
+        known = correspondence is not None
+        left_out = feature_omissions(
+            call.prepared, self._buckets, given=len(full), impossible=int(impossible.sum()), known=known
+        )
+        # By the first particle of each piece, since a piece that does not fit into memory is tried again in halves.
+        nobody = np.empty((0, len(full)))
+        pieces = {-1: (nobody.astype(_INT), nobody.astype(self._real))}
+
+        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
+            chosen, parts = self._launch_all(call, cloud, part, result)
+            if each:
+                pieces[part[0]] = self._download(call, part[1] - part[0], len(full), chosen, parts)
+
+        items, itemsize = self._cost(call, known)
+        log_p = self._score(poses, out, launch, left_out, items=items, itemsize=itemsize)
+        which, added = zip(*(pieces[first] for first in sorted(pieces)), strict=True)
+        return log_p, np.concatenate(which), np.concatenate(added)
+
+    def _cost(self, call: _Call, known: bool) -> tuple[int, float]:
+        """What a particle costs, in readings of a scan, and the bytes that it keeps for each."""
+        looked = 1.0 if known else len(self.landmarks) if call.joint else looked_at(call.prepared, self._buckets)
+        work, kept = max(call.count, 1) * (1 + looked / _PER_READING), 0.0
+        if call.joint:
+            work, kept = work * (1 << call.count), (1 << call.count) * (1 + 2.0 * call.count)
+        elif "PER_BEAM" in call.flags:
+            kept = 2.0 * call.count
+        work = min(work, 1e9)
+        return math.ceil(work), self._real.itemsize * kept / work
+
+    def _launch_all(self, call: _Call, cloud: Cloud, part: Part, result: Buffer) -> tuple[Buffer, Buffer]:
+        """Start to score some particles into a buffer; places of landmarks and what features add, where wanted."""
+        space, backend, real = self._workspace, self._backend, self._real
+        count, features = part[1] - part[0], call.count
+        given = cloud.given(backend, space, part)
+        frame = (Region(0, 0, *self._buckets.shape), self._buckets, self.mount)
+        placed = cloud.place(backend, space, given, part, frame, real, careful=True)
+        numbers = call.prepared.numbers
+        feature = space.upload("feature", np.resize(numbers, (max(features, 1), numbers.shape[1])))
+        size = count * features if "PER_BEAM" in call.flags else 1
+        parts, chosen = space.empty("parts", size, real), space.empty("which", size, _INT)
+        start = self._launch_joint if call.joint else self._launch_each
+        start(call, cloud, placed, feature, (result, parts, chosen), (count, features))
+        if self.negative:
+            self._launch_unseen(placed, chosen, result, (count, features))
+        return chosen, parts
+
+    def _download(
+        self, call: _Call, count: int, given: int, chosen: Buffer, parts: Buffer
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(n, F) landmarks in the map and what features add; -1 and 0 for those that are not evaluated."""
+        which, added = np.full((count, given), -1, _INT), np.zeros((count, given), self._real)
+        if call.count:
+            place = self._backend.download(chosen, np.empty((count, call.count), _INT))
+            index = self._buckets.index[place] if len(self.landmarks) else -1
+            which[:, call.prepared.columns] = np.where(place >= 0, index, -1)
+            added[:, call.prepared.columns] = self._backend.download(parts, np.empty((count, call.count), self._real))
+        return which, added
+
+    def _launch_each(
+        self, call: _Call, cloud: Cloud, placed: Placed, feature: Buffer, outputs: tuple[Buffer, Buffer, Buffer],
+        counts: tuple[int, int],
+    ) -> None:  # fmt: skip
+        t, b, landmarks = self._tables, self._buckets, len(self.landmarks)
+        prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
+        partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
+        self._launch(
+            "score_features", widened(self._backend.info.lanes, "score_features", call.flags), cloud, counts[0],
+            t.landmark, t.signature, t.start, placed.cell, placed.pose, placed.low, feature, partner, t.terms, t.arcs,
+            *outputs, *b.shape, landmarks, *counts, b.resolution, prior, call.fixed,
+        )  # fmt: skip
+
+    def _launch_joint(
+        self, call: _Call, cloud: Cloud, placed: Placed, feature: Buffer, outputs: tuple[Buffer, Buffer, Buffer],
+        counts: tuple[int, int],
+    ) -> None:  # fmt: skip
+        t, b, space = self._tables, self._buckets, self._workspace
+        sets = 1 << counts[1]
+        scratch = (
+            space.empty("best", counts[0] * sets, self._real),
+            space.empty("choice", counts[0] * sets * counts[1], _INT),
+            space.empty("value", counts[0] * sets * counts[1], self._real),
+        )
+        self._launch(
+            "joint_features", call.flags, cloud, counts[0], t.landmark, t.signature, placed.cell, placed.pose,
+            placed.low, feature, t.terms, t.arcs, *scratch, *outputs, len(self.landmarks), *counts, sets, b.resolution,
+            call.fixed,
+        )  # fmt: skip
+
+    def _launch_unseen(self, placed: Placed, chosen: Buffer, result: Buffer, counts: tuple[int, int]) -> None:
+        p, t, b = self.parameters, self._tables, self._buckets
+        least = -2.0 if full_circle(p) else math.cos(p.field_of_view / 2)
+        log_missed = self.temperature * log_weight(1 - p.p_detect)
+        self._backend.compile("count_unseen", self._flags)(
+            (counts[0],), t.landmark, t.start, placed.cell, placed.pose, placed.low, chosen, result, *b.shape,
+            *counts, b.resolution, p.range_max, math.cos(self.mount[2]), math.sin(self.mount[2]), least, log_missed,
+        )  # fmt: skip

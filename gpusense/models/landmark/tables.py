@@ -1,0 +1,67 @@
+"""A map of landmarks on a device: positions in buckets, signatures, and the numbers of the sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.models.landmark.features import Sensor, full_circle, signature_mass
+from gpusense.reference.landmarks import ARCS
+from gpusense.world.frames import split
+from gpusense.world.landmarks import Buckets, LandmarkMap
+from gpusense.world.parameters import LandmarkParameters
+
+
+@dataclass(frozen=True)
+class LandmarkTables:
+    """Buffers by the names of the kernels' arguments.
+
+    Attributes:
+        landmark: (M,) real4 positions in the buckets' frame, by place, and what rounding took from them.
+        signature: (M,) real4 signatures, what rounding took from them, and -log of their mass on the span.
+        start: (rows * columns + 1,) place of the first landmark of each bucket.
+        terms: The sensor's numbers.
+        arcs: Arcs of the slopes i / 8.
+        norm: The largest -log of a signature's mass.
+    """
+
+    landmark: Buffer
+    signature: Buffer
+    start: Buffer
+    terms: Buffer
+    arcs: Buffer
+    norm: float
+
+
+def upload_tables(
+    backend: Backend, real: np.dtype, landmarks: LandmarkMap, buckets: Buckets, p: LandmarkParameters, sensor: Sensor
+) -> LandmarkTables:
+    """Make the tables in a precision."""
+    signature = np.zeros((len(landmarks), 4))
+    if landmarks.signatures is not None:
+        high, low = split(landmarks.signatures[buckets.index], real)
+        with np.errstate(divide="ignore"):
+            norm = -np.log(signature_mass(p, landmarks)[buckets.index])
+        signature[:, 0], signature[:, 1], signature[:, 2] = high, low, norm
+    high, low = split(np.array([p.range_max, p.field_of_view]), real)
+    # The density of a bearing at zero range, over the largest one there is elsewhere, but for the scale.
+    scale = sensor.scales[1]
+    flat = p.field_of_view / math.sqrt(math.pi)
+    flat /= math.erf(math.pi * scale) if full_circle(p) and scale else 1.0
+    terms = np.array([high[0], low[0], high[1], flat], real)
+    arcs = np.empty((len(ARCS), 2), real)
+    given = np.array(ARCS)
+    arcs[:, 0] = given[:, 0]
+    arcs[:, 1] = (given[:, 0] - arcs[:, 0]) + given[:, 1]
+
+    def there(table: np.ndarray) -> Buffer:
+        return backend.upload(np.ascontiguousarray(table))
+
+    return LandmarkTables(
+        there(buckets.table(real)), there(signature.astype(real)), there(buckets.start), there(terms), there(arcs),
+        float(signature[:, 2].max(initial=0.0)),
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Models of sensors with one reading for each pose."""

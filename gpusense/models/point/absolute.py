@@ -1,0 +1,228 @@
+"""Sensors that know where they are: position fixes and headings."""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal, localcontext
+from typing import Any, cast
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Selection, arrays
+from gpusense.backends.base import Buffer
+from gpusense.interface.plan import Omission
+from gpusense.interface.terms import log_weight
+from gpusense.models.cloud import Cloud
+from gpusense.models.point.base import MISSING, Part, PointModel, rand_omission, relative_omissions
+from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.reference.absolute import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
+from gpusense.reference.relative import wrapped_difference
+from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
+
+# Up to this deviation a wrapped normal is a sum of normals, beyond a Fourier series: both have few terms there.
+_WIDEST_SUM = 1.5
+
+
+class PositionModel(PointModel):
+    """log p(z | x) of a position fix, as of a satellite receiver.
+
+    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region; outside it lacks the second part.
+
+    Args:
+        parameters: Covariance, weights, region and where the antenna is.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
+        temperature: In (0, 1]: multiplies log p, for errors that are not independent from fix to fix.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        parameters: PositionParameters,
+        *,
+        backend: Selection = "auto",
+        precision: str = "float32",
+        temperature: float = 1.0,
+    ) -> None:
+        if not isinstance(parameters, PositionParameters):
+            raise TypeError(f"parameters: must be PositionParameters, got {checks.show(parameters)}")
+        super().__init__(backend, precision, temperature)
+        self.parameters = parameters
+        p = parameters
+        own = p.covariance
+        self._hit: list[np.floating] | None = None
+        if p.sigma is not None:
+            self._check_scale("sigma", p.sigma)
+            square = exact(p.sigma) * exact(p.sigma)
+            self._hit = self._gaussian("sigma", (square, Decimal(0), square))
+        elif own is not None:
+            self._hit = self._gaussian("covariance", (exact(own[0][0]), exact(own[0][1]), exact(own[1][1])))
+
+    def log_likelihood(self, poses: object, fix: object, *, covariance: object = None, out: Any = None) -> np.ndarray:
+        """log p(z | x) of a fix for each particle, natural logarithm.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            fix: (2,) measured x and y of the antenna [m]. One that is not finite is missing and says nothing: 0.
+            covariance: None, or the (2, 2) covariance matrix of this fix in the world [m^2].
+            out: Where to write the result, in the memory where the poses are.
+
+        Returns:
+            (N,) log-likelihoods in the model's precision, densities in 1/m^2.
+
+        Raises:
+            TypeError: an argument does not hold real numbers.
+            ValueError: a wrong shape, a pose that is not finite, or no covariance at all.
+        """
+        given = arrays.copied_to_host(fix, self._backend, "fix")
+        x, y = (float(value) for value in checks.array("fix", given, (2,), finite=False))
+        hit = self._hit
+        if covariance is not None:
+            c = check_covariance("covariance", covariance)
+            hit = self._gaussian("covariance", (exact(c[0][0]), exact(c[0][1]), exact(c[1][1])))
+        if hit is None:
+            raise ValueError("covariance: must be given where the parameters have none, got None")
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
+        terms = self._terms(hit, x, y)
+        impossible = bool(np.isneginf(terms[-1]))
+        flags = self._flags if impossible else self._flags | {"RAND"}
+        left_out = [rand_omission("the fix is outside the region")] if impossible and self.parameters.z_rand else []
+
+        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
+            place = self._relative(cloud, part, "place_relative", (x, y, *self.parameters.mount))
+            numbers, count = self._workspace.upload("terms", terms), part[1] - part[0]
+            self._launch("score_position", flags, cloud, count, place, numbers, result, count)
+
+        return cast(np.ndarray, self._score(poses, out, launch, left_out))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        p = self.parameters
+        found = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        return "position fix", found + relative_omissions(p.mount, self.precision)
+
+    def _terms(self, hit: list[np.floating], x: float, y: float) -> np.ndarray:
+        region, random = self.parameters.region, -math.inf
+        if region is not None and region[0] <= x <= region[2] and region[1] <= y <= region[3]:
+            random = log_weight(self.parameters.z_rand)
+            random -= math.log(region[2] - region[0]) + math.log(region[3] - region[1])
+        return np.array([*hit, random], self._real)
+
+    def _gaussian(self, name: str, covariance: tuple[Decimal, Decimal, Decimal]) -> list[np.floating]:
+        """Whitening by the Cholesky factor, and the log of weight and peak, each as two numbers."""
+        with localcontext(prec=DIGITS):
+            xx, xy, yy = covariance
+            first = xx.sqrt()
+            below = xy / first
+            second = (yy - below * below).sqrt()
+            for value in (first, second):
+                self._check_scale(name, float(value), "" if name == "sigma" else "standard deviations ")
+            root = Decimal(2).sqrt()
+            a, c = 1 / (root * first), 1 / (root * second)
+            b = -below / first * c
+            peak = total(log_of(self.parameters.z_hit), -(2 * PI * first * second).ln())
+        return two_parts((a, b, c, peak), self._real)
+
+
+class HeadingModel(PointModel):
+    """log p(z | x) of a heading, as of a compass.
+
+    ``z_hit p_hit(z - theta - offset) + z_rand / (2 pi)`` with a wrapped normal or a von Mises density p_hit.
+
+    Args:
+        parameters: Kind, deviation or concentration, weights and offset.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        precision: ``"float32"`` or ``"float64"``; either keeps the digits of headings of many turns.
+        temperature: In (0, 1]: multiplies log p, for errors that are not independent from reading to reading.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        parameters: HeadingParameters | None = None,
+        *,
+        backend: Selection = "auto",
+        precision: str = "float32",
+        temperature: float = 1.0,
+    ) -> None:
+        self.parameters = HeadingParameters() if parameters is None else parameters
+        if not isinstance(self.parameters, HeadingParameters):
+            raise TypeError(f"parameters: must be HeadingParameters, got {checks.show(parameters)}")
+        super().__init__(backend, precision, temperature)
+        self._kind, terms = self._mixture()
+        self._flags |= {"RAND"} if self.parameters.z_rand else set()
+        self._terms_there = self._backend.upload(terms)
+
+    def log_likelihood(self, poses: object, heading: object, *, out: Any = None) -> np.ndarray:
+        """log p(z | x) of a heading for each particle, natural logarithm.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            heading: What the sensor reads [rad], any number of turns. One that is not finite is missing and says
+                nothing: 0.
+            out: Where to write the result, in the memory where the poses are.
+
+        Returns:
+            (N,) log-likelihoods in the model's precision, densities in 1/rad.
+
+        Raises:
+            TypeError: an argument does not hold real numbers.
+            ValueError: a wrong shape, or a pose that is not finite.
+        """
+        given = arrays.copied_to_host(heading, self._backend, "heading")
+        reading = float(checks.array("heading", given, (), finite=False))
+        if not math.isfinite(reading):
+            return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
+        zero = np.zeros(1)
+        turned = wrapped_difference(np.array([self.parameters.offset]), (zero, zero))
+        high, low = wrapped_difference(np.array([reading]), turned)
+        target = float(high[0]), float(low[0])
+
+        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
+            residual = self._relative(cloud, part, "wrap_headings", target)
+            count = part[1] - part[0]
+            numbers = residual, self._terms_there
+            self._launch("score_heading", self._flags, cloud, count, *numbers, result, count, self._kind)
+
+        return cast(np.ndarray, self._score(poses, out, launch, []))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        p = self.parameters
+        found = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        # How far from half a turn all other turns are below exp(-40) of the nearest one.
+        near = NEGLIGIBLE * p.sigma**2 / (2 * math.pi)
+        if self._kind == NEARBY and near < math.pi:
+            why = f"residuals of less than pi - {near:.2g} rad need the nearest turn only"
+            found.append(Omission("other turns", why, f"{2 * WRAPS} exp and 1 log for each such particle"))
+        return f"heading, {p.kind}", found
+
+    def _mixture(self) -> tuple[int, np.ndarray]:
+        """The kind of density, and the numbers of the kernel file ``absolute``."""
+        p, real = self.parameters, self._real
+        waves, decay = [0.0] * WAVES, 0.0
+        log_hit, random = log_of(p.z_hit), log_weight(p.z_rand) - math.log(2 * math.pi)
+        with localcontext(prec=DIGITS):
+            if p.kind == "von_mises":
+                from scipy.special import i0e
+
+                # Small ones may vanish: they are as 0.
+                self._check_scale("kappa", 1 / math.sqrt(max(p.kappa, 1.0)), "1 / sqrt(kappa) ")
+                kind, scale = VON_MISES, (2 * exact(p.kappa)).sqrt()
+                peak = total(log_hit, -(2 * PI * exact(float(i0e(p.kappa)))).ln())
+            elif p.sigma <= _WIDEST_SUM:
+                self._check_scale("sigma", p.sigma)
+                kind, scale = NEARBY, 1 / (Decimal(2).sqrt() * exact(p.sigma))
+                peak = total(log_hit, -((2 * PI).sqrt() * exact(p.sigma)).ln())
+                # Held finite in float32; other turns have vanished long before.
+                decay = min(2 * math.pi / p.sigma / p.sigma, 1e30)
+            else:
+                kind, scale, peak = SERIES, Decimal(0), total(log_hit, -(2 * PI).ln())
+                waves = [2 * math.exp(-0.5 * min(n * p.sigma, 1e3) ** 2) for n in range(1, WAVES + 1)]
+        return kind, np.array([*two_parts((scale, peak), real), random, decay, *waves], real)

@@ -1,0 +1,195 @@
+"""Ranges to known beacons, as of ultra-wideband radios."""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal, localcontext
+from typing import Any, cast
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Selection, arrays
+from gpusense.backends.base import Buffer
+from gpusense.interface.plan import Omission, share
+from gpusense.interface.terms import log_weight
+from gpusense.models.cloud import Cloud
+from gpusense.models.point.base import Part, PointModel, rand_omission, relative_omissions
+from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.reference.beacons import BEACON, NORMAL, STUDENT_T, TERMS, TWO_NORMALS
+from gpusense.reference.relative import FARTHEST
+from gpusense.world.sensor_parameters import BeaconParameters
+
+
+class BeaconModel(PointModel):
+    """log p(z_1 ... z_F | x) of ranges to known beacons.
+
+    Each adds ``log(z_hit f(z - d - bias) / m + z_rand / range_max)``. d is the antenna's distance to the beacon, f the
+    density of the parameters' kind and m its mass on [0, range_max], so that each range's density integrates to 1;
+    where d + bias lies outside this interval m is that at its end.
+
+    Args:
+        xy: (M, 2) places of the beacons in the world [m].
+        parameters: Density, bias, weights and where the antenna is.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
+        temperature: In (0, 1]: multiplies the sum over ranges. 1 is the plain product of densities.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        xy: object,
+        parameters: BeaconParameters | None = None,
+        *,
+        backend: Selection = "auto",
+        precision: str = "float32",
+        temperature: float = 1.0,
+    ) -> None:
+        self.parameters = BeaconParameters() if parameters is None else parameters
+        if not isinstance(self.parameters, BeaconParameters):
+            raise TypeError(f"parameters: must be BeaconParameters, got {checks.show(parameters)}")
+        given = checks.as_array("xy", xy)
+        # An empty list has no columns.
+        self.xy = checks.array("xy", given.reshape(0, 2) if given.shape == (0,) else given, ("M", 2)).copy()
+        self.xy.flags.writeable = False
+        super().__init__(backend, precision, temperature)
+        self._flags |= {"RAND"} if self.parameters.z_rand else set()
+        # Poses and beacons are placed relative to the middle of the beacons.
+        middle = (self.xy.min(axis=0) / 2 + self.xy.max(axis=0) / 2) if len(self.xy) else np.zeros(2)
+        self._origin = float(middle[0]), float(middle[1])
+        far = np.abs(self.xy - middle).max(initial=0.0)
+        if not far <= FARTHEST:
+            raise ValueError(f"xy: must be within {FARTHEST:.2g} m of the middle, got {far:.2g} m")
+        self._kind, terms, series = self._mixture()
+        self._count = len(series)
+        self._terms_there, self._series_there = self._backend.upload(terms), self._backend.upload(series)
+
+    def log_likelihood(self, poses: object, ranges: object, ids: object = None, *, out: Any = None) -> np.ndarray:
+        """log p(z_1 ... z_F | x) for each particle, natural logarithm.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and what is not between 0 and
+                range_max, is missing: it says nothing.
+            ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.
+            out: Where to write the result, in the memory where the poses are.
+
+        Returns:
+            (N,) log-likelihoods in the model's precision, densities in 1/m for each range; 0 without ranges.
+
+        Raises:
+            TypeError: an argument does not hold real numbers, or indices that are no integers.
+            ValueError: a wrong shape, a pose that is not finite, an index that is no beacon's.
+        """
+        beacon, left_out = self._prepare(ranges, ids)
+        count = len(beacon)
+        if count == 0:
+            return cast(np.ndarray, self._score(poses, out, None, left_out))
+
+        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
+            place = self._relative(cloud, part, "place_relative", (*self._origin, *self.parameters.mount))
+            numbers, particles = self._workspace.upload("beacon", beacon), part[1] - part[0]
+            self._launch(
+                "score_beacons", self._flags, cloud, particles, place, numbers, self._terms_there, self._series_there,
+                result, particles, count, self._count, self._kind,
+            )  # fmt: skip
+
+        return cast(np.ndarray, self._score(poses, out, launch, left_out, items=count))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        p = self.parameters
+        found = [] if p.z_rand else [rand_omission("z_rand = 0", " and range")]
+        return f"ranges to beacons, {p.kind}", found + relative_omissions(p.mount, self.precision)
+
+    def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
+        """(F, BEACON) numbers of the ranges that count, and which do not."""
+        p, known = self.parameters, len(self.xy)
+        given = arrays.copied_to_host(ranges, self._backend, "ranges")
+        if ids is None:
+            z, index = checks.array("ranges", given, (known,), finite=False), np.arange(known)
+        else:
+            chosen = checks.as_array("ids", ids)
+            index = checks.array("ids", chosen.astype(np.int64) if chosen.size == 0 else chosen, ("F",), dtype=np.int64)
+            z = checks.array("ranges", given, (len(index),), finite=False)
+            outside = (index < 0) | (index >= known)
+            if outside.any():
+                at = int(np.argmax(outside))
+                raise ValueError(f"ids: indices must be in [0, {known}), got {index[at]} at index {at}")
+        missing, there = np.isnan(z), (z >= 0) & (z <= p.range_max)
+        left_out = []
+        reasons = (
+            ("missing ranges", missing, "are nan"),
+            ("impossible ranges", ~(missing | there), f"are not in [0, {p.range_max:g}] m"),
+        )
+        for what, which, why in reasons:
+            if number := int(np.count_nonzero(which)):
+                why = f"{number} of {len(z)} {why}"
+                left_out.append(Omission(what, why, f"{share(number, len(z))} of the ranges"))
+        rows = []
+        with localcontext(prec=DIGITS):
+            for (x, y), reading in zip(self.xy[index[there]], z[there], strict=True):
+                numbers = (exact(float(x)) - exact(self._origin[0]), exact(float(y)) - exact(self._origin[1]),
+                           exact(float(reading)) - exact(p.bias))  # fmt: skip
+                rows.append(two_parts(numbers, self._real))
+        return np.array(rows, self._real).reshape(-1, BEACON), left_out
+
+    def _mixture(self) -> tuple[int, np.ndarray, np.ndarray]:
+        """The kind of density, and the numbers and the series of the kernel file ``beacons``."""
+        p, real = self.parameters, self._real
+        self._check_scale("sigma_range", p.sigma_range)
+        self._check_scale("range_max", p.range_max)
+        self._check_scale("bias", max(abs(p.bias), 1.0), "its size ")
+        random = log_weight(p.z_rand) - math.log(p.range_max)
+        rest: list[Any] = [0.0] * 6
+        series = np.zeros(1)
+        with localcontext(prec=DIGITS):
+            if p.kind == "student_t":
+                kind, nu = STUDENT_T, Decimal(p.nu)
+                log_peak = _log_t_peak(p.nu) - exact(p.sigma_range).ln()
+                k = (2 * log_peak / (nu + 1)).exp()
+                first = two_parts((1 / (exact(p.sigma_range) * (nu * k).sqrt()), log_of(p.z_hit)), real)
+                arc, series = t_series(p.nu)
+                flat = 1 / (p.sigma_range * math.sqrt(p.nu))
+                rest = [*two_parts((1 / k,), real), (p.nu + 1) / 2, flat, arc, float(p.nu % 2)]
+            else:
+                kind, share = NORMAL, 1.0
+                if p.kind == "mixture":
+                    self._check_scale("sigma_heavy", p.sigma_heavy)
+                    kind, share = TWO_NORMALS, 1 - p.heavy_weight
+                    heavy = _normal(p.sigma_heavy, total(log_of(p.z_hit), log_of(p.heavy_weight)))
+                    rest = [*two_parts(heavy, real), 0.0, 0.0]
+                first = two_parts(_normal(p.sigma_range, total(log_of(p.z_hit), log_of(share))), real)
+        terms = np.array([*first, random, p.range_max, p.bias, *rest], real)
+        assert len(terms) == TERMS
+        return kind, terms, series.astype(real)
+
+
+def _normal(sigma: float, log_share: Decimal | float) -> tuple[Decimal, Decimal | float]:
+    """``1 / (sigma sqrt 2)`` and the log of a share of a normal's peak."""
+    scale = 1 / (Decimal(2).sqrt() * exact(sigma))
+    return scale, total(log_share, -((2 * PI).sqrt() * exact(sigma)).ln())
+
+
+def _log_t_peak(nu: int) -> Decimal:
+    """Log of the peak of a Student t of scale 1, by the recurrence of its ratio of gamma functions."""
+    ratio = 1 / PI.sqrt() if nu % 2 else PI.sqrt() / 2
+    for n in range(2 - nu % 2, nu, 2):
+        ratio = ratio * (n + 1) / n
+    return (ratio / (nu * PI).sqrt()).ln()
+
+
+def t_series(nu: int) -> tuple[float, np.ndarray]:
+    """Of a Student t's mass between -t and t: the factor of the arc, and the series in the square of its cosine.
+
+    Source: Abramowitz and Stegun, 26.7.3 (odd nu) and 26.7.4 (even nu).
+    """
+    odd = nu % 2
+    factors = [(n - 1 + odd) / (n + odd) for n in range(2, nu - odd, 2)]
+    if nu == 1:
+        return 2 / math.pi, np.zeros(1)
+    series = np.cumprod([1.0, *factors])
+    return (2 / math.pi, 2 / math.pi * series) if odd else (0.0, series)

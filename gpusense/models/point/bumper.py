@@ -1,0 +1,246 @@
+"""A bumper: contact of a robot's outline with the map."""
+
+from __future__ import annotations
+
+import math
+from decimal import localcontext
+from typing import Any, cast
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Selection, arrays
+from gpusense.backends.base import Buffer
+from gpusense.interface.plan import Omission, share
+from gpusense.models.cloud import Cloud
+from gpusense.models.point.base import Part, PointModel
+from gpusense.models.point.pairs import DIGITS, exact, two_parts
+from gpusense.reference.end_point import FIELD_RING
+from gpusense.tables.distances import squared_distances
+from gpusense.world.frames import split
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.sensor_parameters import BumperParameters
+from gpusense.world.windows import LONGEST_SIDE, Region
+
+# Cells around the map and the outline: so many deviations, but no more than that many cells.
+_DEVIATIONS, _MOST_MARGIN = 4, 64
+# Points of an outline, and in eps and cells of a reading and 2 more what an end point's rounding errors can be.
+_MOST_POINTS = 1 << 16
+_GUARD = 3.25
+
+
+class BumperModel(PointModel):
+    """log p(pressed | x, m) of a bumper by the distance of the robot's outline to the nearest obstacle.
+
+    ``P(pressed) = p_contact P(touching) + p_false (1 - P(touching))`` with ``P(touching) = Phi(-gap / sigma)``. The gap
+    is the distance from the outline to the nearest occupied cell's centre, less half a cell; distances are those of the
+    cells that points lie in, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle
+    in segments, are looked up at points half a cell apart at most. What stands wholly inside a polygon touches nothing.
+    A point farther off the map than the outline reaches, and 4 deviations (64 cells at most), counts as there.
+
+    Args:
+        grid: The map.
+        outline: The radius of a round robot [m], or (P, 2) corners of a polygon in its frame [m], in order.
+        parameters: Probabilities, and the deviation of outline and map.
+        segments: None where the outline is one bumper. Of a circle: (B, 2) bearings from and to which bumpers reach
+            counter-clockwise [rad]. Of a polygon: (P,) integers, the bumper 0 to B - 1 that the edge from each corner
+            to the next is part of, or -1 for none.
+        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        precision: ``"float32"`` or ``"float64"``.
+        unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
+        outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        temperature: In (0, 1]: multiplies the sum over segments. 1 is the plain product of probabilities.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+    """
+
+    def __init__(
+        self,
+        grid: OccupancyGrid,
+        outline: object,
+        parameters: BumperParameters | None = None,
+        *,
+        segments: object = None,
+        backend: Selection = "auto",
+        precision: str = "float32",
+        unknown: str = "free",
+        outside: str = "free",
+        temperature: float = 1.0,
+    ) -> None:
+        if not isinstance(grid, OccupancyGrid):
+            raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+        self.grid = grid
+        self.parameters = BumperParameters() if parameters is None else parameters
+        if not isinstance(self.parameters, BumperParameters):
+            raise TypeError(f"parameters: must be BumperParameters, got {checks.show(parameters)}")
+        self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
+        self.outside = checks.choice("outside", outside, ("free", "occupied"))
+        super().__init__(backend, precision, temperature)
+        self._check_scale("sigma", self.parameters.sigma)
+        side = grid.resolution
+        self._radius, self._points, self._start = sample_outline(outline, segments, side / 2)
+        self.segments = len(self._start) - 1
+        extent = self._radius + float(np.hypot(*self._points.T).max())
+        margin = math.ceil(extent / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
+        rows, cols = (size + 2 * margin for size in grid.shape)
+        if max(rows, cols) + 2 * FIELD_RING > LONGEST_SIDE:
+            rule = f"must have at most {LONGEST_SIDE - 2 * FIELD_RING} rows and columns with room for the outline"
+            raise ValueError(f"grid: {rule}, got {rows} x {cols}")
+        obstacles = np.pad(
+            grid.obstacles("occupied" if self.unknown == "occupied" else "free"),
+            margin + FIELD_RING,
+            constant_values=self.outside == "occupied",
+        )
+        self._table = squared_distances(self._backend, obstacles)
+        self._region = Region(-margin, -margin, rows, cols)
+        self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
+        high, low = split(self._points / side, self._real)
+        self._given = [self._backend.upload(each) for each in (high, low)]
+        self._terms_there = self._backend.upload(self._terms(self._radius))
+
+    def log_likelihood(self, poses: object, pressed: object, *, out: Any = None) -> np.ndarray:
+        """log p(pressed | x, m) for each particle, natural logarithm.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
+            pressed: True or False (1 or 0 do as well), or (B,) of them where there are segments; NaN or None is a
+                missing reading, which says nothing: 0.
+            out: Where to write the result, in the memory where the poses are.
+
+        Returns:
+            (N,) logarithms of probabilities in the model's precision.
+
+        Raises:
+            TypeError: ``pressed`` is none of these, or poses do not hold real numbers.
+            ValueError: a wrong shape, or a pose that is not finite.
+        """
+        states = self._states(pressed)
+        there, left_out = states >= 0, []
+        if missing := int(np.count_nonzero(~there)):
+            why = f"{missing} of {self.segments} are nan or None"
+            left_out = [Omission("missing readings", why, f"{share(missing, self.segments)} of the segments")]
+        if not there.any():
+            return cast(np.ndarray, self._score(poses, out, None, left_out))
+        sizes = np.diff(self._start)
+        kept = np.repeat(there, sizes)
+        points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._given
+        start = np.concatenate([[0], np.cumsum(sizes[there])]).astype(np.int32)
+        own = states[there].astype(np.int32)
+        flags = self._flags | (frozenset({"CAREFUL"}) if self._real == np.float32 else frozenset())
+        region, space = self._region, self._workspace
+
+        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
+            given, count = cloud.given(self._backend, space, part), part[1] - part[0]
+            frame = (region, self.grid, (0.0, 0.0, 0.0))
+            placed = cloud.place(self._backend, space, given, part, frame, self._real, careful="CAREFUL" in flags)
+            self._launch(
+                "score_contact", flags, cloud, count, self._table, placed.cell, placed.pose, placed.low, *points,
+                space.upload("start", start), space.upload("pressed", own), self._terms_there, result, region.rows,
+                region.cols, count, len(own), self._guard,
+            )  # fmt: skip
+
+        return cast(np.ndarray, self._score(poses, out, launch, left_out, items=int(kept.sum())))
+
+    def _describe(self) -> tuple[str, list[Omission]]:
+        found = []
+        if len(self._points) == 1:
+            spared = max(round(4 * math.pi * self._radius / self.grid.resolution) - 1, 0)
+            why = "one look-up at a circle's centre gives the distance of all of it"
+            found.append(Omission("points of the outline", why, f"about {spared} look-ups per particle"))
+        why = f"unknown cells are {self.unknown} by one rule, applied once to the map"
+        found.append(Omission("unknown branch", why, "a test per look-up"))
+        if self.precision == "float32":
+            why = "positions are split into cell and fraction in float64"
+            found.append(Omission("float64", why, "half the bytes and wide units"))
+        return "bumper", found
+
+    def _select(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        high, low = split(self._points[kept] / self.grid.resolution, self._real)
+        return high, low
+
+    def _states(self, pressed: object) -> np.ndarray:
+        """(B,) 1 where pressed, 0 where not, -1 where missing."""
+        given = arrays.copied_to_host(pressed, self._backend, "pressed")
+        one = given is None or isinstance(given, (bool, int, float, np.bool, np.number))
+        if not one and not isinstance(given, (list, tuple, np.ndarray)):
+            rule = "must be True, False or nan, or a sequence of these"
+            raise TypeError(f"pressed: {rule}, got {checks.show(pressed)}")
+        if isinstance(given, np.ndarray) and given.ndim > 1:
+            raise ValueError(f"pressed: shape must be ({self.segments},), got {checks.shape_text(given.shape)}")
+        many = [given] if one else list(np.atleast_1d(np.asarray(given, object)))
+        states = []
+        for value in many:
+            if value is None or (isinstance(value, (float, np.floating)) and math.isnan(value)):
+                states.append(-1)
+            elif isinstance(value, (bool, int, float, np.bool, np.number)) and value in (0, 1):
+                states.append(int(value))
+            else:
+                raise TypeError(f"pressed: every value must be True, False or nan, got {checks.show(value)}")
+        if len(states) != self.segments:
+            raise ValueError(f"pressed: shape must be ({self.segments},), got ({len(states)},)")
+        return np.array(states)
+
+    def _terms(self, radius: float) -> np.ndarray:
+        """The numbers of the kernel file ``contact``."""
+        p, side = self.parameters, self.grid.resolution
+        with localcontext(prec=DIGITS):
+            scale = 1 / (exact(2).sqrt() * exact(p.sigma))
+            pairs = two_parts((scale, exact(radius) + exact(side) / 2, exact(side)), self._real)
+        weights = (p.p_contact, p.p_false)
+        logs = [math.log(w) if w > 0 else -math.inf for w in weights]
+        misses = [math.log1p(-w) if w < 1 else -math.inf for w in weights]
+        return np.array([*pairs, *logs, *misses], self._real)
+
+
+def sample_outline(outline: object, segments: object, spacing: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """What is left of an outline beside its points, the (Q, 2) points, and where each segment's begin, (B + 1,).
+
+    Raises:
+        TypeError: not numbers, or segments of a polygon that are no integers.
+        ValueError: a radius that is not positive, fewer than 3 corners, segments that fit neither, or too many points.
+    """
+    if isinstance(outline, (int, float, np.integer, np.floating)) and not isinstance(outline, bool):
+        radius = checks.real("outline", float(outline), above=0)
+        if segments is None:
+            return radius, np.zeros((1, 2)), np.array([0, 1], np.int32)
+        arcs = checks.array("segments", segments, ("B", 2))
+        if len(arcs) == 0:
+            raise ValueError("segments: must be one at least, got none")
+        parts = []
+        for begin, end in arcs:
+            width = (end - begin) % (2 * math.pi) or 2 * math.pi
+            count = _count(radius * width, spacing)
+            angles = begin + width * np.arange(count + 1) / count
+            parts.append(radius * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+    else:
+        corners = checks.array("outline", outline, ("P", 2))
+        if len(corners) < 3:
+            raise ValueError(f"outline: must have at least 3 corners, got {len(corners)}")
+        owner = np.zeros(len(corners), np.int64)
+        if segments is not None:
+            owner = checks.array("segments", segments, (len(corners),), dtype=np.int64)
+        bumpers = int(owner.max()) + 1
+        if owner.min() < -1 or set(range(bumpers)) - set(owner.tolist()) or bumpers == 0:
+            rule = "must be -1 or numbers from 0 on without a gap, one of them 0"
+            raise ValueError(f"segments: {rule}, got {checks.show(owner.tolist())}")
+        edges = []
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            count = _count(float(np.hypot(*(b - a))), spacing)
+            edges.append(a + (b - a) * (np.arange(count + 1) / count)[:, None])
+        parts = [np.concatenate([edges[i] for i in np.flatnonzero(owner == s)]) for s in range(bumpers)]
+    start = np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int32)
+    return 0.0, np.concatenate(parts), start
+
+
+def _count(length: float, spacing: float) -> int:
+    """Pieces of a stretch of the outline.
+
+    Raises:
+        ValueError: more than 65 536.
+    """
+    count = max(math.ceil(length / spacing), 1) if length / spacing <= _MOST_POINTS else _MOST_POINTS + 1
+    if count > _MOST_POINTS:
+        raise ValueError(f"outline: must be at most {_MOST_POINTS // 2} cells long in each part, got {length:g} m")
+    return count

@@ -1,0 +1,1 @@
+"""Models of whole scans, and ray casting."""

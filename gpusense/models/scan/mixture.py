@@ -1,0 +1,92 @@
+"""The beam model's mixture as kernels have it: flags of its components, its numbers, and a table in its place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.world.parameters import BeamParameters
+
+# Bins of a sensor's table along each axis: 268 MB in float32.
+_MOST_BINS = 8192
+
+
+def mixture_of(
+    kinds: Sequence[BeamParameters], range_max: float, real: np.dtype, *, specialize: bool, max_depends: bool
+) -> tuple[frozenset[str], np.ndarray]:
+    """Flags of the components, and the numbers of the kernel file ``mixture`` for each bin of angles of incidence.
+
+    Raises:
+        ValueError: a number is beyond what the precision can hold.
+    """
+    weights = {name: max(getattr(p, f"z_{name.lower()}") for p in kinds) for name in ("HIT", "SHORT", "RAND")}
+    flags = {name for name, weight in weights.items() if weight > 0 or not specialize}
+    # Where no range is possible at any angle, something must say so of each.
+    flags |= {"RAND"} if max_depends and not flags else set()
+    peaks = [_peak(p) for p in kinds]
+    if specialize and len(flags) == 1:
+        flags.add("SINGLE")
+    if max(peaks) > HIGH_PEAK or not specialize:
+        flags.add("SHARP")
+    if all(
+        sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), real)
+        for p, peak in zip(kinds, peaks, strict=True)
+    ):
+        flags.add("LINEAR")
+    return frozenset(flags), np.concatenate([_terms(p, range_max, real, "LINEAR" in flags) for p in kinds])
+
+
+def peer_mixture(
+    p: BeamParameters, range_max: float, real: np.dtype, *, amcl: bool
+) -> tuple[frozenset[str], np.ndarray]:
+    """Flags and numbers of the kernel file ``compat``.
+
+    Raises:
+        ValueError: a number is beyond what the precision can hold.
+    """
+    flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"} | ({"AMCL"} if amcl else set())
+    hit = p.z_hit if amcl else _peak(p)
+    terms = [hit, *_shape(p), p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
+    return frozenset(flags), rounded_terms(terms, real)
+
+
+def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype) -> np.ndarray:
+    """log p in bins of readings and expected ranges, both with a last one for range_max.
+
+    Raises:
+        TypeError, ValueError: a width that is no number, too small or more than range_max.
+    """
+    from gpusense.models.scan.densities import log_mixture  # loads SciPy
+
+    width = checks.real("sensor_table", width, low=range_max / _MOST_BINS, high=range_max)
+    cells = max(round(range_max / width), 1)
+    middle = (np.arange(cells) + 0.5) * (range_max / cells)
+    expected = np.append(middle, range_max)
+    table = np.full((cells + 1, cells + 1), log_weight(p.z_max), real)
+    # In blocks of rows: the densities need some forty numbers for each of theirs.
+    for first in range(0, cells, 64):
+        rows = slice(first, first + 64)
+        table[:-1][rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **p.to_dict())
+    return table
+
+
+def _peak(p: BeamParameters) -> float:
+    return p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+
+
+def _shape(p: BeamParameters) -> tuple[float, float]:
+    return 0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit
+
+
+def _terms(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) -> np.ndarray:
+    if linear:
+        head = (_peak(p), p.z_short, p.z_rand / range_max)
+    else:
+        log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+        head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
+    terms = [head[0], *_shape(p), head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
+    return rounded_terms(terms, real)

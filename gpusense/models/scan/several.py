@@ -1,0 +1,94 @@
+"""Several models of one device in one call: other maps, sensors or kinds of model, and one wait for all."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from typing import Any
+
+from gpusense._util import checks
+from gpusense.models.cloud import Cloud, finish_all
+from gpusense.models.scan.model import ScanModel
+
+
+def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
+    """log p(z | x, m) of several beam models and likelihood fields, as ``log_likelihood`` of each, at once.
+
+    Every model queues its launches before the device is waited for, once. Models may differ in everything but the
+    device: maps (one of each floor, or of each robot's own), scanners, parameters, precision. The same model may stand
+    there several times.
+
+    Args:
+        models: :class:`BeamModel` and :class:`LikelihoodFieldModel` objects of one device.
+        poses: As for ``log_likelihood``, (N, 3) or (S, N, 3): one array for all models, or a list or tuple of one for
+            each of them.
+        ranges: (K,) or (S, K) readings: one array for all models, or a list or tuple of one for each of them.
+        out: None, or a list or tuple of where to write each model's result, or None, as in ``log_likelihood``.
+
+    Returns:
+        A list of what ``log_likelihood`` of each model returns, to the last bit: (N,) or (S, N).
+
+    Raises:
+        TypeError: models that are not such, or an argument of one of them that breaks its rule.
+        ValueError: models of several devices, a list of another length, or an argument that breaks its rule.
+        MemoryError: the device cannot hold a map's table, or even a few particles.
+    """
+    chosen = _checked(models)
+    if not chosen:
+        return []
+    each_poses, each_ranges = _one_each("poses", poses, len(chosen)), _one_each("ranges", ranges, len(chosen))
+    if out is not None and not isinstance(out, (list, tuple)):
+        raise TypeError(f"out: must be a list or tuple of one array for each model, got {checks.show(out)}")
+    each_out = _one_each("out", out, len(chosen))
+    known: dict[int, dict[object, list[Cloud]]] = {}
+    calls = []
+    for model, own_poses, own_ranges, own_out in zip(chosen, each_poses, each_ranges, each_out, strict=True):
+        # Poses that several models have are looked at once.
+        seen = known.setdefault(id(own_poses), {})
+        calls.append(model._call(own_poses, own_ranges, own_out, known=seen))
+    # Always in one order, so that two such calls cannot wait for each other.
+    different = sorted({id(model): model for model in chosen}.items())
+    with contextlib.ExitStack() as stack:
+        for _, model in different:
+            stack.enter_context(model._lock)
+        for _, model in different:
+            stack.push(lambda kind, *error, space=model._workspace: space.abandon() if kind else None)
+        # Left first: what was gathered is started before an error forgets its memory.
+        stack.enter_context(chosen[0]._workspace)
+        for model, call in zip(chosen, calls, strict=True):
+            model._start(call)
+            model._workspace.start()
+        on_device = {id(model) for model, call in zip(chosen, calls, strict=True) if call.on_device}
+        finish_all([(model._workspace, key in on_device) for key, model in different])
+    return [call.log_p(model._backend) for model, call in zip(chosen, calls, strict=True)]
+
+
+def _checked(models: object) -> list[ScanModel]:
+    """Models of one device.
+
+    Raises:
+        TypeError, ValueError: they are not.
+    """
+    if not isinstance(models, (list, tuple)):
+        raise TypeError(f"models: must be a list or tuple of models, got {checks.show(models)}")
+    for i, model in enumerate(models):
+        if not isinstance(model, ScanModel):
+            rule = "must be BeamModel or LikelihoodFieldModel objects"
+            raise TypeError(f"models: {rule}, got {checks.show(model)} at index {i}")
+        if model._backend is not models[0]._backend:
+            found = f"{models[0].device.selection} and, at index {i}, {model.device.selection}"
+            raise ValueError(f"models: must be of one device, got {found}")
+    return list(models)
+
+
+def _one_each(name: str, given: Any, count: int) -> list[Any]:
+    """An argument of each model: lists and tuples have one for each, anything else is all models'.
+
+    Raises:
+        ValueError: a list of another length.
+    """
+    if not isinstance(given, (list, tuple)):
+        return [given] * count
+    if len(given) != count:
+        raise ValueError(f"{name}: a list must have one entry for each of {count} models, got {len(given)}")
+    return list(given)

@@ -1,0 +1,293 @@
+"""Drawing: maps, scans, particles and densities over poses, each onto a Matplotlib ``Axes``.
+
+Matplotlib is imported when something is drawn. ``pyplot`` and its global state are never touched: make a figure with
+:func:`new_figure`, draw, and write it with :func:`save`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense._util.files import write_whole
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Reading, Scanner, classify
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+    from matplotlib.transforms import Transform
+
+FREE, UNKNOWN, OCCUPIED = "#ffffff", "#dfe3e8", "#4a5568"
+BEAM, ROBOT, FRAME = "#0077b6", "#d7263d", "#9aa5b1"
+# From unlikely to likely, ever darker: as good on paper, in grey and to colour-blind eyes.
+SCALE = ("#eef1f5", "#ffd166", "#f3722c", "#b5179e", "#3a0ca3")
+# Dots per inch of a saved image; shapes of many points are drawn as pixels in vector formats too.
+DPI = 150
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of that size [inches] whose parts make room for each other."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def draw_map(ax: Axes, grid: OccupancyGrid) -> AxesImage:
+    """The map: occupied cells dark, unknown ones grey, free ones white; axes in metres of the world.
+
+    What :func:`draw_pose_density` draws shows through the free cells.
+
+    Args:
+        ax: Where to draw.
+        grid: The map; its origin's yaw turns the picture.
+    """
+    from matplotlib.colors import to_rgba
+
+    palette = np.array([to_rgba(FREE), to_rgba(UNKNOWN), to_rgba(OCCUPIED)], dtype=np.float32)
+    kinds = np.where(grid.occupied, 2, np.where(grid.unknown, 1, 0))
+    _over_grid(ax, grid, palette[kinds], zorder=0)
+    palette[0, 3] = 0  # the upper layer is for what is drawn in between
+    image = _over_grid(ax, grid, palette[kinds], zorder=2)
+    x_min, y_min, x_max, y_max = grid.bounds()
+    ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    ax.set_facecolor(UNKNOWN)
+    ax.spines[:].set_color(FRAME)
+    ax.tick_params(color=FRAME)
+    return image
+
+
+def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, ranges: ArrayLike) -> int:
+    """A scan as it lies on the map when the robot stands at a pose: thin beams, their end points, the robot.
+
+    Readings without a range ("no return" and missing ones) are not drawn.
+
+    Args:
+        ax: Where to draw, usually onto :func:`draw_map`.
+        grid: The map, which gives the size of the robot's arrow.
+        scanner: The scanner's geometry, mount included.
+        pose: (3,) the robot's x, y and theta in the world [m, m, rad].
+        ranges: (K,) readings [m].
+
+    Returns:
+        The number of readings that were drawn.
+    """
+    from matplotlib.collections import LineCollection
+
+    x, y, theta = checks.array("pose", pose, (3,)).tolist()
+    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    hit = classify(z, scanner) == Reading.HIT
+    ahead, aside, turn = scanner.mount
+    c, s = math.cos(theta), math.sin(theta)
+    start = np.array([x + c * ahead - s * aside, y + s * ahead + c * aside])
+    heading = theta + turn + scanner.bearings[hit]
+    ends = start + z[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    beams = np.stack([np.broadcast_to(start, ends.shape), ends], axis=1)
+    ax.add_collection(LineCollection(list(beams), colors=BEAM, linewidths=0.6, alpha=0.35, zorder=4), autolim=False)
+    ax.scatter(ends[:, 0], ends[:, 1], s=9, c=BEAM, linewidths=0, zorder=5)
+    draw_pose(ax, (x, y, theta), length=0.07 * max(grid.width, grid.height))
+    return int(np.count_nonzero(hit))
+
+
+def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) -> None:
+    """A pose: a ring at its position and an arrow along its heading, ``length`` metres long (0: no arrow)."""
+    x, y, theta = checks.array("pose", pose, (3,)).tolist()
+    if length > 0:
+        tip = (x + length * math.cos(theta), y + length * math.sin(theta))
+        style = {"arrowstyle": "-|>", "color": colour, "linewidth": 2.0, "shrinkA": 7, "shrinkB": 0}
+        ax.annotate("", xy=tip, xytext=(x, y), arrowprops=style, zorder=6)
+    for width, edge in ((3.5, "white"), (1.8, colour)):
+        ax.plot([x], [y], marker="o", markersize=15, markerfacecolor="none", markeredgecolor=edge,
+                markeredgewidth=width, linestyle="none", zorder=7)  # fmt: skip
+
+
+def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
+    """A colour bar as high as its axes; the arrow at its low end says that values go on below."""
+    bar = ax.figure.colorbar(mappable, cax=ax.inset_axes((1.015, 0.0, 0.02, 1.0)), extend="min")
+    bar.set_label(label)
+    bar.outline.set_edgecolor(FRAME)
+
+
+def draw_particles(
+    ax: Axes, poses: ArrayLike, log_p: ArrayLike, *, size: float = 3.0, depth: float | None = None
+) -> PathCollection:
+    """Particles coloured by their log-likelihood, the likely ones on top.
+
+    Args:
+        ax: Where to draw.
+        poses: (N, 3) x, y and theta in the world [m, m, rad].
+        log_p: (N,) log-likelihoods, natural logarithm; -inf is drawn as the colour scale's low end.
+        size: Area of a particle [points squared].
+        depth: How far the colour scale reaches below the best [nats]; by default half of the particles lie on it.
+
+    Returns:
+        What a colour bar takes.
+    """
+    position = checks.array("poses", poses, ("N", 3))[:, :2]
+    value = checks.array("log_p", log_p, (len(position),), finite=False)
+    low, high = _scale(value, depth)
+    order = np.argsort(value, kind="stable")
+    return ax.scatter(
+        position[order, 0], position[order, 1], s=size, c=np.maximum(value[order], low), cmap=_colours(), vmin=low,
+        vmax=high, linewidths=0, rasterized=True, zorder=3,
+    )  # fmt: skip
+
+
+def pose_lattice(
+    grid: OccupancyGrid, spacing: float, theta: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool], tuple[float, float]]:
+    """Poses with one heading all over a map, in a lattice along the grid's own axes.
+
+    Args:
+        grid: The map.
+        spacing: Wanted distance between neighbours [m], > 0; it is rounded to whole cells.
+        theta: The heading of all poses in the world [rad].
+
+    Returns:
+        (R C, 3) poses row by row, (R, C) whether there is a free cell to stand on, and the lattice's extent (W, H)
+        along the grid's axes [m], for :func:`draw_pose_density`. A pose stands on the free cell that is nearest to
+        the middle of its tile.
+
+    Raises:
+        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+    """
+    step = max(round(checks.real("spacing", spacing, above=0) / grid.resolution), 1)
+    rows, cols = (-(-count // step) for count in grid.shape)
+    padded = np.zeros((rows * step, cols * step), bool)
+    padded[: grid.shape[0], : grid.shape[1]] = grid.free
+    tiles = padded.reshape(rows, step, cols, step).swapaxes(1, 2).reshape(rows, cols, step * step)
+    within = np.stack(np.divmod(np.arange(step * step), step))
+    order = np.argsort(((within - (step - 1) / 2) ** 2).sum(axis=0), kind="stable")
+    chosen = within[:, order[tiles[:, :, order].argmax(axis=2)]]
+    row, col = (np.indices((rows, cols)) * step + chosen).reshape(2, -1)
+    poses = np.column_stack([grid.cell_centers(row, col), np.full(rows * cols, checks.real("theta", theta))])
+    extent = (cols * step * grid.resolution, rows * step * grid.resolution)
+    free: NDArray[np.bool] = tiles.max(axis=2)
+    return poses, free, extent
+
+
+def draw_pose_density(
+    ax: Axes, grid: OccupancyGrid, log_p: ArrayLike, extent: tuple[float, float], *, depth: float | None = None
+) -> AxesImage:
+    """P(z | x, m) over a lattice of poses with one heading, as log-likelihood below the best.
+
+    Args:
+        ax: Where to draw, usually onto :func:`draw_map`.
+        grid: The map that gives the frame.
+        log_p: (R, C) log-likelihoods from the grid's first row and column on, natural logarithm; NaN is left blank.
+        extent: (W, H) that they cover along the grid's axes [m], as :func:`pose_lattice` says.
+        depth: How far the colour scale reaches below the best [nats]; by default half of the values lie on it.
+
+    Returns:
+        What a colour bar takes.
+    """
+    value = checks.array("log_p", log_p, ("R", "C"), finite=False)
+    low, high = _scale(value[~np.isnan(value)], depth)
+    below = np.maximum(value, low) - high
+    return _over_grid(ax, grid, below, extent, cmap=_colours(), vmin=low - high, vmax=0.0, zorder=1)
+
+
+def localization_figure(
+    grid: OccupancyGrid,
+    scanner: Scanner,
+    ranges: ArrayLike,
+    truth: ArrayLike,
+    best: ArrayLike,
+    poses: ArrayLike,
+    log_p: ArrayLike,
+    densities: Mapping[str, ArrayLike],
+    extent: tuple[float, float],
+) -> Figure:
+    """Four maps: a scan at the best pose, particles with those near the truth enlarged, and two densities.
+
+    Args:
+        grid: The map.
+        scanner: The scanner's geometry.
+        ranges: (K,) readings [m].
+        truth: (3,) the robot's true pose in the world [m, m, rad].
+        best: (3,) the pose at which the scan is drawn.
+        poses: (N, 3) particles.
+        log_p: (N,) their log-likelihoods.
+        densities: Two (R, C) log-likelihoods of :func:`pose_lattice`, by their titles.
+        extent: Of that lattice.
+    """
+    figure = new_figure(15.0, 9.8)
+    axes = figure.subplots(2, 2)
+    for ax in axes.flat:
+        draw_map(ax, grid)
+    drawn = draw_scan(axes[0, 0], grid, scanner, best, ranges)
+    axes[0, 0].set_title(f"The scan at the best particle: {drawn} ranges of {scanner.count} beams", loc="left")
+    x, y, _ = checks.array("truth", truth, (3,)).tolist()
+    zoom = axes[0, 1].inset_axes((0.735, 0.655, 0.255, 0.325))
+    draw_map(zoom, grid)
+    zoom.set(xlim=(x - 1.5, x + 1.5), ylim=(y - 1.3, y + 1.3), xticks=[], yticks=[], xlabel="", ylabel="")
+    for ax, size in ((axes[0, 1], 2.0), (zoom, 3.0)):
+        cloud = draw_particles(ax, poses, log_p, size=size)
+    axes[0, 1].indicate_inset_zoom(zoom, edgecolor=ROBOT, alpha=1.0)
+    add_colour_bar(axes[0, 1], cloud, "log P(z | x, m) [nats]")
+    axes[0, 1].set_title("The particles and their likelihood by the beam model", loc="left")
+    for ax, (title, density) in zip(axes[1], densities.items(), strict=True):
+        image = draw_pose_density(ax, grid, density, extent)
+        add_colour_bar(ax, image, "log P(z | x, m) below its maximum [nats]")
+        draw_pose(ax, (x, y, 0.0), length=0.0)
+        ax.set_title(title, loc="left")
+    return figure
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure in the format of the path's ending; the file is there whole or as it was before.
+
+    Args:
+        figure: What to write.
+        path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
+
+    Raises:
+        OSError: it cannot be written.
+        ValueError: the ending names no format.
+    """
+    target = checks.path("path", path)
+    kind = target.suffix.lower().removeprefix(".")
+    formats = figure.canvas.get_supported_filetypes()
+    if kind not in formats:
+        raise ValueError(f"path: must end in one of {', '.join('.' + name for name in formats)}, got {target}")
+    write_whole(target, lambda stream: figure.savefig(stream, format=kind))
+
+
+def _colours() -> Colormap:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("gpusense", SCALE)
+
+
+def _scale(value: NDArray[np.float64], depth: float | None) -> tuple[float, float]:
+    """The ends of a colour scale for log-likelihoods."""
+    finite = value[np.isfinite(value)]
+    if finite.size == 0:
+        return -1.0, 0.0
+    high = float(finite.max())
+    low = float(np.quantile(finite, 0.5)) if depth is None else high - checks.real("depth", depth, above=0)
+    return min(low, high - 1.0), high
+
+
+def _over_grid(
+    ax: Axes, grid: OccupancyGrid, values: NDArray[Any], extent: tuple[float, float] | None = None, **options: Any
+) -> AxesImage:
+    """An image that starts in the grid's corner and is moved and turned with its origin."""
+    from matplotlib.transforms import Affine2D
+
+    x, y, yaw = grid.origin
+    width, height = (grid.width, grid.height) if extent is None else extent
+    place: Transform = Affine2D().rotate(yaw).translate(x, y) + ax.transData
+    return ax.imshow(values, origin="lower", extent=(0.0, width, 0.0, height), transform=place, **options)

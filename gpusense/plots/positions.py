@@ -1,0 +1,213 @@
+"""Drawing: where the robot may stand, given ranges or bearings of beacons, without uncertainty and with it.
+
+The pictures of the lectures' "Distances Only" and "Bearings Only". As in ``drawing``, Matplotlib is imported when
+something is drawn, and everything is drawn onto a Matplotlib ``Axes``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, _colours, draw_pose
+from gpusense.positions.fix import PositionFix
+from gpusense.positions.problem import make_problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+Floats = NDArray[np.float64]
+
+# Root of the 95 % quantile of chi-squared with two degrees of freedom: the semi-axes of an ellipse, in sigmas.
+SIGMAS_95 = 2.4477468306808166
+# Points of a curve.
+FINE = 721
+
+
+def position_log_density(
+    points: ArrayLike,
+    xy: ArrayLike,
+    *,
+    ranges: ArrayLike | None = None,
+    bearings: ArrayLike | None = None,
+    heading: float | None = None,
+    sigma_range: ArrayLike | None = None,
+    sigma_bearing: ArrayLike | None = None,
+) -> Floats:
+    """log p(ranges, bearings | x, y): the sum over beacons of the logarithms of Gaussian densities.
+
+    Bearings without a known heading are taken with the heading that fits them best at each point (profile likelihood).
+
+    Args:
+        points: (..., 2) x and y [m].
+        xy: (M, 2) beacons [m].
+        ranges: (M,) [m], or None.
+        bearings: (M,) [rad], or None.
+        heading: The robot's heading [rad], or None.
+        sigma_range: Standard deviation of the ranges [m], one or (M,), > 0; it must be given with them.
+        sigma_bearing: Standard deviation of the bearings [rad], likewise.
+
+    Returns:
+        (...) log densities, natural logarithm.
+
+    Raises:
+        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+    """
+    places = checks.array("points", points)
+    if places.ndim < 1 or places.shape[-1] != 2:
+        raise ValueError(f"points: shape must be (..., 2), got {checks.shape_text(places.shape)}")
+    if ranges is None and bearings is None:
+        raise ValueError("ranges: must be given where bearings are not, got None")
+    for name, values, sigma in (("range", ranges, sigma_range), ("bearing", bearings, sigma_bearing)):
+        if values is not None and sigma is None:
+            raise ValueError(f"sigma_{name}: must be given with {name}s, got None")
+    problem = make_problem(
+        xy, ranges=ranges, bearings=bearings, heading=heading, sigma_range=sigma_range, sigma_bearing=sigma_bearing,
+        names=("sigma_range", "sigma_bearing"),
+    )  # fmt: skip
+    states = (places - problem.origin).reshape(-1, 2)
+    if problem.bearings is not None and heading is None:
+        offset = problem.points - (states[:, :1] + 1j * states[:, 1:])
+        share = problem.sigma_bearing**-2.0
+        facing = np.angle((share * np.exp(1j * (np.angle(offset) - problem.bearings))).sum(axis=1))
+        # The mean on the circle starts, that of the wrapped residuals ends.
+        for _ in range(2):
+            off = problem.residuals(np.column_stack([states, facing]))[:, -len(share) :]
+            facing = facing - (off @ share) / share.sum()
+        states = np.column_stack([states, facing])
+    scaled = problem.residuals(states) * problem.scales
+    norm = np.log(problem.sigmas).sum() + 0.5 * math.log(2 * math.pi) * len(problem.sigmas)
+    density: Floats = -0.5 * np.sum(scaled * scaled, axis=1) - norm
+    return density.reshape(places.shape[:-1])
+
+
+def draw_beacons(ax: Axes, xy: ArrayLike) -> None:
+    """The beacons: dark squares with their numbers, counted from 1 as P1, P2, ..."""
+    places = checks.array("xy", xy, ("M", 2))
+    ax.scatter(places[:, 0], places[:, 1], marker="s", s=42, c=OCCUPIED, edgecolors="white", linewidths=1.0, zorder=6)
+    for k, place in enumerate(places):
+        ax.annotate(
+            f"P{k + 1}", place, xytext=(6, 6), textcoords="offset points", color=OCCUPIED, fontsize=11, zorder=6
+        )
+
+
+def draw_solution_set(
+    ax: Axes,
+    xy: ArrayLike,
+    *,
+    ranges: ArrayLike | None = None,
+    bearings: ArrayLike | None = None,
+    heading: float | None = None,
+) -> int:
+    """Where each measurement, or pair of bearings, puts the robot: circles, rays or arcs; no uncertainty.
+
+    A range leaves a circle around its beacon. A bearing with a known heading leaves a ray that ends in the beacon.
+    Without a heading, the angle between two bearings leaves an arc of a circle through both beacons.
+
+    Args:
+        ax: Where to draw; its limits say how far rays are drawn, so set them first.
+        xy: (M, 2) beacons [m].
+        ranges: (M,) [m], or None.
+        bearings: (M,) [rad], or None.
+        heading: The robot's heading [rad], or None.
+
+    Returns:
+        How many curves were drawn.
+    """
+    from matplotlib.collections import LineCollection
+
+    problem = make_problem(xy, ranges=ranges, bearings=bearings, heading=heading)
+    world = problem.points + complex(*problem.origin)
+    reach = math.hypot(np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()))
+    curves: list[NDArray[np.complex128]] = []
+    if problem.ranges is not None:
+        around = np.exp(1j * np.linspace(0, 2 * np.pi, FINE))
+        curves += [m + r * around for m, r in zip(world, problem.ranges, strict=True)]
+    if problem.bearings is not None and problem.heading is not None:
+        away = np.exp(1j * (problem.bearings + problem.heading))
+        curves += [np.array([m, m - reach * u]) for m, u in zip(world, away, strict=True)]
+    elif problem.bearings is not None:
+        for i in range(len(world)):
+            for j in range(i):
+                curves.append(_arc(world[i], world[j], problem.bearings[j] - problem.bearings[i], reach))
+    lines = [np.column_stack([curve.real, curve.imag]) for curve in curves]
+    ax.add_collection(LineCollection(lines, colors=BEAM, linewidths=1.4, zorder=4), autolim=False)
+    return len(lines)
+
+
+def draw_fix(ax: Axes, fix: PositionFix, *, length: float = 0.0, ellipses: bool = True) -> None:
+    """The solutions, their headings and the ellipses that hold the position with 95 %.
+
+    Args:
+        ax: Where to draw.
+        fix: What was found; covariances that do not exist are not drawn.
+        length: Of a heading's arrow [m]; 0 draws none.
+        ellipses: Whether to draw ellipses; a small point then marks a solution instead of a ring.
+    """
+    from matplotlib.patches import Ellipse
+
+    for solution, covariance in zip(fix.solutions, fix.covariance, strict=True):
+        if not ellipses:
+            heading = solution[2] if len(solution) == 3 else 0.0
+            draw_pose(ax, (*solution[:2], heading), length=length if len(solution) == 3 else 0.0)
+            continue
+        ax.plot(*solution[:2], marker="o", markersize=5, color=ROBOT, markeredgecolor="white", zorder=7)
+        if np.isfinite(covariance).all():
+            values, axes = np.linalg.eigh(covariance[:2, :2])
+            width, height = 2 * SIGMAS_95 * np.sqrt(np.maximum(values, 0.0))
+            angle = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
+            at = (solution[0], solution[1])
+            ax.add_patch(Ellipse(at, width, height, angle=angle, fill=False, color="white", linewidth=1.6, zorder=5))
+
+
+def draw_position_density(
+    ax: Axes, log_p: ArrayLike, extent: tuple[float, float, float, float], *, depth: float = 12.0
+) -> AxesImage:
+    """A log density over x and y, below its maximum.
+
+    Args:
+        ax: Where to draw.
+        log_p: (R, C) log densities at the middles of equal tiles, row 0 at the least y.
+        extent: x_min, x_max, y_min, y_max that the tiles cover [m].
+        depth: How far the colour scale reaches below the maximum [nats], > 0.
+
+    Returns:
+        What a colour bar takes.
+    """
+    value = checks.array("log_p", log_p, ("R", "C"))
+    below = np.maximum(value - value.max(initial=-np.inf), -checks.real("depth", depth, above=0))
+    return ax.imshow(below, origin="lower", extent=extent, cmap=_colours(), vmin=-depth, vmax=0.0, zorder=0)
+
+
+def tile_centers(extent: tuple[float, float, float, float], count: int) -> Floats:
+    """(R, C, 2) middles of square tiles over an extent, ``count`` of them along its longer side."""
+    x_min, x_max, y_min, y_max = extent
+    side = max(x_max - x_min, y_max - y_min) / count
+    cols, rows = max(round((x_max - x_min) / side), 1), max(round((y_max - y_min) / side), 1)
+    x = x_min + (np.arange(cols) + 0.5) * (x_max - x_min) / cols
+    y = y_min + (np.arange(rows) + 0.5) * (y_max - y_min) / rows
+    return np.stack(np.meshgrid(x, y), axis=-1)
+
+
+def set_view(ax: Axes, extent: tuple[float, float, float, float], title: str) -> None:
+    """Limits, equal scales, names of the axes and a title."""
+    ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    ax.set_title(title, loc="left")
+    ax.spines[:].set_color(FRAME)
+    ax.tick_params(color=FRAME)
+
+
+def _arc(first: complex, second: complex, angle: float, reach: float) -> NDArray[np.complex128]:
+    """Points p with second - p = k exp(i angle) (first - p) for k > 0: they see ``second`` turned from ``first``."""
+    # k = tan(t / 2) is 0 at the second beacon and infinite at the first one.
+    t = np.linspace(0, np.pi, FINE)
+    turn = np.exp(1j * angle)
+    low, high = np.cos(t / 2), np.sin(t / 2) * turn
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = first + (second - first) * low / (low - high)
+    return np.where(np.abs(points - first) <= 4 * reach, points, complex(np.nan, np.nan))

@@ -1,0 +1,1 @@
+"""Plain data about the world: maps, scanners, parameters, frames; no device."""

@@ -1,0 +1,102 @@
+"""Maps of landmarks (features), and the square buckets in which kernels look for those that are near."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.world.frames import split
+
+# Sides of buckets are powers of two, so that scaling by them is exact; none is smaller than this.
+_SMALLEST_SIDE = -6
+# Landmarks for each bucket, on average over the map's rectangle.
+_EACH = 2
+
+
+class LandmarkMap:
+    """Landmarks in the plane, each with a signature where they can be told apart by one.
+
+    A signature is a number: an average colour, a height, or an id. *Probabilistic Robotics* section 6.6.
+
+    Args:
+        xy: (M, 2) positions in the world [m]; M may be 0.
+        signatures: None, or (M,) numbers.
+
+    Attributes:
+        xy: (M, 2) float64, read-only.
+        signatures: (M,) float64, read-only, or None.
+
+    Raises:
+        TypeError: not real numbers.
+        ValueError: another shape, or a value that is not finite.
+    """
+
+    def __init__(self, xy: object, signatures: object = None) -> None:
+        given = checks.as_array("xy", xy)
+        self.xy = np.zeros((0, 2)) if given.shape == (0,) else checks.array("xy", given, ("M", 2)).copy()
+        self.xy.flags.writeable = False
+        self.signatures: np.ndarray | None = None
+        if signatures is not None:
+            self.signatures = checks.array("signatures", signatures, (len(self.xy),)).copy()
+            self.signatures.flags.writeable = False
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def __repr__(self) -> str:
+        return f"LandmarkMap({len(self)} landmarks{'' if self.signatures is None else ' with signatures'})"
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """Landmarks in square buckets, row by row, in the order of the map within each.
+
+    Attributes:
+        origin: (x, y, 0) of the first bucket's corner in the world; poses are placed as in a grid of such cells.
+        resolution: Side of a bucket [m], a power of two.
+        shape: Rows and columns of buckets.
+        start: (rows * columns + 1,) int32 place of the first landmark of each bucket.
+        index: (M,) int32 index in the map of the landmark at each place.
+        place_of: (M,) int32 its inverse.
+        position: (M, 2) float64 positions relative to the origin, by place.
+    """
+
+    origin: tuple[float, float, float]
+    resolution: float
+    shape: tuple[int, int]
+    start: np.ndarray
+    index: np.ndarray
+    place_of: np.ndarray
+    position: np.ndarray
+
+    def table(self, real: np.dtype) -> np.ndarray:
+        """(M, 4) x, y and what rounding took from them, in a precision."""
+        high, low = split(self.position, real)
+        return np.concatenate([high, low], axis=1)
+
+
+def make_buckets(landmarks: LandmarkMap) -> Buckets:
+    """Sort landmarks into buckets of about two."""
+    xy, count = landmarks.xy, len(landmarks)
+    low, high = (xy.min(axis=0), xy.max(axis=0)) if count else (np.zeros(2), np.zeros(2))
+    most = max(count // _EACH, 1)
+    with np.errstate(over="ignore"):
+        size = high - low
+    if not np.isfinite(size).all():
+        raise ValueError(f"xy: must span a finite distance, got {checks.show(low)} to {checks.show(high)}")
+    power = max(math.ceil(math.log2(max(size.max(), 2.0**_SMALLEST_SIDE))), _SMALLEST_SIDE)
+    while power > _SMALLEST_SIDE and np.prod(np.floor(size / 2.0 ** (power - 1)) + 1) <= most:
+        power -= 1
+    side = 2.0**power
+    position = xy - low
+    cell = np.floor(position / side).astype(np.int64)
+    cols, rows = (int(n) for n in np.floor(size / side) + 1)
+    bucket = cell[:, 1] * cols + cell[:, 0]
+    index = np.argsort(bucket, kind="stable").astype(np.int32)
+    place_of = np.empty_like(index)
+    place_of[index] = np.arange(count, dtype=np.int32)
+    start = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=rows * cols))]).astype(np.int32)
+    return Buckets((float(low[0]), float(low[1]), 0.0), side, (rows, cols), start, index, place_of, position[index])

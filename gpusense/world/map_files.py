@@ -1,0 +1,224 @@
+"""Maps as ROS map_server writes them: a YAML file beside a PGM, PNG or BMP image."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense._util.files import read_mapping
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.images import open_raster
+
+
+@dataclass(frozen=True)
+class _MapYaml:
+    image: Path
+    resolution: float
+    origin: ArrayLike
+    negate: bool
+    occupied_thresh: float
+    free_thresh: float
+    mode: str
+
+
+def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> OccupancyGrid:
+    """Read a map in the format of ROS map_server.
+
+    The values follow nav2_map_server. With v the mean of the colour channels as a fraction of white, the
+    occupancy is p = 1 - v, or v with ``negate``. Modes ``trinary`` (the default) and ``scale``: p >=
+    ``occupied_thresh`` is 100, p <= ``free_thresh`` is 0; between them trinary is unknown and scale is
+    ``round(100 (p - free_thresh) / (occupied_thresh - free_thresh))``; a pixel that is not opaque is unknown.
+    Mode ``raw``: round(255 v), unknown where that exceeds 100. The image's bottom row is ``cells[0]``.
+
+    The image is told by its content: PGM (P2, P5; 8 or 16 bits), PPM (P3, P6), PNG (1 to 16 bits; grey,
+    palette or colour, with or without alpha) or uncompressed BMP. A 16-bit value is a fraction of its own
+    maximum, except in a PNG with colours or alpha, of which the upper 8 bits are used. Nothing is allocated
+    on the word of a header alone: the file must hold the pixels that its header claims, and at most 2^31.
+
+    Args:
+        path: the YAML file; its ``image`` is relative to its folder.
+        occupied_threshold: passed on to :class:`OccupancyGrid` [per cent].
+
+    Raises:
+        FileNotFoundError: the YAML file or its image is missing.
+        TypeError: ``path`` or ``occupied_threshold`` is not of the kind described.
+        ValueError: a file breaks the format; the message names the file and the rule.
+    """
+    meta = _read_yaml(checks.existing_file(checks.path("path", path)))
+    size = meta.image.stat().st_size
+    with meta.image.open("rb") as stream:
+        raster = open_raster(stream, meta.image, size)
+        table = _cell_table(meta, raster.white)
+        cells = np.empty((raster.rows, raster.cols), np.int8)
+        end = raster.rows
+        for shade, opaque in raster.strips:
+            block = table[shade]
+            if opaque is not None and meta.mode != "raw":
+                block[~opaque] = -1
+            cells[end - len(block) : end] = block[::-1]
+            end -= len(block)
+    return OccupancyGrid(cells, meta.resolution, meta.origin, occupied_threshold=occupied_threshold)
+
+
+def write_map(
+    grid: OccupancyGrid, path: str | os.PathLike[str], *, image_format: Literal["pgm", "png"] = "pgm"
+) -> None:
+    """Write a map for ROS map_server, whole or not at all.
+
+    The image has the YAML file's name with the suffix of its format. A grid of 0, 100 and unknown is written
+    in mode ``trinary`` with map_saver's greys (254, 0 and 205, ``free_thresh`` 0.196); any other in mode
+    ``raw`` with 255 for unknown. :func:`read_map` gives equal cells, resolution and origin back. The grid's
+    ``occupied_threshold`` is no part of the format.
+
+    Args:
+        grid: the map.
+        path: the YAML file, ending in .yaml or .yml. It and its image are replaced if they exist.
+        image_format: ``"pgm"`` or ``"png"``.
+
+    Raises:
+        FileNotFoundError: the folder is missing.
+        TypeError: an argument is not of the kind described.
+        ValueError: ``path`` has another suffix or is a folder, or ``image_format`` is unknown.
+        OSError: the files cannot be written; those of before are then still there.
+    """
+    import yaml
+
+    if not isinstance(grid, OccupancyGrid):
+        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+    target = checks.path("path", path)
+    if target.suffix.lower() not in (".yaml", ".yml"):
+        raise ValueError(f"path: must end in .yaml or .yml, got {target}")
+    checks.choice("image_format", image_format, ("pgm", "png"))
+    image = target.with_suffix(f".{image_format}")
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"path: must lie in a folder that exists, got {target}")
+    for file in (target, image):
+        if file.is_dir():
+            raise ValueError(f"path: must not name a folder, got {file}")
+
+    cells = grid.cells
+    trinary = sum(np.count_nonzero(cells == value) for value in (0, 100, -1)) == cells.size
+    greys = bytearray([*range(101), *[255] * 155])  # by the cell's byte; that of unknown, -1, is 255
+    if trinary:
+        greys[0], greys[100], greys[255] = 254, 0, 205
+    pixels = cells[::-1].tobytes().translate(greys)
+    meta = {
+        "image": image.name,
+        "mode": "trinary" if trinary else "raw",
+        "resolution": grid.resolution,
+        "origin": list(grid.origin),
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+    }
+    text = yaml.safe_dump(meta, sort_keys=False, default_flow_style=None, allow_unicode=True)
+    writers: dict[Path, Callable[[BinaryIO], object]] = {
+        image: lambda stream: _write_image(stream, pixels, grid.shape, image_format),
+        target: lambda stream: stream.write(text.encode()),
+    }
+    _write_all(writers)
+
+
+def _write_image(stream: BinaryIO, pixels: bytes, shape: tuple[int, int], image_format: str) -> None:
+    size = shape[::-1]
+    if image_format == "png":
+        from PIL import Image
+
+        Image.frombytes("L", size, pixels).save(stream, "PNG")
+    else:
+        stream.write(b"P5\n%d %d\n255\n" % size)
+        stream.write(pixels)
+
+
+def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
+    """Write files so that either all are replaced or, whatever happens, all are as before."""
+    tag = secrets.token_hex(4)
+    fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
+    kept = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
+    existed = {target: target.exists() for target in writers}
+    try:
+        for target, write in writers.items():
+            with fresh[target].open("xb") as stream:
+                write(stream)
+        for target in writers:
+            if existed[target]:
+                os.replace(target, kept[target])
+            os.replace(fresh[target], target)
+    except BaseException:
+        for target in writers:
+            if kept[target].exists():
+                os.replace(kept[target], target)
+            elif not existed[target]:
+                target.unlink(missing_ok=True)
+        raise
+    else:
+        for file in kept.values():
+            file.unlink(missing_ok=True)
+    finally:
+        for file in fresh.values():
+            file.unlink(missing_ok=True)
+
+
+def _read_yaml(file: Path) -> _MapYaml:
+    data = read_mapping(file)
+    for key in ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"):
+        if key not in data:
+            raise ValueError(f"{file}: must have the key {key!r}, got {checks.show(list(data))}")
+
+    image, origin, negate, mode = data["image"], data["origin"], data["negate"], data.get("mode", "trinary")
+    if not isinstance(image, str) or not image or "\0" in image:
+        raise ValueError(f"{file}: image: must be a file name, got {checks.show(image)}")
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise ValueError(f"{file}: origin: must be a list of x, y and yaw, got {checks.show(origin)}")
+    if negate not in (0, 1) or isinstance(negate, float):
+        raise ValueError(f"{file}: negate: must be 0 or 1, got {checks.show(negate)}")
+    if not isinstance(mode, str) or mode.lower() not in ("trinary", "scale", "raw"):
+        raise ValueError(f"{file}: mode: must be 'trinary', 'scale' or 'raw', got {checks.show(mode)}")
+    free = _number(file, "free_thresh", data["free_thresh"], low=0, high=1)
+    occupied = _number(file, "occupied_thresh", data["occupied_thresh"], low=0, high=1)
+    if free >= occupied:
+        raise ValueError(f"{file}: occupied_thresh: must be > free_thresh = {free}, got {occupied}")
+    return _MapYaml(
+        image=checks.existing_file(file.parent / image),
+        resolution=_number(file, "resolution", data["resolution"], above=0),
+        origin=[_number(file, f"origin[{i}]", value) for i, value in enumerate(origin)],
+        negate=bool(negate),
+        occupied_thresh=occupied,
+        free_thresh=free,
+        mode=mode.lower(),
+    )
+
+
+def _number(file: Path, key: str, value: object, **limits: float) -> float:
+    # 5e-2 is a number to YAML 1.2 and to map_server, but a string to YAML 1.1 and to PyYAML.
+    if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", value):
+        value = float(value)
+    try:
+        return checks.real(f"{file}: {key}", value, **limits)
+    except TypeError as error:
+        raise ValueError(str(error)) from None
+
+
+def _cell_table(meta: _MapYaml, white: int) -> NDArray[np.int8]:
+    """The cell for every sum of channels from 0 to ``white``, by nav2's rules in float64."""
+    shade = np.arange(white + 1, dtype=np.float64)
+    if meta.mode == "raw":
+        value = np.floor(shade * 255 / white + 0.5)
+        return np.where(value <= 100, value, -1).astype(np.int8)
+    p = (shade if meta.negate else white - shade) / white
+    cells = np.full(p.shape, -1.0)
+    if meta.mode == "scale":
+        ratio = (p - meta.free_thresh) / (meta.occupied_thresh - meta.free_thresh)
+        cells = np.floor(100 * ratio + 0.5)
+    cells[p >= meta.occupied_thresh] = 100
+    cells[p <= meta.free_thresh] = 0
+    return cells.astype(np.int8)

@@ -1,0 +1,234 @@
+"""The intrinsic parameters of the measurement models: frozen, validated dataclasses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
+from typing import Any, ClassVar, Literal, Self
+
+from gpusense._util import checks
+
+_WEIGHT_SUM_TOLERANCE = 1e-6
+
+
+class _Parameters:
+    """What the parameter classes share."""
+
+    _sum_is_one: ClassVar[bool] = True
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields by name, as plain numbers and strings."""
+        return asdict(self)  # type: ignore[call-overload]
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The parameters that :meth:`to_dict` wrote; a field that is left out takes its default.
+
+        Raises:
+            TypeError: ``values`` is not a mapping, or a value is not of its field's kind.
+            ValueError: a key names no field, or a value breaks its field's rule.
+        """
+        if not isinstance(values, Mapping):
+            raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
+        names = [field.name for field in fields(cls)]  # type: ignore[arg-type]
+        for key in values:
+            if key not in names:
+                rule = f"every field must be one of {', '.join(names)}"
+                raise ValueError(f"{cls.__name__}: {rule}, got {checks.show(key)}")
+        return cls(**values)
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed.
+
+        Raises:
+            TypeError: a value is not of its field's kind.
+            ValueError: a name is no field's, or the result breaks a rule.
+        """
+        return self.from_dict({**self.to_dict(), **changes})
+
+    def _check(self, name: str, **limits: float) -> None:
+        """Hold one field to its limits and store it as a float."""
+        object.__setattr__(self, name, checks.real(name, getattr(self, name), **limits))
+
+    def _check_weights(self, *names: str) -> None:
+        for name in names:
+            self._check(name, low=0)
+        total = math.fsum(getattr(self, name) for name in names)
+        if self._sum_is_one and abs(total - 1.0) > _WEIGHT_SUM_TOLERANCE:
+            rule = f"must be 1 within {_WEIGHT_SUM_TOLERANCE:.0e}"
+            raise ValueError(f"{' + '.join(names)}: {rule}, got {total}")
+
+
+@dataclass(frozen=True)
+class BeamParameters(_Parameters):
+    """The beam model's parameters, *Probabilistic Robotics* section 6.3.
+
+    Raises:
+        TypeError: a value is not a real number.
+        ValueError: a value breaks its field's rule, or the four weights do not sum to 1 within 1e-6.
+    """
+
+    z_hit: float = 0.7
+    """The weight of a correct range with local noise, >= 0 [1] (6.3.1, item 1)."""
+    z_short: float = 0.1
+    """The weight of an unexpected, nearer object, >= 0 [1] (6.3.1, item 2)."""
+    z_max: float = 0.1
+    """The weight of no return, >= 0 [1] (6.3.1, item 3)."""
+    z_rand: float = 0.1
+    """The weight of a random reading, >= 0 [1] (6.3.1, item 4)."""
+    sigma_hit: float = 0.05
+    """The standard deviation of a correct range, > 0 [m] (equation 6.4)."""
+    lambda_short: float = 0.2
+    """The rate of unexpected objects along the beam, >= 0 [1/m] (equation 6.6)."""
+
+    def __post_init__(self) -> None:
+        self._check_weights("z_hit", "z_short", "z_max", "z_rand")
+        self._check("sigma_hit", above=0)
+        self._check("lambda_short", low=0)
+
+
+@dataclass(frozen=True)
+class IncidenceParameters:
+    """The beam model's parameters for each range of angles of incidence.
+
+    The angle of incidence lies between a beam and the normal of the surface it hits: 0 is head-on, pi / 2 grazing.
+
+    Raises:
+        TypeError: a value is not of its field's kind.
+        ValueError: the edges do not rise from 0 to pi / 2, or there is not one set of parameters for each bin.
+    """
+
+    edges: tuple[float, ...]
+    """(B + 1,) bounds of the bins, rising from 0 to pi / 2 [rad]."""
+    parameters: tuple[BeamParameters, ...]
+    """(B,) the parameters of each bin."""
+    no_surface: BeamParameters | None = None
+    """Those of beams that hit nothing, or nothing that returns; None for those of the first bin."""
+
+    def __post_init__(self) -> None:
+        edges = tuple(float(edge) for edge in checks.array("edges", self.edges, ("B + 1",)))
+        if len(edges) < 2 or edges[0] != 0 or abs(edges[-1] - math.pi / 2) > 1e-9:
+            raise ValueError(f"edges: must rise from 0 to pi / 2, got {checks.show(self.edges)}")
+        if any(low >= high for low, high in pairwise(edges)):
+            raise ValueError(f"edges: must rise from 0 to pi / 2, got {checks.show(self.edges)}")
+        parameters = tuple(self.parameters)
+        for each in parameters:
+            if not isinstance(each, BeamParameters):
+                raise TypeError(f"parameters: must be BeamParameters, got {checks.show(each)}")
+        if len(parameters) != len(edges) - 1:
+            raise ValueError(f"parameters: must be one for each of {len(edges) - 1} bins, got {len(parameters)}")
+        if self.no_surface is not None and not isinstance(self.no_surface, BeamParameters):
+            raise TypeError(f"no_surface: must be BeamParameters or None, got {checks.show(self.no_surface)}")
+        object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "parameters", parameters)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields by name, as plain numbers."""
+        return {
+            "edges": list(self.edges),
+            "parameters": [each.to_dict() for each in self.parameters],
+            "no_surface": None if self.no_surface is None else self.no_surface.to_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The parameters that :meth:`to_dict` wrote.
+
+        Raises:
+            TypeError: ``values`` is not a mapping, or a value is not of its field's kind.
+            ValueError: a key is missing or names no field, or a value breaks its field's rule.
+        """
+        if not isinstance(values, Mapping):
+            raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
+        if not {"edges", "parameters"} <= set(values) <= {"edges", "parameters", "no_surface"}:
+            rule = "must have the fields edges and parameters, and may have no_surface"
+            raise ValueError(f"{cls.__name__}: {rule}, got {sorted(values)}")
+        own, nothing = values["parameters"], values.get("no_surface")
+        if not isinstance(own, (list, tuple)):
+            raise TypeError(f"parameters: must be a list, got {checks.show(own)}")
+        return cls(
+            values["edges"],
+            tuple(BeamParameters.from_dict(each) for each in own),
+            None if nothing is None else BeamParameters.from_dict(nothing),
+        )
+
+
+@dataclass(frozen=True)
+class LikelihoodFieldParameters(_Parameters):
+    """The likelihood field's parameters, *Probabilistic Robotics* section 6.4.
+
+    Raises:
+        TypeError: a value is not of its field's kind.
+        ValueError: a value breaks its field's rule, or the three weights do not sum to 1 within 1e-6.
+    """
+
+    z_hit: float = 0.9
+    """The weight of a correct range with local noise, >= 0 [1] (6.4.1)."""
+    z_max: float = 0.0
+    """The weight of no return, >= 0 [1]; 0 leaves such readings out, as the book does (6.4.1)."""
+    z_rand: float = 0.1
+    """The weight of a random reading, >= 0 [1] (6.4.1)."""
+    sigma_hit: float = 0.2
+    """The standard deviation of an end point's distance to the nearest obstacle, > 0 [m] (table 6.3)."""
+    max_distance: float = 2.0
+    """The distance to the nearest obstacle is capped at this, > 0 [m]."""
+    interpolation: Literal["nearest", "bilinear"] = "nearest"
+    """How the distance is read between cell centres: that of the end point's cell, or bilinear."""
+
+    def __post_init__(self) -> None:
+        self._check_weights("z_hit", "z_max", "z_rand")
+        self._check("sigma_hit", above=0)
+        self._check("max_distance", above=0)
+        checks.choice("interpolation", self.interpolation, ("nearest", "bilinear"))
+
+
+@dataclass(frozen=True)
+class LandmarkParameters(_Parameters):
+    """The landmark model's parameters, *Probabilistic Robotics* section 6.6.
+
+    A deviation of None leaves that part of every feature out.
+
+    Raises:
+        TypeError: a value is not of its field's kind.
+        ValueError: a value breaks its field's rule, the two weights do not sum to 1 within 1e-6, or all deviations are
+            None.
+    """
+
+    sigma_range: float | None = 0.2
+    """The standard deviation of a range, > 0 [m] (equation 6.40)."""
+    sigma_bearing: float | None = 0.05
+    """The standard deviation of a bearing, > 0 [rad] (equation 6.40)."""
+    sigma_signature: float | None = None
+    """The standard deviation of a signature, > 0, in its own unit (equation 6.40)."""
+    z_detect: float = 0.95
+    """The weight of a feature that is a landmark, >= 0 [1]."""
+    z_false: float = 0.05
+    """The weight of a feature that is none, a false positive, >= 0 [1]."""
+    range_max: float = 20.0
+    """The largest range of a feature, > 0 [m]."""
+    field_of_view: float = 2 * math.pi
+    """The angle in which features are seen, half to each side of the sensor's axis, in (0, 2 pi] [rad]."""
+    signature_span: tuple[float, float] | None = None
+    """The smallest and largest signature of a feature; None for 4 deviations more than the map's own span."""
+    p_detect: float = 0.9
+    """The probability that a landmark in view is seen, in [0, 1] [1]; used for negative information only."""
+
+    def __post_init__(self) -> None:
+        names = ("sigma_range", "sigma_bearing", "sigma_signature")
+        for name in names:
+            if getattr(self, name) is not None:
+                self._check(name, above=0)
+        if all(getattr(self, name) is None for name in names):
+            raise ValueError(f"{' + '.join(names)}: must not all be None, got None")
+        self._check_weights("z_detect", "z_false")
+        self._check("range_max", above=0)
+        self._check("field_of_view", above=0, high=2 * math.pi)
+        self._check("p_detect", low=0, high=1)
+        if self.signature_span is not None:
+            low, high = (float(end) for end in checks.array("signature_span", self.signature_span, (2,)))
+            if not low < high:
+                rule = "must be two rising numbers"
+                raise ValueError(f"signature_span: {rule}, got {checks.show(self.signature_span)}")
+            object.__setattr__(self, "signature_span", (low, high))

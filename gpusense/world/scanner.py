@@ -1,0 +1,241 @@
+"""The range scanner's geometry, and what a reading of it says."""
+
+from __future__ import annotations
+
+import enum
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+
+
+class Reading(enum.IntEnum):
+    """The class of a reading, as :func:`classify` returns it."""
+
+    MISSING = 0
+    """No information: the beam is left out."""
+    MAX = 1
+    """No return within the scanner's range (REP-117)."""
+    HIT = 2
+    """A range [m]."""
+
+
+class Scanner:
+    """The immutable geometry of a planar range scanner; equal and hashed by value.
+
+    A sonar is a scanner whose beams are cones: its expected range is the nearest return among ``cone_rays`` rays that
+    are spread evenly over the cone's width, both edges included. Smooth walls are mirrors to sound: with
+    ``critical_incidence`` a ray that meets a wall at a larger angle of incidence (see ``RayCaster.incidence``) has no
+    return. Only beam models know cones; a likelihood field, which asks where a reading ends, takes each cone's axis.
+
+    Args:
+        bearings: (K,) beam directions in the scanner's frame, counter-clockwise from its x axis [rad]; K may
+            be 0. Copied.
+        range_max: readings of at least this are "no return" [m], > 0.
+        range_min: readings below this are no information [m], at least 0 and less than ``range_max``. When it
+            is greater than 0, a reading of 0 is no information either.
+        mount: (x, y, theta) of the scanner in the robot's frame [m, m, rad].
+        cone: full width of each beam [rad], 0 (a laser) to 2 pi.
+        cone_rays: rays that a cone is made of, 1 (its axis) to 1024; a laser has one.
+        critical_incidence: largest angle of incidence that returns [rad], above 0 and at most pi / 2; None for all.
+
+    Raises:
+        TypeError: an argument is not of the kind described.
+        ValueError: a shape or a value breaks the rules above.
+    """
+
+    __slots__ = ("_bearings", "_cone", "_cone_rays", "_critical", "_hash", "_mount", "_range_max", "_range_min")
+
+    def __init__(
+        self,
+        bearings: ArrayLike,
+        range_max: float,
+        range_min: float = 0.0,
+        mount: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        cone: float = 0.0,
+        cone_rays: int = 9,
+        critical_incidence: float | None = None,
+    ) -> None:
+        own: NDArray[np.float64] = np.array(checks.array("bearings", bearings, ("K",)))
+        own.setflags(write=False)
+        self._bearings = own
+        self._range_max = checks.real("range_max", range_max, above=0)
+        self._range_min = checks.real("range_min", range_min, low=0)
+        if self._range_min >= self._range_max:
+            raise ValueError(f"range_min: must be < range_max = {self._range_max}, got {self._range_min}")
+        x, y, theta = checks.array("mount", mount, (3,)).tolist()
+        self._mount: tuple[float, float, float] = (x, y, theta)
+        self._cone = checks.real("cone", cone, low=0, high=2 * math.pi)
+        rays = checks.integer("cone_rays", cone_rays, low=1, high=1024)
+        self._cone_rays = rays if self._cone > 0 else 1
+        self._critical = critical_incidence
+        if critical_incidence is not None:
+            self._critical = checks.real("critical_incidence", critical_incidence, above=0, high=math.pi / 2)
+        # Adding 0.0 makes -0.0 and 0.0, which are equal, hash alike.
+        self._hash = hash(((own + 0.0).tobytes(), *self._scalars()))
+
+    @classmethod
+    def uniform(
+        cls,
+        *,
+        angle_min: float,
+        angle_increment: float,
+        count: int,
+        range_max: float,
+        range_min: float = 0.0,
+        mount: ArrayLike = (0.0, 0.0, 0.0),
+        cone: float = 0.0,
+        cone_rays: int = 9,
+        critical_incidence: float | None = None,
+    ) -> Scanner:
+        """A scanner of evenly spaced beams, as ``sensor_msgs/LaserScan`` describes it.
+
+        Args:
+            angle_min: the bearing of beam 0 [rad].
+            angle_increment: from one beam to the next, positive counter-clockwise [rad]; beam k has the
+                bearing ``angle_min + k * angle_increment``.
+            count: the number of beams K, 0 to 2^31 - 1.
+            range_max: as for the class [m].
+            range_min: as for the class [m].
+            mount: as for the class [m, m, rad].
+            cone: as for the class [rad].
+            cone_rays: as for the class.
+            critical_incidence: as for the class [rad].
+
+        Raises:
+            TypeError: an argument is not of the kind described.
+            ValueError: a value breaks the rules above.
+        """
+        first = checks.real("angle_min", angle_min)
+        step = checks.real("angle_increment", angle_increment)
+        beams = checks.integer("count", count, low=0, high=2**31 - 1)
+        if not math.isfinite(first + step * beams):
+            raise ValueError(f"angle_increment: must keep every bearing finite, got {step}")
+        return cls(
+            first + step * np.arange(beams), range_max, range_min, mount, cone=cone, cone_rays=cone_rays,
+            critical_incidence=critical_incidence,
+        )  # fmt: skip
+
+    @property
+    def bearings(self) -> NDArray[np.float64]:
+        """(K,) beam directions in the scanner's frame [rad]; read-only."""
+        return self._bearings
+
+    @property
+    def count(self) -> int:
+        """The number of beams K."""
+        return self._bearings.size
+
+    @property
+    def range_max(self) -> float:
+        """Readings of at least this are "no return" [m]."""
+        return self._range_max
+
+    @property
+    def range_min(self) -> float:
+        """Readings below this are no information [m]."""
+        return self._range_min
+
+    @property
+    def mount(self) -> tuple[float, float, float]:
+        """(x, y, theta) of the scanner in the robot's frame [m, m, rad]."""
+        return self._mount
+
+    @property
+    def cone(self) -> float:
+        """Full width of each beam [rad]; 0 for a laser."""
+        return self._cone
+
+    @property
+    def cone_rays(self) -> int:
+        """Rays that a beam is made of; 1 for a laser."""
+        return self._cone_rays
+
+    @property
+    def critical_incidence(self) -> float | None:
+        """Largest angle of incidence that returns [rad]; None for all."""
+        return self._critical
+
+    @property
+    def ray_bearings(self) -> NDArray[np.float64]:
+        """(K, cone_rays) directions of the rays of each beam in the scanner's frame [rad]; a single one is the axis."""
+        between = self._cone / max(self._cone_rays - 1, 1)
+        return self._bearings[:, None] + (np.arange(self._cone_rays) - (self._cone_rays - 1) / 2) * between
+
+    def _scalars(self) -> tuple[Any, ...]:
+        return self._range_max, self._range_min, self._mount, self._cone, self._cone_rays, self._critical
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scanner):
+            return NotImplemented
+        return self._scalars() == other._scalars() and np.array_equal(self._bearings, other._bearings)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __repr__(self) -> str:
+        sonar = f", cone={self._cone}, cone_rays={self._cone_rays}" if self._cone > 0 else ""
+        sonar += "" if self._critical is None else f", critical_incidence={self._critical}"
+        return (
+            f"Scanner({self.count} beams, range_max={self._range_max}, range_min={self._range_min}, "
+            f"mount={self._mount}{sonar})"
+        )
+
+    def __reduce__(self) -> tuple[Callable[..., Scanner], tuple[Any, ...]]:
+        # Copies and pickles go through the constructor, so that their bearings are read-only too.
+        sonar = functools.partial(
+            Scanner, cone=self._cone, cone_rays=self._cone_rays, critical_incidence=self._critical
+        )
+        return sonar, (self._bearings, self._range_max, self._range_min, self._mount)
+
+
+def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
+    """Class every reading of a scan, or of several scans, as a :class:`Reading`.
+
+    ======================================================  ===========
+    reading z                                               class
+    ======================================================  ===========
+    NaN, -inf, z < 0, z < range_min (0 if range_min > 0)    ``MISSING``
+    +inf, z >= range_max                                    ``MAX``
+    else                                                    ``HIT``
+    ======================================================  ===========
+
+    The limits are rounded to the readings' own floating dtype before they are compared, so that a scanner's
+    ``range_max`` stored as float32 is recognised. Integers become float64. Source: REP-117 and the message
+    definition of ``sensor_msgs/LaserScan``.
+
+    Args:
+        ranges: (K,) or (S, K) readings of any value [m].
+        scanner: the scanner they come from.
+
+    Returns:
+        uint8 of the same shape.
+
+    Raises:
+        TypeError: ``ranges`` does not hold real numbers, or ``scanner`` is no :class:`Scanner`.
+        ValueError: the shape is neither (K,) nor (S, K).
+    """
+    if not isinstance(scanner, Scanner):
+        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+    z = checks.array("ranges", ranges, finite=False, dtype=None)
+    if z.ndim not in (1, 2) or z.shape[-1] != scanner.count:
+        rule = f"shape must be ({scanner.count},) or (S, {scanner.count})"
+        raise ValueError(f"ranges: {rule}, got {checks.shape_text(z.shape)}")
+    return classes(z, scanner.range_min, scanner.range_max)
+
+
+def classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:
+    """:func:`classify` for readings of any shape between two ranges."""
+    with np.errstate(over="ignore"):  # a range_max beyond float16 is infinite there
+        nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
+    too_near = (z < nearest) | (z <= 0) if range_min > 0 else z < 0
+    kinds = np.full(z.shape, Reading.HIT, dtype=np.uint8)
+    kinds[z >= farthest] = Reading.MAX
+    kinds[too_near | np.isnan(z)] = Reading.MISSING
+    return kinds

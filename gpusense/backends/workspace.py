@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer, Recording
+from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.launches import Program, flags_of
 
-# Recordings that are kept.
+# Programs that are kept.
 _MOST_KEPT = 64
 # Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
 _ALIGNED = 64
@@ -19,15 +20,16 @@ POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
 class Workspace:
-    """Named buffers that only grow, and recordings of the programs that use them."""
+    """Named buffers that only grow, and programs that use them."""
 
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that copies under way read or write.
         self._busy: list[np.ndarray] = []
-        # Recordings and the flags of their programs, by everything that the programs depend on.
-        self._recordings: dict[Hashable, tuple[Recording, frozenset[str]]] = {}
+        # Programs of earlier calls or their recordings, with their flags, by everything on which they depend.
+        self._programs: dict[Hashable, tuple[Any, frozenset[str]]] = {}
+        self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
 
     def __enter__(self) -> Workspace:
@@ -52,31 +54,45 @@ class Workspace:
         """Let the device begin with the work of the call so far."""
         self._backend.start()
 
-    def run(self, key: Hashable, buffers: Iterable[Buffer], program: Callable[[], Program]) -> frozenset[str]:
-        """Run a program of this workspace's buffers; a gathered call repeats the recording of an equal one.
+    def run(
+        self, key: Hashable, buffers: Iterable[Buffer], make: Callable[[], Program], *, version: int, lasting: bool
+    ) -> frozenset[str]:
+        """Run a program of this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
 
         Args:
             key: All sizes, numbers and flags on which the program depends.
             buffers: Its buffers that are not of this workspace.
-            program: Makes it.
+            make: Makes the program.
+            version: Of the map's table: programs of other versions are dropped.
+            lasting: Whether these buffers stay for later calls.
 
         Returns:
             The flags of its launches.
         """
         backend = self._backend
-        if not (backend.info.graphs and backend.gathers):
-            made = program()
-            backend.run(made)
-            return flags_of(made)
-        key = (key, *[backend.address(buffer) for buffer in buffers])
-        known = self._recordings.get(key)
-        if known is None:
-            made = program()
-            if len(self._recordings) >= _MOST_KEPT:
-                del self._recordings[next(iter(self._recordings))]
-            known = self._recordings[key] = (backend.record(made), flags_of(made))
-        backend.replay(known[0])
-        return known[1]
+        records = backend.info.graphs and backend.gathers
+        if version != self._version:
+            self._version = version
+            self._programs.clear()
+        if not (records or lasting):
+            program = make()
+            backend.run(program)
+            return flags_of(program)
+        key = (records, key, *[backend.address(buffer) for buffer in buffers])
+        kept = self._programs.get(key)
+        if kept is None:
+            program = make()
+            # A recording keeps no buffer alive; addresses of buffers are in its key.
+            work: Any = backend.record(program) if records else program
+            kept = work, flags_of(program)
+            if len(self._programs) >= _MOST_KEPT:
+                del self._programs[next(iter(self._programs))]
+            self._programs[key] = kept
+        if records:
+            backend.replay(kept[0])
+        else:
+            backend.run(kept[0])
+        return kept[1]
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost.
@@ -165,8 +181,8 @@ class Workspace:
         self._busy.clear()
 
     def _forget(self) -> None:
-        """Forget recordings and parts: a buffer of theirs is replaced."""
-        self._recordings.clear()
+        """Forget programs and parts: a buffer of theirs is replaced."""
+        self._programs.clear()
         self._parts.clear()
 
     def release(self, keep: str = "") -> None:

@@ -123,7 +123,10 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
     Raises:
         ValueError: a device pose that was placed in it was not finite.
     """
-    finish_all([(space, on_device)], name)
+    if on_device:
+        finish_all([(space, True)], name)
+    else:
+        space.wait()
 
 
 def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") -> None:

@@ -17,7 +17,7 @@ from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import Mixture
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
-from gpusense.models.scan.tiles import Parts, all_within, stranded, sum_launch, tiles_of
+from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
 from gpusense.reference.error_free import BLOCK_TERMS, strands_in
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import ray_vectors
@@ -120,21 +120,28 @@ class BeamPipeline(ScanPipeline):
         """See ScanPipeline.spread."""
         return tiles_of(particles, readings.rays)[1]
 
-    def flags(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None, *, per_beam: bool) -> frozenset[str]:
-        """See ScanPipeline.flags."""
-        flags = self._fixed_flags | self.caster.flags | self.cones.flags | placed.headings | readings.flags
-        flags |= _NO_FLAGS if self.specialize and all_within(placed, 0) else {"ORIGINS_OUTSIDE"}
+    def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        """See ScanPipeline.conditions."""
+        inside = self.specialize and all_within(placed, 0)
+        flags = self.caster.flags if inside else self.caster.flags | {"ORIGINS_OUTSIDE"}
         if tiles is None:
-            return widened(self.backend.info.lanes, "score_beams", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
+            return flags
         flags |= {"ORDERED"} if tiles.order is not None else _NO_FLAGS
-        strands = "SHARED_RAYS" not in flags and stranded(readings.rays, tiles.spread)
+        strands = "SHARED_RAYS" not in readings.flags and stranded(readings.rays, tiles.spread)
         return flags | {"STRANDED"} if strands else flags
 
-    def layout(self, readings: Readings, flags: frozenset[str]) -> Parts:
+    def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
+        """See ScanPipeline.flags."""
+        flags = self._fixed_flags | self.cones.flags | conditions
+        if tiled:
+            return flags
+        return widened(self.backend.info.lanes, "score_beams", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
+
+    def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""
         if "STRANDED" in flags:
-            return Parts(int(strands_in(readings.readings)), 1)
-        return Parts(readings.readings, BLOCK_TERMS)
+            return int(strands_in(readings.readings)), 1
+        return readings.readings, BLOCK_TERMS
 
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""

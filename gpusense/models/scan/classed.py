@@ -104,15 +104,15 @@ class ClassedScans:
         """Whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
 
-    @property
+    @functools.cached_property
     def most_readings(self) -> int:
         """Readings of the scan that has most."""
-        return int(self.counts.max(initial=0))
+        return int(np.maximum.reduce(self.counts))
 
-    @property
+    @functools.cached_property
     def most_rays(self) -> int:
         """Rays of the scan that has most."""
-        return int(self.ray_counts.max(initial=0))
+        return self.most_readings if self.ray_counts is self.counts else int(np.maximum.reduce(self.ray_counts))
 
     def part(self, begin: int, end: int) -> ClassedScans:
         """Return scans ``begin`` to ``end`` - 1."""
@@ -280,27 +280,28 @@ def _with_ranges(
         kinds: (K,) classes of the last scan's readings where beams are chosen, else None.
     """
     beams, z_max = rules.scanner.count, rules.z_max
-    columns, counts = hit.nonzero()[1], np.count_nonzero(hit, axis=1)
+    columns, counts = hit.nonzero()[1], np.add.reduce(hit, axis=1)
     constants = np.zeros(len(ranges))
     ignored = constant_max = _NONE
     if len(columns) < ranges.size:
         last = far[-1].nonzero()[0]
         constant_max, ignored = (last, ignored) if z_max > 0 else (ignored, last)
         if z_max > 0:
-            far_counts = np.count_nonzero(far, axis=1)
+            far_counts = np.add.reduce(far, axis=1)
             # No max readings add 0, not -0.
             constants = np.where(far_counts > 0, far_counts * np.log(z_max), 0.0)
         values, vectors = ranges[hit].astype(np.float64), rules.vectors[columns]
     else:
-        # A scan without gaps needs no choice.
-        values, vectors = ranges.reshape(-1).astype(np.float64), rules.vectors[columns]
+        # Scans without gaps need no choice.
+        values = ranges.reshape(-1).astype(np.float64)
+        vectors = rules.vectors if len(ranges) == 1 else rules.vectors[columns]
+    kept = int(counts[-1]) + len(constant_max)
     if kinds is None:
-        missing, thinned = beams - int(counts[-1]) - len(ignored) - len(constant_max), 0
-        ignored_max = len(ignored)
+        missing, ignored_max, thinned = beams - kept - len(ignored), len(ignored), 0
     else:
         missing = int(np.count_nonzero(kinds == Reading.MISSING))
         ignored_max = 0 if z_max > 0 else int(np.count_nonzero(kinds == Reading.MAX))
-        thinned = beams - missing - ignored_max - int(counts[-1]) - len(constant_max)
+        thinned = beams - missing - ignored_max - kept
     first = np.arange(len(columns) + 1, dtype=np.int32)
     left_out = LeftOut(missing, ignored_max, constant_max, thinned)
     return ClassedScans(columns, values, vectors, vectors, first, counts, counts, constants, left_out)

@@ -123,7 +123,5 @@ class LikelihoodFieldModel(ScanModel):
         omissions += launch_omissions(self._last.flags)
         if (far := pipeline.map.omission(pipeline.real.itemsize)) is not None:
             omissions.append(far)
-        title = (
-            f"likelihood field{self._weights_note()}, {self.precision}"
-        )
+        title = f"likelihood field{self._weights_note()}, {self.precision}"
         return str(self._plan(title, omissions))

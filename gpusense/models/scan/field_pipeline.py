@@ -15,7 +15,7 @@ from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
-from gpusense.models.scan.tiles import ENOUGH_SHORT, Parts, all_within, spread_of, sum_launch
+from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
@@ -27,6 +27,7 @@ from gpusense.world.parameters import LikelihoodFieldParameters
 _GROUP = 64
 # In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.
 _GUARD = 3.25
+_NO_FLAGS, _INSIDE = frozenset[str](), frozenset({"INSIDE"})
 
 
 class FieldPipeline(ScanPipeline):
@@ -167,19 +168,22 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.spread."""
         return spread_of(particles, -(-readings.readings // BLOCK_TERMS), ENOUGH_SHORT)
 
-    def flags(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None, *, per_beam: bool) -> frozenset[str]:
+    def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        """See ScanPipeline.conditions."""
+        inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
+        return _INSIDE if inside else _NO_FLAGS
+
+    def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """See ScanPipeline.flags."""
-        flags = self.components | readings.flags | placed.headings
-        if tiles is not None:
-            quick = {"QUICK"} if self.quick else frozenset[str]()
-            quick |= {"INSIDE"} if quick and all_within(placed, readings.reach, RING) else set()
-            return flags | quick
-        flags = widened(self.backend.info.lanes, "score_field", flags | ({"PER_BEAM"} if per_beam else set()))
+        flags = self.components | conditions
+        if tiled:
+            return flags | ({"QUICK"} if self.quick else _NO_FLAGS)
+        flags = widened(self.backend.info.lanes, "score_field", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
         return flags | {"QUICK"} if self.quick and self.backend.info.vector_loops else flags
 
-    def layout(self, readings: Readings, flags: frozenset[str]) -> Parts:
+    def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""
-        return Parts(readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1)
+        return readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1
 
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""

@@ -8,7 +8,7 @@ memory of the device, is the only loop.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,13 +104,18 @@ class LastCall:
 
     Attributes:
         flags: Flags of its launches.
-        scan: The readings of its last scan; None before there is a call.
+        scans: The readings of its last scans; None before there is a call.
         together: Scans that shared launches.
     """
 
     flags: frozenset[str] = frozenset()
-    scan: ClassedScans | None = None
+    scans: ClassedScans | None = None
     together: int = 0
+
+    @property
+    def scan(self) -> ClassedScans | None:
+        """The readings of its last scan."""
+        return None if self.scans is None else self.scans.part(self.scans.scans - 1, self.scans.scans)
 
 
 class ScanPipeline(ABC):
@@ -135,6 +140,8 @@ class ScanPipeline(ABC):
         self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
+        # Flags by everything on which they depend.
+        self._flags: dict[Hashable, frozenset[str]] = {}
 
     # ---- what a model adds
 
@@ -160,12 +167,16 @@ class ScanPipeline(ABC):
         """Return log2 of the number of parts into which the work of a tile is split."""
 
     @abstractmethod
-    def flags(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None, *, per_beam: bool) -> frozenset[str]:
+    def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        """Return the flags of the scoring kernel that depend on the poses and on their number."""
+
+    @abstractmethod
+    def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """Return the flags of the scoring kernel."""
 
     @abstractmethod
-    def layout(self, readings: Readings, flags: frozenset[str]) -> Parts:
-        """Return how many numbers of what kind each particle's sum adds."""
+    def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
+        """Return how many numbers each particle's sum adds, and in blocks of how many; see ``Parts``."""
 
     @abstractmethod
     def score_launches(self, scoring: Scoring) -> Program:
@@ -186,10 +197,11 @@ class ScanPipeline(ABC):
 
     def _shares_launches(self, request: Request) -> bool:
         """Return whether several scans may be scored by one program."""
+        if request.scans < 2 or request.per_beam or not self.setting.possible:
+            return False
         rays = max(self.scanner.count * self.rays_each, 1)
         most = min(TOGETHER[self.backend.info.kind] // rays, self.chunk(rays))
-        together = request.scans > 1 and self.setting.possible and not request.per_beam
-        return together and request.per_scan <= most
+        return request.per_scan <= most
 
     def chunk(self, rays: int, *, per_beam: bool = False) -> int:
         """Return the particles of one launch with a number of rays each."""
@@ -233,10 +245,15 @@ class ScanPipeline(ABC):
         if self.backend.info.kind == "gpu" and not per_beam:
             order = order_of(space, placed, readings.rays, self.real) if ordered and self.orders else None
             tiles = Tiles(self.spread(placed.count, readings), order)
-        flags = self.flags(readings, placed, tiles, per_beam=per_beam)
-        parts = self.layout(readings, flags)
-        numbers = placed.count * parts.count if tiles or per_beam else 1
-        parts = Parts(parts.count, parts.block, space.empty("parts", numbers, self.real))
+        conditions = self.conditions(readings, placed, tiles)
+        key = conditions, readings.flags, placed.flags, tiles is None, per_beam
+        flags = self._flags.get(key)
+        if flags is None:
+            everything = conditions | readings.flags | placed.headings
+            flags = self._flags[key] = self.flags(everything, tiled=tiles is not None, per_beam=per_beam)
+        count, block = self.layout(readings, flags)
+        numbers = placed.count * count if tiles or per_beam else 1
+        parts = Parts(count, block, space.empty("parts", numbers, self.real))
         return Scoring(readings, placed, table, parts, log_p, flags, tiles)
 
     def program(self, scoring: Scoring) -> Program:
@@ -252,7 +269,7 @@ class ScanPipeline(ABC):
         """Start everything that a request needs; parts are complete on return."""
         last.together = 0
         for particles, scans in self.groups(request):
-            last.scan = scans.part(scans.scans - 1, scans.scans)
+            last.scans = scans
             most = self.chunk(scans.most_readings * self.rays_each, per_beam=request.per_beam)
             run_pieces(space, particles, most, _Scorer(self, request, particles, scans, space, last))
             if request.scans > 1:
@@ -286,9 +303,12 @@ class _Scorer:
         placed, table = pipeline.place(request.poses, piece.part, space)
         with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
-            key = (scoring.flags, placed.key, readings.key, pipeline.map.version)
-            flags = space.run(key, (placed.source, log_p, table), lambda: pipeline.program(scoring))
-        self._last.flags = flags | placed.headings
+            key = (scoring.flags, placed.key, readings.key)
+            flags = space.run(
+                key, (placed.source, log_p, table), lambda: pipeline.program(scoring), version=pipeline.map.version,
+                lasting=not request.poses.on_device,
+            )  # fmt: skip
+        self._last.flags = flags
         if readings.scans > 1:
             self._last.together = max(self._last.together, readings.scans)
         if request.per_beam:
@@ -303,7 +323,7 @@ class _Scorer:
         if request.poses.on_device:
             frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
             placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
-            space.run(("inspect", placed.key), (placed.source,), placed.launches)
+            pipeline.backend.run(placed.launches())
             with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
                 pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
         else:

@@ -7,7 +7,7 @@ import types
 
 import numpy as np
 import pytest
-from array_libraries import CUDA, Array, OldArray, Recorded, installed
+from support.array_libraries import CUDA, Array, OldArray, Recorded, installed
 
 import gpusense as gs
 from gpusense.backends import arrays, get_backend

@@ -15,10 +15,10 @@ import sys
 import time
 from pathlib import Path
 
-import fake_driver
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support import fake_driver
 
 from gpusense.backends import BackendInfo, cache, scratch
 from gpusense.backends.cache import ProgramCache, load_entry, pack, store_entry, unpack, write_files

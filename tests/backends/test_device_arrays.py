@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 
 import numpy as np
 import pytest
-from array_libraries import Array, counted_copies, installed
-from conftest import skip_or_fail
+from support.array_libraries import Array, to_device
+from support.frameworks import each_framework, framework
 
 import gpusense as gs
-from gpusense.backends import arrays, get_backend
+from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
@@ -25,26 +24,6 @@ SCAN = RNG.uniform(0, 5.5, BEAMS)
 METHODS = ("log_likelihood", "field", "expected_ranges", "cast")
 
 
-@pytest.fixture
-def device(needs, monkeypatch):
-    """Warp's processor as a GPU that holds Warp's arrays and those of ``fakelib`` in its own memory."""
-    needs("warp")
-    import warp as wp
-
-    installed(monkeypatch)
-    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
-    found = get_backend("warp:cpu")
-    monkeypatch.setattr(found, "info", dataclasses.replace(found.info, kind="gpu", lanes=1))
-    return found
-
-
-def to_device(array: np.ndarray):
-    import warp as wp
-
-    dtype = {"float32": wp.float32, "float64": wp.float64}.get(array.dtype.name, wp.int32)
-    return wp.array(array, dtype=dtype, device="cpu")
-
-
 def call_of(method: str, backend, scan=SCAN):
     """What takes poses and out=, and the shape of its result."""
     if method == "cast":
@@ -56,45 +35,35 @@ def call_of(method: str, backend, scan=SCAN):
     return lambda poses, **options: model.log_likelihood(poses, scan, **options), (COUNT,)
 
 
-@pytest.fixture
-def copies(monkeypatch):
-    """Sizes of what goes to the device and comes back, by the names of buffers."""
-    import warp  # noqa: F401
-
-    from gpusense.backends.warp.backend import WarpBackend
-
-    return counted_copies(monkeypatch, WarpBackend)
-
-
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("method", METHODS)
-def test_poses_on_the_device_stay_there(method, real, device, copies):
-    call, shape = call_of(method, device)
+def test_poses_on_the_device_stay_there(method, real, warp_as_gpu, warp_copies):
+    call, shape = call_of(method, warp_as_gpu)
     poses = POSES.astype(real)
     expected = call(poses)
     for given in (to_device(poses), Array(to_device(poses))):
         call(given)
-        copies.clear()
+        warp_copies.clear()
         found = call(given)
         held = found.held if isinstance(given, Array) else found
         assert type(found) is type(given) and tuple(held.shape) == shape
         assert differing(held.numpy(), expected) == 0
         # Rays and readings go there, and two numbers that tell whether all is finite come back.
-        assert all(size <= 16 * BEAMS for _, size in copies)
-        assert [size for way, size in copies if way == "down"] == [8]
+        assert all(size <= 16 * BEAMS for _, size in warp_copies)
+        assert [size for way, size in warp_copies if way == "down"] == [8]
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_out_on_the_device(method, device, copies):
-    call, shape = call_of(method, device)
+def test_out_on_the_device(method, warp_as_gpu, warp_copies):
+    call, shape = call_of(method, warp_as_gpu)
     expected, poses = call(POSES), to_device(POSES)
     for wrap in (lambda array: array, Array):
         room = to_device(np.full(shape, 7, np.float32))
         out, address = wrap(room), room.ptr
-        copies.clear()
+        warp_copies.clear()
         assert call(wrap(poses), out=out) is out
         assert room.ptr == address and differing(room.numpy(), expected) == 0
-        assert all(size <= 16 * BEAMS or size == 4 * 8192 for way, size in copies)
+        assert all(size <= 16 * BEAMS or size == 4 * 8192 for way, size in warp_copies)
 
 
 @pytest.mark.parametrize("selection", ["opencl", "warp"])
@@ -112,8 +81,8 @@ def test_copies_on_the_device(selection, needs):
 
 
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_batches_on_the_device(kind, device):
-    model = kind(GRID, SCANNER, backend=device)
+def test_batches_on_the_device(kind, warp_as_gpu):
+    model = kind(GRID, SCANNER, backend=warp_as_gpu)
     several, scans = np.stack([POSES, POSES + 0.1]), np.stack([SCAN, np.full(BEAMS, np.nan)])
     expected, expected_parts = model.log_likelihood(several, scans, per_beam=True)
     given, out = to_device(several), to_device(np.zeros((2, COUNT), np.float32))
@@ -126,20 +95,20 @@ def test_batches_on_the_device(kind, device):
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_scans_that_share_launches_on_the_device(kind, real, device, copies):
-    model = kind(GRID, SCANNER, backend=device)
+def test_scans_that_share_launches_on_the_device(kind, real, warp_as_gpu, warp_copies):
+    model = kind(GRID, SCANNER, backend=warp_as_gpu)
     several = np.stack([POSES + 0.1 * i for i in range(5)]).astype(real)
     scans = np.stack([SCAN, SCAN[::-1], np.full(BEAMS, np.nan), np.roll(SCAN, 3), np.where(SCAN < 2, np.inf, SCAN)])
     expected = np.stack([model.log_likelihood(own, scan) for own, scan in zip(several, scans, strict=True)])
     out = to_device(np.zeros((5, COUNT), np.float32))
     for given in (to_device(several), Array(to_device(several))):
-        copies.clear()
+        warp_copies.clear()
         found = model.log_likelihood(given, scans)
         assert type(found) is type(given) and model._together == 2
         assert differing((found.held if isinstance(found, Array) else found).numpy(), expected) == 0
         # Poses stay there; the scan without readings is filled in.
-        assert all(size <= 5 * 16 * BEAMS for way, size in copies) and ("up", 24 * COUNT) not in copies
-        assert [size for way, size in copies if way == "down"] == [8]
+        assert all(size <= 5 * 16 * BEAMS for way, size in warp_copies) and ("up", 24 * COUNT) not in warp_copies
+        assert [size for way, size in warp_copies if way == "down"] == [8]
         assert model.log_likelihood(given, scans, out=out) is out and differing(out.numpy(), expected) == 0
     for scan, place in ((2, 5), (3, 7), (4, COUNT - 1)):
         bad = several.copy()
@@ -157,8 +126,8 @@ def test_scans_that_share_launches_on_the_device(kind, real, device, copies):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_in_pieces_on_the_device(method, device, monkeypatch):
-    call, _ = call_of(method, device)
+def test_in_pieces_on_the_device(method, warp_as_gpu, monkeypatch):
+    call, _ = call_of(method, warp_as_gpu)
     expected = call(POSES)
     monkeypatch.setattr(chunks, "CHUNK", 77)
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
@@ -166,9 +135,9 @@ def test_in_pieces_on_the_device(method, device, monkeypatch):
 
 @pytest.mark.parametrize("count", [COUNT, 0])
 @pytest.mark.parametrize("where", [to_device, np.array], ids=["device", "host"])
-def test_no_array_of_a_call_is_kept(where, count, device):
+def test_no_array_of_a_call_is_kept(where, count, warp_as_gpu):
     """A scan's arrays must live until the device has read them, and no longer: filters call for hours."""
-    model, caster = gs.BeamModel(GRID, SCANNER, backend=device), gs.RayCaster(GRID, RANGE, backend=device)
+    model, caster = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu), gs.RayCaster(GRID, RANGE, backend=warp_as_gpu)
     for scan in (SCAN, np.full(BEAMS, np.nan)):
         model.log_likelihood(where(POSES[:count]), scan)
         caster.cast(where(POSES[:count]), SCANNER.bearings)
@@ -176,19 +145,19 @@ def test_no_array_of_a_call_is_kept(where, count, device):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_no_particles_on_the_device(method, device):
-    call, shape = call_of(method, device)
+def test_no_particles_on_the_device(method, warp_as_gpu):
+    call, shape = call_of(method, warp_as_gpu)
     assert tuple(call(to_device(np.empty((0, 3)))).shape) == (0, *shape[1:])
 
 
 @pytest.mark.parametrize("scan", [SCAN, np.full(BEAMS, np.nan)], ids=["readings", "no reading"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_pose_on_the_device_that_is_not_finite(value, scan, device):
+def test_a_pose_on_the_device_that_is_not_finite(value, scan, warp_as_gpu):
     message = "^poses: must be finite, got a pose on the device that is not$"
     for method in METHODS:
         if method in ("expected_ranges", "cast") and scan is not SCAN:
             continue
-        call, _ = call_of(method, device, scan)
+        call, _ = call_of(method, warp_as_gpu, scan)
         bad = POSES.copy()
         bad[17, 1] = value
         expected = call(POSES)
@@ -198,9 +167,9 @@ def test_a_pose_on_the_device_that_is_not_finite(value, scan, device):
         assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
-def test_a_pose_that_is_not_finite_is_told_after_memory_ran_out(device, monkeypatch):
+def test_a_pose_that_is_not_finite_is_told_after_memory_ran_out(warp_as_gpu, monkeypatch):
     """The first piece has it; the second is tried again in halves."""
-    model = gs.BeamModel(GRID, SCANNER, backend=device)
+    model = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu)
     poses = np.tile(POSES, (4, 1))
     model.log_likelihood(to_device(poses), SCAN)
     poses[3, 0] = np.nan
@@ -230,9 +199,9 @@ ON_DEVICE_WRONG = {
 
 @pytest.mark.parametrize("name", ON_DEVICE_WRONG)
 @pytest.mark.parametrize("method", METHODS)
-def test_poses_on_the_device_that_cannot_be_used(method, name, device):
+def test_poses_on_the_device_that_cannot_be_used(method, name, warp_as_gpu):
     make, error, message = ON_DEVICE_WRONG[name]
-    call, _ = call_of(method, device)
+    call, _ = call_of(method, warp_as_gpu)
     with pytest.raises(error, match="^" + re.escape(message)):
         call(make())
 
@@ -249,9 +218,9 @@ OUT_WRONG = {
 
 @pytest.mark.parametrize("name", OUT_WRONG)
 @pytest.mark.parametrize("method", METHODS)
-def test_out_on_the_device_that_cannot_be_written(method, name, device):
+def test_out_on_the_device_that_cannot_be_written(method, name, warp_as_gpu):
     make, error, message = OUT_WRONG[name]
-    call, shape = call_of(method, device)
+    call, shape = call_of(method, warp_as_gpu)
     with pytest.raises(error, match="^" + re.escape(message)):
         call(to_device(POSES), out=make(shape))
 
@@ -259,30 +228,11 @@ def test_out_on_the_device_that_cannot_be_written(method, name, device):
 # ---- frameworks on a real GPU
 
 
-def framework(name: str, needs):
-    """A GPU's backend, and what makes an array there, what copies one back, and where it lies."""
-    module = pytest.importorskip(name)
-    cuda = next((d.selection for d in gs.devices() if d.available and d.selection.startswith("warp:cuda")), None)
-    if cuda is None:
-        skip_or_fail("cuda", "there is no CUDA device")
-    if name == "torch":
-        return (cuda, lambda array: module.from_numpy(array.copy()).to(cuda.removeprefix("warp:")),
-                lambda array: array.cpu().numpy(), lambda array: array.data_ptr())  # fmt: skip
-    if name == "cupy":
-        return cuda, module.asarray, module.asnumpy, lambda array: array.data.ptr
-    module.config.update("jax_enable_x64", True)
-    return (cuda, lambda array: module.device_put(array, module.devices("gpu")[0]), np.asarray,
-            lambda array: array.unsafe_buffer_pointer())  # fmt: skip
-
-
-each_framework = pytest.mark.parametrize("name", ["torch", "cupy", "jax"])
-
-
 @each_framework
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("method", METHODS)
-def test_frameworks(method, real, name, needs):
-    cuda, there, back, _ = framework(name, needs)
+def test_frameworks(method, real, name):
+    cuda, there, back, _ = framework(name)
     call, shape = call_of(method, cuda)
     poses = POSES.astype(real)
     given = there(poses)
@@ -300,7 +250,7 @@ def test_frameworks(method, real, name, needs):
 @pytest.mark.parametrize("name", ["torch", "cupy"])
 @pytest.mark.parametrize("method", METHODS)
 def test_frameworks_that_may_be_written(method, name, needs):
-    cuda, there, back, address = framework(name, needs)
+    cuda, there, back, address = framework(name)
     call, shape = call_of(method, cuda)
     out = there(np.full(shape, 7, np.float32))
     place = address(out)

@@ -11,8 +11,8 @@ import textwrap
 import time
 from pathlib import Path
 
-import fake_driver
 import pytest
+from support import fake_driver
 
 import gpusense as gs
 from gpusense.backends import BackendInfo, child, proof

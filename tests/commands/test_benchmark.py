@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from bench_world import ERRORS, TIMES, made_report
+from support.bench_world import ERRORS, TIMES, made_report
 
 from gpusense.commands import cli
 from gpusense.evaluation.benchmark import candidates, report, scenes

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, error_of, script
+from support.command_line import SMALL, error_of, script
 
 import gpusense
 from gpusense.commands import cli, devices

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import SMALL, error_of, script
+from support.command_line import SMALL, error_of, script
+from support.paths import ROOT
 
 from gpusense.commands import cli, demo
 
 # What a model in float32 may differ from the float64 reference on 60 beams at most [nats], on its own rounded inputs.
 DEMO_TOLERANCE = 1e-2
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_demo_numbers_agree(backend, capsys):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import gzip
 import json
 
-import landmark_log as world
 import numpy as np
 import pytest
-from command_line import error_of
+from support import landmark_log as world
+from support.command_line import error_of
 
 import gpusense as gs
 from gpusense.commands.cli import main

@@ -6,14 +6,14 @@ import functools
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import mpmath as mp
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from oracles import Mixture
+from support.oracles import Mixture
+from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -22,7 +22,7 @@ from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.models.scan.densities import log_mixture
 
 PRECISIONS = ("float32", "float64")
-PAGE = Path(__file__).parents[1] / "docs" / "numerics.md"
+PAGE = ROOT / "docs" / "numerics.md"
 # eps (1 + |log p|); processors and NVIDIA's GPUs are far better in float64 than the tolerance, which is for any driver.
 BOUND = {"float32": 16, "float64": 16}
 

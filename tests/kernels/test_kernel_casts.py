@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS, SECTORS, adversarial_poses, each_grid, ranges_on_both, scene_flags
+from support.kernel_scenes import PRECISIONS, SECTORS, adversarial_poses, each_grid, ranges_on_both, scene_flags
 
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing

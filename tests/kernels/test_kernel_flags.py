@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS, scene_flags
+from support.kernel_scenes import PRECISIONS, scene_flags
 
 from gpusense.backends import get_backend
 from gpusense.interface.kernel_files import warp_module

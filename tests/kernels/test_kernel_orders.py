@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS, scene_flags
+from support.kernel_scenes import PRECISIONS, scene_flags
 
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.order import ALL_BINS, STRETCH

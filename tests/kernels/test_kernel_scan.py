@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS, on_both, scene_flags
+from support.kernel_scenes import PRECISIONS, on_both, scene_flags
 
 import gpusense as gs
 from gpusense.backends import Backend

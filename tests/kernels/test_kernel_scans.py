@@ -6,9 +6,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kernel_scenes import EXACT, LASER, LIMIT, RESOLUTION, assert_near, nothing, on_both, planes_of, scene_flags
-from test_kernel_scores import field_scene, mixture, scan
-from test_kernel_tiles import OCCUPIED, RANGE, an_order, guards_of, items, poses, rays_of, room_for, strides
+from support.kernel_scenes import EXACT, LASER, LIMIT, RESOLUTION, assert_near, nothing, on_both, planes_of, scene_flags
+from support.score_scenes import (
+    OCCUPIED,
+    RANGE,
+    an_order,
+    field_scene,
+    guards_of,
+    items,
+    mixture,
+    poses,
+    rays_of,
+    room_for,
+    scan,
+    strides,
+)
 
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan

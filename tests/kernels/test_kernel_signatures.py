@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS
+from support.kernel_scenes import PRECISIONS
 
 from gpusense.interface.kernel_files import kernel_root, opencl_source, warp_module
 from gpusense.interface.signatures import KERNELS, Argument

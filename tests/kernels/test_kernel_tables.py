@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kernel_scenes import (
+from support.kernel_scenes import (
     GRIDS,
     PRECISIONS,
     SECTORS,

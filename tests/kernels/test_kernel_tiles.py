@@ -7,18 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kernel_scenes import (
+from support.kernel_scenes import (
     EXACT,
-    GRIDS,
     LASER,
     LIMIT,
     ONE_SCAN,
     PRECISIONS,
     RESOLUTION,
     SECTORS,
-    adversarial_poses,
     assert_near,
-    directions,
     nothing,
     on_both,
     planes_of,
@@ -26,58 +23,35 @@ from kernel_scenes import (
     scene_flags,
     sector_flags,
 )
-from test_kernel_scores import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mixture, scan
+from support.score_scenes import (
+    FIELD_SCENES,
+    FIELDS,
+    MIXTURES,
+    NOWHERE,
+    OCCUPIED,
+    RANGE,
+    an_order,
+    field_scene,
+    guards_of,
+    items,
+    mixture,
+    parts_at,
+    poses,
+    rays_of,
+    room_for,
+    scan,
+    strides,
+)
 
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.tolerances import differing, per_beam
-from gpusense.models.scan.field import _GUARD
 from gpusense.reference.error_free import BLOCK_TERMS, strand_sums, strands_in
-from gpusense.reference.tiles import TILE, TILE_PARTICLES
+from gpusense.reference.tiles import TILE
 
 SPREADS = range(6)
 COUNTS = (1, 15, 16, 17, 777)
 RAYS = (1, 3, 4, 5, 53)
 WAYS = ("particles", "readings", "gaps")
-OCCUPIED = GRIDS["rooms"]
-RANGE = LIMIT * RESOLUTION
-# Where scans begin, which is not read where there is one.
-NOWHERE = np.zeros(1, np.int32)
-
-
-def items(count: int, spread: int, group: int = TILE_PARTICLES, each: int = TILE) -> tuple[int]:
-    """The size of a launch whose groups have so many particles and work-items each."""
-    return ((-(-count // group) << spread) * each,)
-
-
-def poses(count: int, real: type) -> tuple[np.ndarray, np.ndarray]:
-    cell, pose = adversarial_poses(OCCUPIED, real, outside=True)
-    some = np.resize(np.arange(len(cell)), count)
-    return cell[some], pose[some]
-
-
-def rays_of(count: int, real: type) -> np.ndarray:
-    return np.resize(directions(real), (count, 2))
-
-
-def an_order(count: int) -> np.ndarray:
-    return np.random.default_rng(count).permutation(count).astype(np.int32)
-
-
-def strides(count: int, each: int, way: str) -> tuple[int, int]:
-    """(across, along): parts of a particle, or of a reading, lie together; or with gaps between them."""
-    return {"particles": (1, count), "readings": (each, 1), "gaps": (2 * each + 3, 2)}[way]
-
-
-def parts_at(parts: np.ndarray, count: int, each: int, way: str) -> np.ndarray:
-    across, along = strides(count, each, way)
-    return parts[np.arange(count)[:, None] * across + np.arange(each) * along]
-
-
-def room_for(count: int, each: int, way: str, real: type) -> np.ndarray:
-    across, along = strides(count, each, way)
-    return np.full(max(count * across + each * along, 1), -77, real)
-
-
 # ---- ranges
 
 
@@ -226,13 +200,6 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 
 
 # ---- the likelihood field
-
-
-def guards_of(point: np.ndarray) -> np.ndarray:
-    """How near to an edge an end point of each block of readings may be."""
-    length = np.where(np.isfinite(point[:, 0]), np.hypot(*point.T), 0.0)
-    longest = np.maximum.reduceat(length, np.arange(0, len(point), BLOCK_TERMS))
-    return (_GUARD * np.finfo(point.dtype).eps * (longest + 2)).astype(point.dtype)
 
 
 def field_blocks(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from pathlib import Path
 from types import ModuleType
 
 import mpmath as mp
 import numpy as np
 import pytest
 from scipy import special
+from support.paths import ROOT
 
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.interface.kernel_files import opencl_source
@@ -106,7 +106,7 @@ def test_ends(evaluate):
 
 def derived() -> ModuleType:
     """bench/lane_constants.py."""
-    path = Path(__file__).parents[1] / "bench" / "lane_constants.py"
+    path = ROOT / "bench" / "lane_constants.py"
     spec = importlib.util.spec_from_file_location("lane_constants", path)
     module = importlib.util.module_from_spec(spec)
     digits = mp.mp.dps

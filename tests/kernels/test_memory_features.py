@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from test_memory import check, run
+from support.checkers import check, run
 
 _WORK = """
 import dataclasses

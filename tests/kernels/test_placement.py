@@ -8,7 +8,6 @@ import importlib.util
 import itertools
 import math
 import re
-from pathlib import Path
 from types import ModuleType
 
 import mpmath as mp
@@ -16,7 +15,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import placed
+from support.oracles import placed
+from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
@@ -90,7 +90,7 @@ def test_no_heading_leaves_the_circle():
 
 def derived() -> ModuleType:
     """bench/heading_constants.py."""
-    path = Path(__file__).parents[1] / "bench" / "heading_constants.py"
+    path = ROOT / "bench" / "heading_constants.py"
     spec = importlib.util.spec_from_file_location("heading_constants", path)
     module = importlib.util.module_from_spec(spec)
     digits = mp.mp.dps

@@ -8,8 +8,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from ray_oracles import backward_error_is_small, walk
-from raycast_scenes import (
+from support.ray_oracles import backward_error_is_small, walk
+from support.raycast_scenes import (
     FLOAT32_CELLS,
     FLOAT64_RELATIVE,
     FLOAT64_TURN,

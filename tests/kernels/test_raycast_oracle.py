@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ray_oracles import backward_error_is_small, fraction_walk
-from raycast_scenes import (
+from support.ray_oracles import backward_error_is_small, fraction_walk
+from support.raycast_scenes import (
     FAMILIES,
     FLOAT32_CELLS,
     FLOAT32_MOVE,

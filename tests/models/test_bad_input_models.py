@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bad_input_models import CASES, CASTER, FIELD, GRID, MODEL, POSE, SCAN
+from support.bad_input_models import CASES, CASTER, FIELD, GRID, MODEL, POSE, SCAN
 
 import gpusense as gs
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import runpy
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
+from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.plots import drawing as plots
 from gpusense.plots import positions as position_plots
 
-ROOT = Path(__file__).resolve().parents[1]
 XY = np.array([(1.0, 1.0), (8.0, 2.0), (4.5, 7.0)]) + np.array([5e5, -3e5])
 POSE = np.array([4.0 + 5e5, 3.5 - 3e5, 2.9])
 OFFSET = XY - POSE[:2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from bad_input_positions import CASES
+from support.bad_input_positions import CASES
 
 
 @pytest.mark.parametrize(("action", "kind", "message"), [case[1:] for case in CASES], ids=[c[0] for c in CASES])

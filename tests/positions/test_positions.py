@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from position_scenes import CASES, POSE, XY
 from scipy.optimize import least_squares
+from support.position_scenes import CASES, POSE, XY
 
 import gpusense as gs
 from gpusense.positions.problem import LOSSES

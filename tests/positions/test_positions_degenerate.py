@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from position_scenes import CASES
+from support.position_scenes import CASES
 
 import gpusense as gs
 from gpusense.positions.fix import STATUSES

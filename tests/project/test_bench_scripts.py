@@ -14,10 +14,11 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from support.paths import ROOT
 
 from gpusense.backends import get_backend
 
-BENCH = Path(__file__).parent.parent / "bench"
+BENCH = ROOT / "bench"
 
 
 def run_script(name: str, *arguments: str, output: Path) -> dict:

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from support.paths import ROOT
 
 import gpusense
 from gpusense.interface.kernel_files import opencl_source
 
-ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("bench", "docs", "examples", "gpusense", "kernels", "tests")
 
 needs_warp = pytest.mark.skipif(find_spec("warp") is None, reason="Warp has no wheel for this platform")

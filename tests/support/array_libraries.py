@@ -29,6 +29,13 @@ def counted_copies(monkeypatch: Any, backend: type) -> list[tuple[str, int]]:
     return seen
 
 
+def to_device(array: np.ndarray):
+    import warp as wp
+
+    dtype = {"float32": wp.float32, "float64": wp.float64}.get(array.dtype.name, wp.int32)
+    return wp.array(array, dtype=dtype, device="cpu")
+
+
 class Array:
     """Delegates DLPack to another array; ``device`` is what it says of its memory."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 from typing import Any
 
-from bad_input_files import Action, put
+from support.bad_input_files import Action, put
 
 from gpusense.logs import read_log
 

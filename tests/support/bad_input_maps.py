@@ -6,8 +6,8 @@ import struct
 import zlib
 from pathlib import Path
 
-from bad_input_files import Action, put
-from bad_input_grid import GRID
+from support.bad_input_files import Action, put
+from support.bad_input_grid import GRID
 
 from gpusense.world.map_files import read_map, write_map
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import bad_input_landmarks
 import numpy as np
+from support import bad_input_landmarks
 
 import gpusense as gs
 from gpusense.tables import casters

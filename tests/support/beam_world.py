@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from oracles import Mixture
+from support.oracles import Mixture
 
 import gpusense as gs
 

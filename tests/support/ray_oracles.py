@@ -10,7 +10,7 @@ from typing import Any
 
 import mpmath as mp
 import numpy as np
-from oracles import as_fraction, placed
+from support.oracles import as_fraction, placed
 
 Number = int | float | Fraction
 

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from ray_oracles import Ray, walk
+from support.ray_oracles import Ray, walk
 
 from gpusense.backends import get_backend
 from gpusense.interface.lanes import widened

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-from caster_world import RANGE, by_name, cast, lists_of, numpy_cast, place, same_bits
-from raycast_scenes import FAMILIES, Scene, scenes_of
-from raycast_scenes import cast as scene_cast
+from support.caster_world import RANGE, by_name, cast, lists_of, numpy_cast, place, same_bits
+from support.paths import ROOT
+from support.raycast_scenes import FAMILIES, Scene, scenes_of
+from support.raycast_scenes import cast as scene_cast
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -22,7 +22,7 @@ from gpusense.tables.directional import directional_table
 from gpusense.tables.distances import sectors_of
 from gpusense.world import windows
 
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "casters.md"
+DOCS = ROOT / "docs" / "casters.md"
 KINDS = [
     *(Exact(), Dda(), Bresenham(), March(), March(0.02), March(1.5, "centre")),
     *(Cddt(), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from caster_world import lists_of
 from scipy.spatial import cKDTree
+from support.caster_world import lists_of
 
 import gpusense as gs
 from gpusense.evaluation.worlds import building, cloud_uniform

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from incidence_world import INCIDENCE, RANGE, RIGHT, place
-from raycast_scenes import FAMILIES, Scene, scenes_of
+from support.incidence_world import INCIDENCE, RANGE, RIGHT, place
+from support.raycast_scenes import FAMILIES, Scene, scenes_of
 
 import gpusense as gs
 from gpusense.backends import get_backend

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from caster_world import RANGE, place, same_bits
+from support.caster_world import RANGE, place, same_bits
 
 import gpusense as gs
 from gpusense.tables import casters

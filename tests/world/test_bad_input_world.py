@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from bad_input_grid import GRID_CASES
-from bad_input_logs import LOG_CASES
-from bad_input_maps import MAP_CASES
-from bad_input_scanner import PARAMETER_CASES, SCANNER_CASES
+from support.bad_input_grid import GRID_CASES
+from support.bad_input_logs import LOG_CASES
+from support.bad_input_maps import MAP_CASES
+from support.bad_input_scanner import PARAMETER_CASES, SCANNER_CASES
 
 CASES = [*GRID_CASES, *MAP_CASES, *SCANNER_CASES, *PARAMETER_CASES, *LOG_CASES]
 

@@ -7,7 +7,7 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
-from oracles import placed
+from support.oracles import placed
 
 import gpusense as gs
 from gpusense.world.frames import place_poses, ray_vectors, split

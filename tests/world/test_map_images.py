@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from map_files import CELLS, GREYS, chunk, pgm, png, yaml_text
 from PIL import Image
+from support.map_files import CELLS, GREYS, chunk, pgm, png, yaml_text
 
 from gpusense.world import images
 from gpusense.world.map_files import read_map

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from map_files import CELLS, GREYS, pgm, yaml_text
+from support.map_files import CELLS, GREYS, pgm, yaml_text
 
 from gpusense.world.map_files import read_map
 

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import fake_driver
 import pytest
+from support import fake_driver
 
 pytest.importorskip("pyopencl")
 from gpusense.backends.opencl import drivers

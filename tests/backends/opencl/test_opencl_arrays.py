@@ -9,10 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from opencl_queue import as_gpu, copies, queue, there
-from test_bound import NEAR, mixed
-from test_device_arrays import GRID as PIXELS
-from test_small_calls import BEAMS, COUNT, GRID, MODELS, SCANNER, cloud, scan
+from support.scan_calls import BEAM, BEAMS, COUNT, FIELD, GRID, MODELS, NEAR, SCANNER, cloud, mixed, scan
 
 import gpusense as gs
 from gpusense import backends
@@ -20,9 +17,6 @@ from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
 
-__all__ = ["as_gpu", "copies", "queue", "there"]
-
-BEAM, FIELD = MODELS
 METHODS = ("log_likelihood", "field", "expected_ranges", "cast", "cones", "absolute", "landmarks")
 
 
@@ -292,9 +286,9 @@ def test_arrays_of_other_places(queue, there, needs):
     for selection in ("numpy", needs("warp"), needs("opencl")):
         expected = "must be of the context of" if selection.startswith("opencl") else "must be in host memory for"
         with pytest.raises(TypeError, match=rf"^poses: {expected} .*backend=<the array's queue>"):
-            FIELD(PIXELS, SCANNER, backend=selection).log_likelihood(there(cloud(1)), scan(1))
+            FIELD(GRID, SCANNER, backend=selection).log_likelihood(there(cloud(1)), scan(1))
     with pytest.raises(TypeError, match=r"^ranges: must be in host memory for numpy"):
-        FIELD(PIXELS, SCANNER, backend="numpy").log_likelihood(cloud(1), there(scan(1)))
+        FIELD(GRID, SCANNER, backend="numpy").log_likelihood(cloud(1), there(scan(1)))
 
 
 def test_readings_with_gaps(queue, there):

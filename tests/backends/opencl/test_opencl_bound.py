@@ -8,16 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from opencl_queue import as_gpu, copies, queue, there
-from test_bound import CASES, NEAR, mixed
-from test_small_calls import BEAMS, COUNT, GRID, MODELS, cloud
+from support.scan_calls import BEAMS, CASES, COUNT, FIELD, GRID, MODELS, NEAR, cloud, mixed
 
 from gpusense.evaluation.tolerances import differing
 from gpusense.models.scan import binding
-
-__all__ = ["as_gpu", "copies", "queue", "there"]
-
-BEAM, FIELD = MODELS
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from bench_world import quick_scene
+from support.bench_world import quick_scene
 
 import gpusense as gs
 from gpusense.backends import get_backend

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench_world import candidate, free_ranges, plan_of, quick_scene
+from support.bench_world import candidate, free_ranges, plan_of, quick_scene
 
 import gpusense as gs
 from gpusense.backends import get_backend

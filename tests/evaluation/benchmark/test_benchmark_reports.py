@@ -6,7 +6,7 @@ import json
 import math
 
 import numpy as np
-from bench_world import ERRORS, made_point, made_report, wrong
+from support.bench_world import ERRORS, made_point, made_report, wrong
 
 from gpusense.commands import cli
 from gpusense.evaluation.benchmark import compare, profiles, report

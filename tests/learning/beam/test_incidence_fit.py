@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from learning_data import RANGE_MAX
+from support.learning_data import RANGE_MAX
 
 import gpusense as gs
 from gpusense.evaluation.worlds import sample_readings

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from learning_data import RANGE_MAX, TYPICAL, draw, starts
+from support.learning_data import RANGE_MAX, TYPICAL, draw, starts
 
 import gpusense as gs
 from gpusense.evaluation.fit_scenes import learning_scenes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from learning_data import RANGE_MAX, TYPICAL, draw
+from support.learning_data import RANGE_MAX, TYPICAL, draw
 
 import gpusense as gs
 from gpusense.learning.beam.pairs import quantum_of

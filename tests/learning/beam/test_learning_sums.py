@@ -8,8 +8,8 @@ from collections.abc import Callable
 import mpmath as mp
 import numpy as np
 import pytest
-from kernel_scenes import PRECISIONS
-from learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
+from support.kernel_scenes import PRECISIONS
+from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, per_beam

@@ -10,7 +10,7 @@ from fractions import Fraction
 import mpmath as mp
 import numpy as np
 import pytest
-from oracles import Mixture
+from support.oracles import Mixture
 
 import gpusense as gs
 from gpusense.learning.discrete.probabilities import log_spread

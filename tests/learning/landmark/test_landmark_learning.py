@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import landmark_log as world
 import numpy as np
 import pytest
+from support import landmark_log as world
 
 import gpusense as gs
 from gpusense.learning.landmark import pairs as inner

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import landmark_scenes as scenes
 import numpy as np
 import pytest
-from array_libraries import Array, installed
-from test_absolute import GRID, models, poses_around
-from test_device_arrays import copies, device, each_framework, framework, to_device  # noqa: F401
+from support import landmark_scenes as scenes
+from support.absolute_scenes import GRID, models, poses_around
+from support.array_libraries import Array, installed, to_device
+from support.frameworks import each_framework, framework
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
@@ -75,22 +75,22 @@ SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "join
 
 
 @pytest.mark.parametrize("name", SENSORS)
-def test_poses_on_the_device_stay_there(name, device, copies, monkeypatch):  # noqa: F811
+def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypatch):
     """Float32 and float64 poses, results and ``out=`` of the same library, in pieces, not finite, and none at all."""
-    call = calls(device)[name]
+    call = calls(warp_as_gpu)[name]
     expected = call(POSES)
     for real in (np.float64, np.float32):
         truth = call(POSES.astype(real))
         for wrap in (lambda array: array, Array):
             given, out = wrap(to_device(POSES.astype(real))), wrap(to_device(np.full(len(POSES), 7, np.float32)))
             call(given)
-            copies.clear()
+            warp_copies.clear()
             found = call(given)
             assert type(found) is type(given)
             assert differing((found.held if wrap is Array else found).numpy(), truth) == 0
             # What is measured goes there, and two numbers that tell whether all is finite come back.
-            assert [size for way, size in copies if way == "down"] == [8]
-            assert all(size <= 400 for _, size in copies)
+            assert [size for way, size in warp_copies if way == "down"] == [8]
+            assert all(size <= 400 for _, size in warp_copies)
             assert call(given, out=out) is out
             assert differing((out.held if wrap is Array else out).numpy(), truth) == 0
     bad = POSES.copy()
@@ -102,8 +102,8 @@ def test_poses_on_the_device_stay_there(name, device, copies, monkeypatch):  # n
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
-def test_associations_of_poses_on_the_device(device):  # noqa: F811
-    model = gs.LandmarkModel(gs.LandmarkMap([(5e6, 0.0), (5e6 + 9, 3.0)]), backend=device)
+def test_associations_of_poses_on_the_device(warp_as_gpu):
+    model = gs.LandmarkModel(gs.LandmarkMap([(5e6, 0.0), (5e6 + 9, 3.0)]), backend=warp_as_gpu)
     there, here = model.associate(to_device(POSES), FEATURES), model.associate(POSES, FEATURES)
     for found, expected in zip(there, here, strict=True):
         assert isinstance(found, np.ndarray)
@@ -112,8 +112,8 @@ def test_associations_of_poses_on_the_device(device):  # noqa: F811
 
 @each_framework
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_frameworks(sensor, name, needs):
-    cuda, there, back, _ = framework(name, needs)
+def test_frameworks(sensor, name):
+    cuda, there, back, _ = framework(name)
     call, given = calls(cuda)[sensor], there(POSES)
     found = call(given)
     assert type(found) is type(given) and differing(back(found), call(POSES)) == 0

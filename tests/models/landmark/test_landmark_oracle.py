@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 from itertools import pairwise
 
-import landmark_oracle as oracle
-import landmark_scenes as scenes
 import numpy as np
 import pytest
-from conftest import on_every_backend
+from support import landmark_oracle as oracle
+from support import landmark_scenes as scenes
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import TOLERANCES

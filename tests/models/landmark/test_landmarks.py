@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import landmark_scenes as scenes
 import numpy as np
 import pytest
-from conftest import on_every_backend
 from scipy.special import ndtr
+from support import landmark_scenes as scenes
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.models import chunks

@@ -4,50 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import runpy
-from pathlib import Path
-from typing import Any
 
-import absolute_oracle as oracle
 import numpy as np
 import pytest
-from bad_input_absolute import CASES
-from kernel_scenes import squared_distances
-from test_absolute_oracle import assert_close, each_precision
+from support import absolute_oracle as oracle
+from support.absolute_scenes import CELLS, GRID, NAN, SQUARE, assert_close, each_precision, models, poses_around
+from support.bad_input_absolute import CASES
+from support.kernel_scenes import squared_distances
+from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.models import chunks
 from gpusense.models.point.bumper import sample_outline
-
-NAN = float("nan")
-CELLS = (np.random.default_rng(4).random((40, 50)) < 0.03).astype(int) * 100
-CELLS[3, 5:20] = -1
-GRID = gs.OccupancyGrid(CELLS, 0.1, origin=(5e6, -2.0, 0.4))
-SQUARE = np.array([(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)])
-
-
-def poses_around(grid: gs.OccupancyGrid, count: int = 60, seed: int = 1) -> np.ndarray:
-    """Poses in the grid and a little around it."""
-    rng = np.random.default_rng(seed)
-    x, y = (rng.uniform(-0.2, n * grid.resolution + 0.2, count) for n in grid.shape[::-1])
-    c, s = np.cos(grid.origin[2]), np.sin(grid.origin[2])
-    poses = np.stack(
-        [grid.origin[0] + c * x - s * y, grid.origin[1] + s * x + c * y, rng.uniform(-4, 4, count)], axis=1
-    )
-    poses[0, 2] = 1e6
-    return poses
-
-
-def models(backend: str, precision: str = "float32", **options: float) -> dict[str, tuple[Any, tuple[Any, ...]]]:
-    """One model of each sensor and what it measures."""
-    own: dict[str, Any] = dict(backend=backend, precision=precision, **options)
-    return {
-        "position": (gs.PositionModel(gs.PositionParameters(sigma=1.0, mount=(0.1, 0.2)), **own), ((5e6, -1.0),)),
-        "heading": (gs.HeadingModel(gs.HeadingParameters(sigma=0.3), **own), (2.0,)),
-        "beacons": (gs.BeaconModel([(5e6, 0.0), (5e6 + 9, 3.0)], **own), ([3.0, 6.0],)),
-        "bumper": (gs.BumperModel(GRID, SQUARE, segments=[0, 1, -1, 1], **own), ([True, False],)),
-    }
-
 
 # -------------------------------------------------------------------------------------------------------- bumper
 
@@ -253,7 +222,7 @@ def test_sensors_of_a_wide_deviation_say_nothing(backend: str) -> None:
 
 
 def test_the_example_sharpens_the_estimate(capsys) -> None:
-    runpy.run_path(str(Path(__file__).parents[1] / "examples" / "several_sensors.py"))
+    runpy.run_path(str(ROOT / "examples" / "several_sensors.py"))
     lines = capsys.readouterr().out.splitlines()
     together = [float(line.split()[4]) for line in lines if line.startswith("... and")]
     assert len(together) == 4 and together[3] < 1 < together[2] < together[0]

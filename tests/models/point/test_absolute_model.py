@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import absolute_oracle as oracle
 import numpy as np
 import pytest
-from test_absolute import GRID, NAN, models, poses_around
+from support import absolute_oracle as oracle
+from support.absolute_scenes import GRID, NAN, models, poses_around
 
 import gpusense as gs
 from gpusense.reference.absolute import WRAPS

@@ -4,28 +4,16 @@ from __future__ import annotations
 
 import itertools
 
-import absolute_oracle as oracle
 import numpy as np
 import pytest
 from scipy import stats
+from support import absolute_oracle as oracle
+from support.absolute_scenes import assert_close, each_precision
 
 import gpusense as gs
 from gpusense.models.point.beacons import t_series
 
-PRECISIONS = ("float32", "float64")
-each_precision = pytest.mark.parametrize("precision", PRECISIONS)
 STEPS = np.array([0.0, 0.3, -1.0, 2.5, -6.0, 12.0, 37.0])
-
-
-def assert_close(found: np.ndarray, truth: object, precision: str, terms: np.ndarray | None = None) -> None:
-    """Within 16 eps (1 + |log p|) of each reading; infinite where the truth is."""
-    truth = np.array(truth, float)
-    size = 1 + np.abs(truth) if terms is None else (1 + np.abs(terms)).sum(axis=-1)
-    assert not np.isnan(found).any()
-    finite = np.isfinite(truth)
-    np.testing.assert_array_equal(found[~finite], truth[~finite])
-    apart = np.abs(found[finite].astype(float) - truth[finite]) / size[finite] / np.finfo(precision).eps
-    assert apart.max(initial=0) <= 16, f"{apart.max():.1f} eps (1 + |log p|)"
 
 
 # ------------------------------------------------------------------------------------------------------ position

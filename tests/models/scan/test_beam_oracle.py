@@ -8,9 +8,9 @@ import math
 import mpmath as mp
 import numpy as np
 import pytest
-from beam_world import PRECISIONS, exact_log_density, parameters
-from conftest import on_every_backend
-from oracles import Mixture
+from support.beam_world import PRECISIONS, exact_log_density, parameters
+from support.oracles import Mixture
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.reference.mixture import log_density

@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from beam_world import PRECISIONS, exact_log_reading, parameters
-from conftest import on_every_backend
-from oracles import Mixture, classify, informative
-from ray_oracles import walk, world_ray
+from support.beam_world import PRECISIONS, exact_log_reading, parameters
+from support.oracles import Mixture, classify, informative
+from support.ray_oracles import walk, world_ray
+from support.selection import on_every_backend
 
 import gpusense as gs
 

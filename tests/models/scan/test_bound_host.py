@@ -6,14 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_bound import BEAM, CASES, FIELD, NEAR, SCANS, mixed
-from test_small_calls import BEAMS, COUNT, GRID, MODELS, cloud, gathering, to_device
+from support.array_libraries import to_device
+from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, NEAR, SCANS, cloud, mixed
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
 from gpusense.models.scan import binding
-
-__all__ = ["gathering"]
 
 
 @pytest.mark.parametrize("case", CASES)

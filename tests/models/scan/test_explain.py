@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_world import INF, KINDS, NAN, REPEATED, cloud, make, room, scan
+from support.model_world import INF, KINDS, NAN, REPEATED, cloud, make, room, scan
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
-from oracles import Field
+from support.oracles import Field
+from support.selection import on_every_backend
 
 import gpusense as gs
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
-from incidence_world import EDGES, INCIDENCE, KINDS, RANGE, RIGHT, P, place
+from support.incidence_world import EDGES, INCIDENCE, KINDS, RANGE, RIGHT, P, place
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_world import BEARINGS, KINDS, NAN, RANGE, cloud, make, parts_of_kind, room, same_bits, scan
+from support.model_world import BEARINGS, KINDS, NAN, RANGE, cloud, make, parts_of_kind, room, same_bits, scan
 
 import gpusense as gs
 from gpusense.backends.workspace import Workspace

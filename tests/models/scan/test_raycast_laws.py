@@ -7,8 +7,8 @@ import math
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from ray_oracles import backward_error_is_small, world_ray
-from raycast_scenes import PRECISIONS
+from support.ray_oracles import backward_error_is_small, world_ray
+from support.raycast_scenes import PRECISIONS
 
 import gpusense as gs
 

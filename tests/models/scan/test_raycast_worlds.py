@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import shapely
-from ray_oracles import Hit, Ray, backward_error_is_small, walk, world_ray
-from raycast_scenes import (
+from support.ray_oracles import Hit, Ray, backward_error_is_small, walk, world_ray
+from support.raycast_scenes import (
     FLOAT32_CELLS,
     FLOAT32_MOVE,
     FLOAT32_TURN,

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from oracles import Mixture
+from support.oracles import Mixture
 
 import gpusense as gs
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.backends import get_backend

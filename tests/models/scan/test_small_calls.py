@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 
 import numpy as np
 import pytest
-from array_libraries import Array, installed
+from support.array_libraries import Array, to_device
+from support.scan_calls import BEAMS, COUNT, GRID, MODELS, RANGE, SCANNER, cloud, scan
 
 import gpusense as gs
-from gpusense.backends import arrays, get_backend
+from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
 from gpusense.models.scan import model as scan_model
-
-BEAMS, COUNT, RANGE = 37, 300, 5.0
-RNG = np.random.default_rng(7)
-GRID = gs.OccupancyGrid(np.where(RNG.random((60, 70)) < 0.04, 100, 0).astype(np.int8), 0.1)
-SCANNER = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, mount=(0.1, 0.0, 0.2))
-MODELS = (gs.BeamModel, gs.LikelihoodFieldModel)
-
-
-def cloud(seed: int, count: int = COUNT) -> np.ndarray:
-    return np.random.default_rng(seed).uniform((-1, -1, -4), (7, 7, 4), (count, 3))
-
-
-def scan(seed: int, readings: int = BEAMS) -> np.ndarray:
-    values = np.random.default_rng(seed).uniform(0, 4.99, BEAMS)
-    values[readings:] = np.nan
-    return values
-
 
 # ---- processors: memory of host and device
 
@@ -88,31 +71,6 @@ def test_shared_memory_that_is_not_to_be_had(two_ways):
 
 
 # ---- CUDA: launches and copies that are gathered, and graphs; Warp's processor stands in for a GPU
-
-
-@pytest.fixture
-def gathering(needs, monkeypatch):
-    """A backend that gathers, and a list that grows with each start of a graph."""
-    needs("warp")
-    import warp as wp
-
-    from gpusense.backends.warp.queue import Graphs
-
-    installed(monkeypatch)
-    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
-    device = get_backend("warp:cpu")
-    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
-    monkeypatch.setattr(device, "_gathers", True)
-    monkeypatch.setattr(device, "_graphs", Graphs(device._device))
-    started, launch = [], wp.capture_launch
-    monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
-    return device, started
-
-
-def to_device(array: np.ndarray):
-    import warp as wp
-
-    return wp.array(array, dtype={"float32": wp.float32, "float64": wp.float64}[array.dtype.name], device="cpu")
 
 
 def plainly(device, monkeypatch, run):

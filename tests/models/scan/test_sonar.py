@@ -9,9 +9,9 @@ import pickle
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
-from incidence_world import EDGES, INCIDENCE, KINDS, P, place
 from scipy.ndimage import distance_transform_edt
+from support.incidence_world import EDGES, INCIDENCE, KINDS, P, place
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan

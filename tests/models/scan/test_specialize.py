@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
-from model_world import BEARINGS, INF, KINDS, NAN, RANGE, REPEATED, cloud, make, room, scan
+from support.model_world import BEARINGS, INF, KINDS, NAN, RANGE, REPEATED, cloud, make, room, scan
+from support.selection import on_every_backend
 
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing

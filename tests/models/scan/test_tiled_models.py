@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from conftest import on_every_backend
-from kernel_scenes import assert_near
+from support.kernel_scenes import assert_near
+from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from array_libraries import counted_copies
+from support.array_libraries import counted_copies
 
 from gpusense.backends import get_backend
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.selection import skip_or_fail
 
 SOURCE = r"""
 #define _GNU_SOURCE
@@ -104,7 +105,7 @@ def pocl_library() -> str:
 
     found = sorted((Path(pyopencl.__file__).parent / ".libs").glob("libpocl*.so*"))
     if not found:
-        pytest.skip("PoCL's wheel is not installed")
+        skip_or_fail("opencl", "PoCL's wheel is not installed")
     return str(found[0])
 
 
@@ -119,8 +120,10 @@ def build(folder: Path, mode: str, word: str = "distance", instead: str = "") ->
         instead: What stands there in a wrong program, of the same length.
     """
     compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None or not sys.platform.startswith("linux"):
-        pytest.skip("a fake driver needs a C compiler and Linux's loader")
+    if not sys.platform.startswith("linux"):
+        pytest.skip("a fake driver needs Linux's loader")
+    if compiler is None:
+        skip_or_fail("opencl", "a fake driver needs a C compiler: none is on the search path as cc or gcc")
     library, source = folder / f"lib{mode or 'plain'}.so", folder / f"{mode or 'plain'}.c"
     source.write_text(SOURCE)
     words = {"REAL": pocl_library(), "MODE": mode, "WORD": word, "INSTEAD": instead}

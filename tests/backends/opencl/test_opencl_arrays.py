@@ -13,7 +13,7 @@ from support.scan_calls import BEAM, BEAMS, COUNT, FIELD, GRID, MODELS, NEAR, SC
 
 import gpusense as gs
 from gpusense import backends
-from gpusense.backends import get_backend
+from gpusense.backends import get_backend, proof
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import chunks
 
@@ -249,6 +249,22 @@ def test_backends_of_queues(queue):
     for wrong in (queue.context, 3, None):
         with pytest.raises(TypeError, match="backend: must be a selection string or a queue of pyopencl, got"):
             get_backend(wrong)
+
+
+def test_a_queue_of_an_unusable_device_is_refused_with_the_reason(queue, monkeypatch):
+    """Devices of queues are proved as those of selection strings are."""
+    import pyopencl as cl
+
+    info, another = get_backend(queue).info, cl.CommandQueue(queue.context)
+    verdict = proof.unusable("scalar kernels compute wrong ranges")
+    monkeypatch.setattr(proof, "verdict_on", lambda *arguments, **options: verdict)
+    message = f"{info.selection} ({info.name}, {info.driver}) is unusable: {verdict.reason}; {verdict.remedy}"
+    for make in (get_backend, lambda backend: FIELD(GRID, NEAR, backend=backend)):
+        with pytest.raises(ValueError, match=f"^backend: {re.escape(message)}, got a queue of it$"):
+            make(another)
+    assert another.int_ptr not in backends._OF_QUEUES
+    monkeypatch.undo()
+    assert get_backend(another).info == info
 
 
 WRONG = {

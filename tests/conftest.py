@@ -23,25 +23,25 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 @pytest.fixture
 def needs() -> Callable[[str], str]:
-    """``needs("opencl")`` returns the selection string to test, or skips."""
+    """Return a function: ``needs("opencl")`` is the selection string to test; it skips where the backend is absent."""
     return present
 
 
 @pytest.fixture(params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> str:
-    """The selection string of each tested backend in turn."""
+    """Return the selection string of each tested backend in turn."""
     return present(request.param)
 
 
 @pytest.fixture(params=["opencl", "warp"])
 def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backend:
-    """The backend of each kernel language in turn."""
+    """Return the backend of each kernel language in turn."""
     return get_backend(needs(request.param))
 
 
 @pytest.fixture
 def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
-    """Each tested backend in turn; called with True it pretends to be a GPU, with False to be a processor."""
+    """Return a function that makes each tested backend pretend to be a GPU (True) or a processor (False)."""
     device = get_backend(backend)
     before = device.info
 
@@ -57,7 +57,7 @@ def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of recorded data that GPUSENSE_DATA names; the test is skipped without it."""
+    """Return the folder of recorded data that GPUSENSE_DATA names; skip the test without it."""
     folder = os.environ.get("GPUSENSE_DATA", "")
     if folder and Path(folder).is_dir():
         return Path(folder)
@@ -70,13 +70,13 @@ def data_dir() -> Path:
 
 @pytest.fixture
 def no_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without recorded data, whatever the environment names."""
+    """Hide recorded data, whatever the environment names."""
     monkeypatch.delenv("GPUSENSE_DATA", raising=False)
 
 
 @pytest.fixture
 def place(tmp_path):
-    """Write an image (bytes, or something to save) and its YAML; give the YAML's path."""
+    """Return a function that writes an image (bytes, or an object with ``save``) and its YAML; it returns this path."""
 
     def write(content, image="map.pgm", save=None, **changes):
         if isinstance(content, bytes):
@@ -91,7 +91,7 @@ def place(tmp_path):
 
 @pytest.fixture
 def warp_as_gpu(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> Backend:
-    """Warp's processor as a GPU that holds Warp's arrays and those of ``fakelib`` in its own memory."""
+    """Return Warp's processor as a GPU that holds Warp's arrays and those of ``fakelib`` in its own memory."""
     needs("warp")
     import warp as wp
 
@@ -104,7 +104,7 @@ def warp_as_gpu(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture
 def warp_copies(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """Bytes that models copy to Warp's device and back."""
+    """Record the bytes that models copy to Warp's device and back."""
     import warp  # noqa: F401
 
     from gpusense.backends.warp.backend import WarpBackend

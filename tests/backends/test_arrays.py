@@ -1,4 +1,4 @@
-"""Arrays of other libraries in host memory, and ``out=``: no copy, the same library back, and who may be written."""
+"""Arrays of other libraries in host memory, and ``out=``: no copy, the same library back, and writable arrays only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def fakelib(monkeypatch):
 
 
 def call_of(method: str, backend, scan=SCAN):
-    """What takes poses and out=, and the shape of its result."""
+    """Return the call that takes poses and ``out=``, and the shape of its result."""
     if method == "cast":
         caster = gs.RayCaster(GRID, RANGE, backend=backend)
         return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options), (COUNT, BEAMS)
@@ -110,7 +110,7 @@ def test_a_batch_of_another_library(backend):
 
 @pytest.mark.parametrize("wrap", [lambda array: array, Array])
 @pytest.mark.parametrize("method", METHODS)
-def test_what_can_be_used_as_it_is_is_not_copied(method, wrap, backend, monkeypatch):
+def test_arrays_that_can_be_used_as_they_are_are_not_copied(method, wrap, backend, monkeypatch):
     """Poses go to the device from where they are, and results come from there to where they are wanted."""
     call, shape = call_of(method, backend)
     seen, before = {}, Workspace.upload
@@ -237,7 +237,7 @@ def test_pinned_memory_is_host_memory(kind):
     assert arrays.on_device(Array(POSES, CUDA))
 
 
-def test_what_has_only_a_cuda_interface_is_on_a_device():
+def test_an_array_with_only_a_cuda_interface_is_on_a_device():
     class OnDevice:
         __cuda_array_interface__ = types.MappingProxyType({"shape": (1, 3), "typestr": "<f8", "data": (0, False)})
 

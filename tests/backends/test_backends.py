@@ -93,7 +93,7 @@ def test_of_one_class_the_faster_device_is_taken_if_it_is_noticeably_so(monkeypa
         assert backends._find("auto") == backends._find("opencl") == chosen
 
 
-def test_what_is_unusable_is_passed_over_unless_it_is_named(monkeypatch):
+def test_an_unusable_device_is_passed_over_unless_it_is_named(monkeypatch):
     rows = fake_devices(("opencl", "GPU", "gpu"), ("opencl", "CPU", "cpu"), ("warp", "CPU", "cpu"))
     bad = Verdict(False, 1, False, "scalar kernels hang", "update the driver")
     use_devices(monkeypatch, rows, {"opencl:0:0": bad})

@@ -26,7 +26,7 @@ from gpusense.backends.cache import ProgramCache, load_entry, pack, store_entry,
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A cache folder of the test's own."""
+    """Use a cache folder of this test alone."""
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.setattr(cache.tempfile, "tempdir", str(tmp_path / "elsewhere"))
@@ -92,7 +92,7 @@ def test_the_cache_can_be_switched_off(folder, monkeypatch):
 
 @pytest.fixture
 def temporary(tmp_path, monkeypatch):
-    """A folder of temporary files of the test's own, and no failure reported before."""
+    """Use a folder of temporary files of this test alone, with no failure reported before."""
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr(cache.tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setattr(cache, "_reported", set())
@@ -101,7 +101,7 @@ def temporary(tmp_path, monkeypatch):
 
 
 def blocked(tmp_path: Path, how: str) -> Path:
-    """A cache folder that cannot be made or written, whoever the user is."""
+    """Return a cache folder that no user can make or write."""
     if how == "a file in its place":
         (tmp_path / "file").write_text("not a folder")
         return tmp_path / "file"
@@ -133,7 +133,7 @@ def test_a_private_temporary_folder_takes_the_place_of_one_that_cannot_be_writte
 
 
 @pytest.mark.parametrize("how", ["others may write", "a link"])
-def test_a_temporary_folder_of_somebody_else_is_not_used(tmp_path, temporary, monkeypatch, how):
+def test_a_temporary_folder_of_another_user_is_not_used(tmp_path, temporary, monkeypatch, how):
     name = temporary / f"gpusense-{os.getuid()}"
     if how == "a link":
         (tmp_path / "elsewhere").mkdir()
@@ -160,7 +160,7 @@ def test_without_a_home_the_cache_is_temporary(temporary, monkeypatch):
     assert len(list(temporary.rglob("*.bin"))) == 1
 
 
-def test_what_killed_processes_left_unfinished_is_removed(folder):
+def test_unfinished_files_of_killed_processes_are_removed(folder):
     store_entry("first", b"payload")
     for name, age in (("old.tmp", 7200), ("new.tmp", 0)):
         (folder / name).write_bytes(b"half")
@@ -190,7 +190,7 @@ def test_packed_files_stay_below_their_folder(name):
 
 @pytest.fixture
 def made(folder, monkeypatch):
-    """Make this process's folder anew, as many times as a test likes; all are removed in the end."""
+    """Return a function that makes this process's folder anew; remove all of them in the end."""
     folders: list[Path] = []
 
     def make() -> Path:

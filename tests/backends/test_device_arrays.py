@@ -25,7 +25,7 @@ METHODS = ("log_likelihood", "field", "expected_ranges", "cast")
 
 
 def call_of(method: str, backend, scan=SCAN):
-    """What takes poses and out=, and the shape of its result."""
+    """Return the call that takes poses and ``out=``, and the shape of its result."""
     if method == "cast":
         caster = gs.RayCaster(GRID, RANGE, backend=backend)
         return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options), (COUNT, BEAMS)
@@ -48,7 +48,7 @@ def test_poses_on_the_device_stay_there(method, real, warp_as_gpu, warp_copies):
         held = found.held if isinstance(given, Array) else found
         assert type(found) is type(given) and tuple(held.shape) == shape
         assert differing(held.numpy(), expected) == 0
-        # Rays and readings go there, and two numbers that tell whether all is finite come back.
+        # Rays and readings go there, and the two numbers of the status of poses come back.
         assert all(size <= 16 * BEAMS for _, size in warp_copies)
         assert [size for way, size in warp_copies if way == "down"] == [8]
 
@@ -68,7 +68,7 @@ def test_out_on_the_device(method, warp_as_gpu, warp_copies):
 
 @pytest.mark.parametrize("selection", ["opencl", "warp"])
 def test_copies_on_the_device(selection, needs):
-    """From any place to any other, after what was started before."""
+    """From any place to any other, after the commands that were started before."""
     backend, real = get_backend(needs(selection)), np.dtype(np.float32)
     source, target = backend.blank(8, real), backend.blank(6, real)
     backend.upload(np.arange(8, dtype=real), source)
@@ -163,11 +163,11 @@ def test_a_pose_on_the_device_that_is_not_finite(value, scan, warp_as_gpu):
         expected = call(POSES)
         with pytest.raises(ValueError, match=message):
             call(to_device(bad))
-        # It is told once.
+        # It is reported once.
         assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
-def test_a_pose_that_is_not_finite_is_told_after_memory_ran_out(warp_as_gpu, monkeypatch):
+def test_a_pose_that_is_not_finite_is_reported_after_memory_ran_out(warp_as_gpu, monkeypatch):
     """The first piece has it; the second is tried again in halves."""
     model = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu)
     poses = np.tile(POSES, (4, 1))

@@ -1,4 +1,4 @@
-"""What goes wrong on real machines, made to go wrong: every fault gives a clear message and leaves a working model."""
+"""Faults of real machines, provoked: each gives a clear message and leaves a working model."""
 
 from __future__ import annotations
 

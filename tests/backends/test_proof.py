@@ -24,7 +24,7 @@ INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "cpu", "Driver 1", 1 <
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    """A cache of the test's own, and no verdicts in this process's memory."""
+    """Use a cache of this test alone, and forget the verdicts of this process."""
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
     for name in ("GPUSENSE_CACHE", "GPUSENSE_PROOF", "GPUSENSE_PROOF_SECONDS", "GPUSENSE_BACKEND"):
         monkeypatch.delenv(name, raising=False)
@@ -34,7 +34,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def driver(monkeypatch):
-    """A driver whose families fail as the test says; it keeps the settings that were tried."""
+    """Return a function that makes a driver whose families fail as asked, and that records the settings tried."""
     tried: list[tuple[int, bool]] = []
 
     def make(fails: dict[tuple[str, int], str], conclusive: bool = True) -> list[tuple[int, bool]]:
@@ -82,7 +82,7 @@ ABORT = "ends the process with SIGABRT (LLVM ERROR: no)"
          (False, 1, False)),
     ],
 )  # fmt: skip
-def test_what_fails_gives_way_to_the_next_more_modest_setting(driver, caplog, fails, tried, left):
+def test_a_setting_that_fails_gives_way_to_the_next_more_modest_one(driver, caplog, fails, tried, left):
     asked = driver(fails)
     verdict = verdict_on(INFO)
     assert asked == tried
@@ -101,7 +101,7 @@ def test_what_fails_gives_way_to_the_next_more_modest_setting(driver, caplog, fa
 
 
 @pytest.mark.parametrize("changed", ["driver", "name", "lanes", "target", "version", "processor"])
-def test_a_verdict_is_made_anew_when_what_it_depends_on_changes(driver, monkeypatch, changed):
+def test_a_verdict_is_made_anew_when_its_key_changes(driver, monkeypatch, changed):
     tried = driver({})
     verdict_on(INFO)
     if changed == "version":
@@ -218,7 +218,7 @@ def test_a_child_reports_until_it_dies():
     assert run_text(text).said == [{"begin": 1}, {"begin": 2}]
 
 
-def test_a_hanging_child_and_what_it_started_are_ended(monkeypatch, tmp_path):
+def test_a_hanging_child_and_its_children_are_ended(monkeypatch, tmp_path):
     monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", "1.5")
     text = f"""
     import subprocess, sys, time
@@ -288,7 +288,7 @@ print(json.dumps({"selection": info.selection, "lanes": info.lanes, "float64": i
 
 
 def default_of(tmp_path, **variables):
-    """What a process makes of its default backend, and of OpenCL by name, in a cold cache and again; its messages."""
+    """Return the default backend of a process, and OpenCL by name, in a cold cache and again; and its messages."""
     seconds = {"GPUSENSE_PROOF_SECONDS": os.environ.get("GPUSENSE_PROOF_SECONDS", "60")}
     environment = fake_driver.environment(tmp_path, **seconds | variables)
     runs = [
@@ -341,7 +341,7 @@ def test_a_driver_that_fails_altogether_is_named_and_another_backend_is_the_defa
     ],
 )
 def test_a_driver_that_fails_in_part_keeps_the_rest(needs, tmp_path, mode, words, message, left):
-    """One that has no float64 but says so; one whose vectors are wrong."""
+    """One claims float64 without having it; the vectors of the other are wrong."""
     needs("opencl")
     icd = fake_driver.build(tmp_path, mode, *words)
     found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd))

@@ -1,4 +1,4 @@
-"""``gpusense demo``, and the example: what they print and draw, and what they refuse."""
+"""``gpusense demo``, and the example: their numbers and pictures, and the arguments that they refuse."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support.paths import ROOT
 
 from gpusense.commands import cli, demo
 
-# What a model in float32 may differ from the float64 reference on 60 beams at most [nats], on its own rounded inputs.
+# Largest difference of a float32 model from the float64 reference on 60 beams [nats], on its own rounded inputs.
 DEMO_TOLERANCE = 1e-2
 
 
@@ -88,7 +88,7 @@ def test_demo_checks_its_default_output_before_it_works(tmp_path, monkeypatch, c
     assert error_of(SMALL, capsys) == "gpusense-demo.png: must be a regular file, got another kind"
 
 
-def test_demo_goes_on_without_a_device_that_nobody_asked_for(needs, monkeypatch, capsys):
+def test_demo_goes_on_without_a_device_that_was_not_asked_for(needs, monkeypatch, capsys):
     needs("opencl")
     score = demo.score
 

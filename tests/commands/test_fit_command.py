@@ -24,7 +24,7 @@ SCANS, BEAMS, RANGE = 60, 60, 10.0
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A building's map, a log of 60 scans in it, and the same readings as pairs."""
+    """Write a building's map, a log of 60 scans in it, and the same readings as pairs."""
     folder = tmp_path_factory.mktemp("recorded")
     grid = building(2, (14.0, 12.0))
     gs.write_map(grid, folder / "map.yaml")
@@ -92,7 +92,7 @@ def test_pairs_are_fitted_as_the_log_they_come_from(capsys, recorded):
         assert abs(value - scans[name]) < 6 * pairs["fit"]["standard_errors"][name], name
 
 
-def test_held_out_scans_tell_the_truth_from_defaults(capsys, recorded):
+def test_held_out_scans_are_likelier_by_the_fit_than_by_defaults(capsys, recorded):
     code, text, _ = run(capsys, *of_log(recorded), "--holdout", "--json")
     document = json.loads(text)
     fitted, *others = document["held_out"]
@@ -118,7 +118,7 @@ def test_a_bias_is_fitted_and_taken_off_held_out_readings(capsys, recorded, tmp_
     document = json.loads(text)
     fit = document["fit"]
     assert abs(fit["range_bias"] - 0.3) < 4 * fit["range_bias_error"] + 0.005
-    # The mean of the held-out half is that of the fitted one, within what blocks tell.
+    # The mean of the held-out half is that of the fitted one, within the error by blocks.
     fitted = document["held_out"][0]
     assert abs(fitted["per_beam"] - fit["log_likelihood"] / document["readings"]) < 5 * fitted["error"]
 

@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def swapped(tmp_path_factory):
-    """The same run with the places of subjects 8 and 12 exchanged, compressed."""
+    """Write the same run with the places of subjects 8 and 12 exchanged, compressed."""
     folder = world.write_run(tmp_path_factory.mktemp("swapped"), swap=(8, 12))
     for file in list(folder.glob("Robot*.dat")):
         (folder / f"{file.name}.gz").write_bytes(gzip.compress(file.read_bytes()))

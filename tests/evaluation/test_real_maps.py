@@ -1,4 +1,4 @@
-"""Real maps: distance transforms, ranges and log-likelihoods of every backend present, on what robots recorded."""
+"""Recorded maps: distance transforms, ranges and log-likelihoods of every backend present."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ COMPARED = [
 
 @pytest.fixture(scope="module")
 def opencl():
-    """The OpenCL backend."""
+    """Return the OpenCL backend."""
     try:
         return get_backend("opencl")
     except ValueError as error:
@@ -64,7 +64,7 @@ def opencl():
 
 @pytest.fixture(scope="module")
 def gigantic(data_dir):
-    """The map of 120 million cells."""
+    """Return the map of 120 million cells."""
     return gs.read_map(data_dir / GIGANTIC)
 
 
@@ -80,7 +80,7 @@ def test_distance_transform_is_scipys(data_dir, opencl, name):
 
 
 def scene_of(data_dir, name):
-    """A scene in a map, and the backends that are here besides NumPy, which is slow in wide open space."""
+    """Return a scene in a map, and the backends that are present besides NumPy, which is slow in wide open space."""
     scanner = gs.Scanner.uniform(
         angle_min=-2.0, angle_increment=0.05, count=81, range_max=20.0, mount=(0.1, -0.05, 0.02)
     )  # fmt: skip

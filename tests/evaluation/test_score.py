@@ -93,7 +93,7 @@ def test_cloud_is_the_pose_its_surroundings_and_the_free_cells():
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A map of a building and a CARMEN log of eight scans in it."""
+    """Write a map of a building and a CARMEN log of eight scans in it."""
     folder = tmp_path_factory.mktemp("recorded")
     grid = building(2, (14.0, 12.0))
     gs.write_map(grid, folder / "map.yaml")
@@ -201,7 +201,7 @@ def test_plot_is_drawn_and_text_names_device(capsys, recorded, tmp_path):
     assert "NumPy reference" in out and "particle-beams/s" in out and "percentile" in out
 
 
-def test_impossible_particles_are_told_and_json_has_no_nan(capsys, recorded):
+def test_impossible_particles_are_reported_and_json_has_no_nan(capsys, recorded):
     code, out, _ = run(capsys, recorded, "--model", "beam", "--particles", "20", "--backend", "numpy", "--limit", "1",
                        "--z-hit", "0", "--z-short", "0", "--z-rand", "0", "--z-max", "1", "--json")  # fmt: skip
     assert code == 0

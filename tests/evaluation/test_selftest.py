@@ -26,7 +26,7 @@ EPS = float(np.finfo(np.float32).eps)
 
 
 def others() -> list[str]:
-    """Backends besides NumPy that are here."""
+    """Return the backends that are present besides NumPy."""
     found = [d for d in gs.devices() if d.available and d.kind != "simulator" and d.backend != "numpy"]
     if not found:
         pytest.skip("only NumPy is here")
@@ -332,7 +332,7 @@ def test_the_stiff_catalogue_on_the_command_line(capsys):
     assert len(document["rows"]) > 400
 
 
-def test_a_stiff_breach_is_told_and_fails(capsys, monkeypatch):
+def test_a_stiff_breach_is_reported_and_fails(capsys, monkeypatch):
     row = stiff.Row("a case", "log p", 17.0, 16.0, 0, False)
     monkeypatch.setattr(stiff, "run", lambda backend, precision: [row])
     assert main(["selftest", "--stiff", "--backend", "numpy"]) == 1

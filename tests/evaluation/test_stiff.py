@@ -1,4 +1,4 @@
-"""Stiff and extreme cases hold on every backend and precision, and the catalogue can tell when they do not."""
+"""Stiff and extreme cases hold on every backend and precision, and the catalogue detects when they do not."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ numpy_grid = functools.cache(lambda precision: stiff.density_grid("numpy", preci
 
 @functools.cache
 def exact_parts(kind: str, z: float, expected: float, shape: float):
-    """p_hit or p_short at 60 digits."""
+    """Return p_hit or p_short at 60 digits."""
     mixture = Mixture(1, 0, 0, 0, sigma=shape, rate=shape, range_max=stiff.RANGE_MAX)
     return getattr(mixture, kind)(mp.mpf(z), mp.mpf(expected)) if kind == "hit" or expected > 0 else mp.mpf(0)
 
 
 @functools.cache
 def exact_grid(precision: str) -> np.ndarray:
-    """log p of the density grid by mpmath, rounded to float64 at the end."""
+    """Return log p of the density grid by mpmath, rounded to float64 at the end."""
     grid = numpy_grid(precision)
     names = ("z_hit", "z_short", "z_rand", "sigma_hit", "lambda_short")
     columns = [column.tolist() for column in (grid.z, grid.expected, *(grid.parameters[name] for name in names))]
@@ -144,7 +144,7 @@ def test_ranges_in_an_empty_room_are_those_of_plain_geometry(name, precision, ba
 
 
 def weigh(selection: str, beams: int, particles: int) -> None:
-    """Finite log-weights that sum to 1 where the product of likelihoods is 0 for every particle."""
+    """Check that log-weights are finite and sum to 1 where the product of likelihoods is 0 for every particle."""
     cells = np.pad(np.zeros((98, 98), np.int8), 1, constant_values=100)
     grid = gs.OccupancyGrid(cells, 0.1)
     scanner = gs.Scanner(np.linspace(-math.pi, math.pi, beams, endpoint=False), 20.0)
@@ -177,7 +177,7 @@ powers = st.integers(-8, 6) | st.floats(-8, 6)
 
 @st.composite
 def questions(draw):
-    """Parameters over the stiff ranges, and expected ranges and readings as shares of range_max."""
+    """Draw parameters over the stiff ranges, and expected ranges and readings as shares of range_max."""
     weights = draw(
         st.sampled_from([(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1), (0.5, 0.25, 0.0, 0.25), (0.5, 0.5, 0, 0)])
     )

@@ -21,13 +21,13 @@ RANGE_MAX = 10.0
 
 
 def turned(seed: int = 1) -> gs.OccupancyGrid:
-    """A building that is turned and far from the origin."""
+    """Return a building that is turned and far from the origin."""
     grid = worlds.building(seed, (16.0, 12.0), 0.1)
     return gs.OccupancyGrid(grid.cells, grid.resolution, (5e5, -3e5, 0.7))
 
 
 def mixture_cdf(z: np.ndarray, expected: float, p: BeamParameters) -> np.ndarray:
-    """CDF of a reading that is a range, by scipy's distributions."""
+    """Return the CDF of a reading that is a range, by SciPy's distributions."""
     hit = stats.truncnorm(-expected / p.sigma_hit, (RANGE_MAX - expected) / p.sigma_hit, expected, p.sigma_hit)
     if expected == 0:
         short = np.ones_like(z)
@@ -40,7 +40,7 @@ def mixture_cdf(z: np.ndarray, expected: float, p: BeamParameters) -> np.ndarray
 
 
 def assert_stochastically_mixture(readings: np.ndarray, expected: float, p: BeamParameters) -> None:
-    """The share of "no return", and the distribution of the ranges, within what chance explains."""
+    """Check the share of "no return" and the distribution of the ranges, within the limits of chance."""
     n = len(readings)
     none = np.isposinf(readings)
     error = math.sqrt(p.z_max * (1 - p.z_max) / n)
@@ -199,7 +199,7 @@ def test_readings_refuse_impossible_ranges(expected):
 
 
 def room(origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> gs.OccupancyGrid:
-    """A room whose inner walls are at x = 0.5 and 7.5 m, y = 0.5 and 5.5 m of its own frame."""
+    """Return a room whose inner walls are at x = 0.5 and 7.5 m, y = 0.5 and 5.5 m of its frame."""
     cells = np.full((60, 80), 100, np.int8)
     cells[5:55, 5:75] = 0
     return gs.OccupancyGrid(cells, 0.1, origin)

@@ -1,4 +1,4 @@
-"""Flags that are off leave no trace in the code; what Warp makes rounds each operation and is made once."""
+"""Flags that are off leave no trace in the code; Warp's code rounds each operation and is made once."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_flags_that_are_off_leave_no_trace_in_warp(
 
 @functools.cache
 def warp_code(kernel: str, flags: frozenset[str]) -> str:
-    """The C++ that Warp generates for a kernel, without comments, which quote the Python source."""
+    """Return the C++ that Warp generates for a kernel, without comments, which quote the Python source."""
     import warp as wp
 
     made = warp_module(KERNELS[kernel].file).make(kernel, flags)
@@ -133,7 +133,7 @@ def warp_code(kernel: str, flags: frozenset[str]) -> str:
 
 
 def cuda_code(kernel: str, flags: frozenset[str], folder: Path) -> str:
-    """The PTX that Warp makes of a kernel for a CUDA device."""
+    """Return the PTX that Warp makes of a kernel for a CUDA device."""
     import warp as wp
 
     architectures = wp.get_cuda_supported_archs()
@@ -147,7 +147,7 @@ def cuda_code(kernel: str, flags: frozenset[str], folder: Path) -> str:
 
 
 def cuda_operations(kernel: str, flags: frozenset[str], folder: Path) -> set[str]:
-    """The floating-point operations that round, of the code that Warp makes of a kernel for a CUDA device."""
+    """Return the floating-point operations that round in Warp's code of a kernel for a CUDA device."""
     return cuda_operations_of(cuda_code(kernel, flags, folder))
 
 

@@ -11,7 +11,7 @@ from gpusense.reference.order import ALL_BINS, STRETCH
 
 
 def clouds() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Cells and headings of particles."""
+    """Return cells and headings of particles."""
     rng = np.random.default_rng(5)
     far = 1 << 30
     wrap = np.multiply.outer([1, -1], np.nextafter(np.float32(np.pi), np.float32([0, 4]))).ravel()
@@ -31,7 +31,7 @@ CLOUDS = clouds()
 
 
 def ordered(device: Backend, cell: np.ndarray, heading: np.ndarray, real: type) -> dict[str, np.ndarray]:
-    """Bins and order that the four kernels make, one after the other, as the models launch them."""
+    """Return the bins and the order that the four kernels make, launched as the models launch them."""
     count, flags = len(cell), scene_flags(real)
     pose = np.stack([0 * heading, 0 * heading, np.cos(heading), np.sin(heading)], axis=1).astype(real)
     at, to = device.upload(cell.astype(np.int32)), device.upload(pose)

@@ -26,7 +26,7 @@ SPECIAL = [
 
 
 def scans(real: type, count: int) -> list[np.ndarray]:
-    """Scans of ranges alone, with readings of every kind, and without any range."""
+    """Return scans of ranges alone, with readings of every class, and without any range."""
     rng = np.random.default_rng(count)
     plain = rng.uniform(0.3, 4.9, count)
     mixed = np.where(rng.random(count) < 0.5, rng.choice(SPECIAL, count), plain)
@@ -36,7 +36,7 @@ def scans(real: type, count: int) -> list[np.ndarray]:
 def placed(
     device: Backend, flags: frozenset[str], ranges: np.ndarray, vectors: np.ndarray, *numbers: Any, some: bool = False
 ) -> Any:
-    """What place_inputs writes of readings, by the reference and by a device; what it does not write stays 77."""
+    """Return the readings that place_inputs writes, by the reference and by a device; the rest stays 77."""
     real = np.float64 if "FLOAT64" in flags else np.float32
     beams, each = vectors.shape[:2]
     places, chosen, kind, possible, nearest, log_max, top = numbers
@@ -114,7 +114,7 @@ def test_readings_that_keep_their_places(device: Backend) -> None:
     assert differing(found["point"], vectors.astype(np.float32).ravel()) == 0
 
 
-def test_where_no_range_is_possible_a_range_is_told(device: Backend) -> None:
+def test_a_range_where_none_is_possible_is_reported(device: Backend) -> None:
     ranges = np.array([1.0, np.inf, np.nan, np.inf])
     vectors = np.ones((4, 1, 2))
     for flags in (frozenset({"END_POINTS"}), frozenset()):

@@ -37,13 +37,13 @@ REAL = np.float32
 
 
 def readings_of(first: np.ndarray, shared: bool) -> tuple[np.ndarray, int]:
-    """How many readings each scan has, and the most."""
+    """Return the number of readings of each scan, and the largest."""
     counts = np.diff(first[START] if shared else START).astype(np.int32)
     return counts, int(counts.max())
 
 
 def field(names: tuple[str, ...]) -> tuple[list[np.ndarray], frozenset[str], tuple[int, int]]:
-    """What both kernels of the field take first, the flags, and rows and columns."""
+    """Return the first arguments of both kernels of the field, the flags, and rows and columns."""
     scene = field_scene("log table", REAL, all_readings=False)
     some = np.resize(np.arange(150), COUNT)
     scene |= {key: scene[key][some] for key in ("pose_cell", "pose", "pose_low")}
@@ -93,7 +93,7 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
 def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> None:
     counts = np.array([5, 0, 48, 16], np.int32)
     parts = np.random.default_rng(4).uniform(0.1, 3, 48 * COUNT).astype(REAL)
-    # What no scan has counts for nothing.
+    # Parts beyond the end of a scan count for nothing.
     place_scan = (an_order(COUNT) if "ORDERED" in names else np.arange(COUNT)) // PER_SCAN
     added = strands_in(counts) if "STRANDED" in names else counts
     parts.reshape(48, COUNT)[np.arange(48)[:, None] >= added[place_scan]] = np.nan
@@ -106,7 +106,7 @@ def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> N
 
 
 def beams(names: tuple[str, ...]) -> tuple[frozenset[str], list[Any], np.ndarray, int]:
-    """Flags, arrays from rays to the sensor's table, how many readings each scan has, and the most."""
+    """Return flags, arrays from rays to the sensor's table, the number of readings of each scan, and the largest."""
     flags, terms = mixture("book", REAL, z_max=0.05)
     repeats = np.ones(START[-1], int)
     if "SHARED_RAYS" in names:

@@ -89,7 +89,7 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
 
 
 def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndarray], *fixed: float) -> Any:
-    """Outputs of the field kernel on the reference and on a device."""
+    """Return the outputs of the field kernel on the reference and on a device."""
     real, (rows, cols) = scene["pose"].dtype, scene["table"].shape
     count, readings = scene["parts"].shape
     finite = scene["point"][np.isfinite(scene["point"])]

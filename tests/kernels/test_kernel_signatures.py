@@ -24,7 +24,7 @@ LANE_FILES = {"lanes", "lane_math", "field_lanes", "landmark_lanes"}
 
 @functools.cache
 def opencl_declarations() -> dict[str, list[tuple[str, str]]]:
-    """Parameters and body of every kernel in the OpenCL files, by name; some have a second body for vectors."""
+    """Return parameters and body of every kernel in the OpenCL files, by name; some have a second body for vectors."""
     found: dict[str, list[tuple[str, str]]] = {}
     for file in sorted({row.file for row in KERNELS.values()} | LANE_FILES):
         text = opencl_source(file)
@@ -34,7 +34,7 @@ def opencl_declarations() -> dict[str, list[tuple[str, str]]]:
 
 
 def opencl_argument(declaration: str) -> tuple[str, str, bool, bool]:
-    """Name, type, whether an array, whether written, of one C parameter."""
+    """Return name, type, whether an array, whether written, of one C parameter."""
     match = re.fullmatch(r"(global )?(const )?(\w+) (\*)?(?:restrict )?(\w+)", " ".join(declaration.split()))
     assert match is not None, declaration
     space, constant, kind, pointer, name = match.groups()

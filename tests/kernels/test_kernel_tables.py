@@ -87,12 +87,12 @@ def test_bits_of_a_map_are_its_cells() -> None:
 
 
 def blocked_before(occupied: np.ndarray) -> np.ndarray:
-    """Obstacles in all rows and columns before each corner of a cell."""
+    """Count the obstacles in all rows and columns before each corner of a cell."""
     return np.pad(occupied.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
 
 def empty_sides(occupied: np.ndarray, quadrant: int, longest: int) -> np.ndarray:
-    """(longest, longest, rows, cols) whether a rectangle of height i + 1 and width j + 1 is empty and in the grid."""
+    """Return (longest, longest, rows, cols): is a rectangle of height i + 1 and width j + 1 empty and in the grid?"""
     seen = occupied[:: -1 if quadrant & 2 else 1, :: -1 if quadrant & 1 else 1]
     rows, cols = seen.shape
     before = blocked_before(np.pad(seen, ((0, longest), (0, longest)), constant_values=True))
@@ -105,13 +105,13 @@ def empty_sides(occupied: np.ndarray, quadrant: int, longest: int) -> np.ndarray
 
 
 def sides_of(planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Widths and heights inside the ring, as int."""
+    """Return widths and heights inside the ring, as int."""
     inner = planes[..., 1:-1, 1:-1].astype(int)
     return inner & 255, inner >> 8
 
 
 def score(planes: np.ndarray) -> np.ndarray:
-    """How long the ray in the middle of the sector stays in each rectangle."""
+    """Return the length for which the ray in the middle of the sector stays in each rectangle."""
     sectors = planes.shape[1]
     width, height = sides_of(planes)
     middle = np.array([slope(sectors, sector) for sector in range(sectors)])[:, :, None, None]
@@ -119,7 +119,7 @@ def score(planes: np.ndarray) -> np.ndarray:
 
 
 def check_empty(occupied: np.ndarray, planes: np.ndarray) -> None:
-    """Every rectangle is free and inside the grid; nothing but the ring and obstacles, which have a mark, have none."""
+    """Check that every rectangle is free and inside the grid, and that only the ring and obstacles have marks."""
     rows, cols = occupied.shape
     assert planes[..., [0, -1], :].max() == planes[..., [0, -1]].max() == 0
     width, height = sides_of(planes)
@@ -142,7 +142,7 @@ def check_empty(occupied: np.ndarray, planes: np.ndarray) -> None:
 
 @pytest.fixture
 def as_kind(backend: str, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Backend]:
-    """Each backend with the kernels for processors or for GPUs."""
+    """Return a function that gives each backend the kernels for processors or for GPUs."""
     device = get_backend(backend)
 
     def pretend(kind: str) -> Backend:
@@ -236,7 +236,7 @@ def test_free_cells_of_a_part_leave_the_others_alone(occupied: np.ndarray, devic
 
 
 def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Region]:
-    """Single cells, among them the four corners, and windows, among them those at borders."""
+    """Return edits of single cells, among them the four corners, and of windows, among them those at borders."""
     rows, cols = shape
     places = [(0, 0), (0, cols - 1), (rows - 1, 0), (rows - 1, cols - 1), (rows // 2, cols // 2)]
     windows = [Region(row, col, 1, 1) for row, col in places]
@@ -253,7 +253,7 @@ def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Region]:
 def made_anew(
     shape: tuple[int, int], share: float, sectors: int, kind: str
 ) -> list[tuple[np.ndarray, Region | None, bytes]]:
-    """A map and its edits one after the other: the map, what has changed, and the compressed rectangles made anew."""
+    """Yield a map after each edit: the map, the changed window, and the compressed rectangles made anew."""
     rng = np.random.default_rng(5)
     occupied = rng.random(shape) < share
     found: list[tuple[np.ndarray, Region | None, bytes]] = []
@@ -269,7 +269,7 @@ def made_anew(
 @pytest.mark.parametrize(
     ("shape", "share"), [((610, 590), 0.0), ((610, 590), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)]
 )
-def test_mended_rectangles_are_those_made_anew(
+def test_updated_rectangles_are_those_made_anew(
     shape: tuple[int, int], share: float, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
     device, sectors = as_kind(kind), 2
@@ -287,7 +287,7 @@ def test_mended_rectangles_are_those_made_anew(
 def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(
     sectors: int, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
-    """In an empty map, 255 cells from the borders: what changes reaches as far as it can, and no farther."""
+    """In an empty map, 255 cells from the borders, the change reaches as far as it can, and no farther."""
     device, shape, place = as_kind(kind), (520, 530), (257, 262)
     occupied = np.zeros(shape, bool)
     rectangles = empty_rectangles(device, occupied, sectors)

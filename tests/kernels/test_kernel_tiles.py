@@ -56,7 +56,7 @@ WAYS = ("particles", "readings", "gaps")
 
 
 def cast_tiles(device: Backend, real: type, count: int, rays: int, spread: int, names: tuple[str, ...] = ()) -> Any:
-    """Ranges of the reference's cast_ranges and of a device's cast_tiles."""
+    """Return the ranges of a device's cast_tiles and of the reference's cast_ranges."""
     (cell, pose), ray = poses(count, real), rays_of(rays, real)
     order = an_order(count) if "ORDERED" in names else np.zeros(1, np.int32)
     flags = scene_flags(real, "ORIGINS_OUTSIDE", *names)
@@ -115,7 +115,7 @@ def test_launches_of_no_particles_write_nothing(device: Backend) -> None:
 def beam_tiles(
     device: Backend, name: str, real: type, count: int, rays: int, spread: int, way: str, names: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each reading adds, in the order's places, by a device's tiles and by the reference."""
+    """Return the term of each reading, in the order's places, by a device's tiles and by the reference."""
     (cell, pose), ray = poses(count, real), rays_of(rays, real)
     flags, terms = mixture(name, real, z_max=0.05)
     flags = scene_flags(real, "ORIGINS_OUTSIDE", *flags, *names)
@@ -152,7 +152,7 @@ TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
 @pytest.mark.parametrize("names", [(), ("ORDERED", "ALL_READINGS")])
 @pytest.mark.parametrize("way", WAYS)
 def test_tiles_that_add_up_strands(way: str, names: tuple[str, ...], device: Backend) -> None:
-    """The sums of strands, no more and no fewer, are those of what single readings add, to the bit."""
+    """The sums of strands, no more and no fewer, are those of the terms of single readings, to the bit."""
     for count, rays, spread in itertools.product((1, 17), (1, 3, 4, 16, 21, 53), SPREADS):
         found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, way, (*names, "STRANDED"))
         single, _ = beam_tiles(device, "book", np.float32, count, rays, spread, way, names)
@@ -205,7 +205,7 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 def field_blocks(
     device: Backend, name: str, real: type, names: tuple[str, ...], spread: int, way: str, readings: int, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums of blocks by a device and by the reference, and the reference's blocks of magnitudes."""
+    """Return sums of blocks by a device and by the reference, and the bound of each block."""
     flags = scene_flags(real, *FIELDS[name], *names)
     scene = field_scene(name, real, all_readings="ALL_READINGS" in names)
     some = np.resize(np.arange(150), count)

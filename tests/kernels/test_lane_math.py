@@ -22,7 +22,7 @@ COUNT = 1 << 22
 
 
 def spread(low: float, high: float) -> np.ndarray:
-    """Positive float32 numbers between two, both among them, evenly in their bits and in their values."""
+    """Return positive float32 numbers between two, both among them, evenly in their bits and in their values."""
     ends = np.array([low, high], np.float32)
     bits = np.linspace(*ends.view(np.int32).astype(np.float64), COUNT // 2).astype(np.int32).view(np.float32)
     return np.concatenate([bits, np.linspace(*ends, COUNT // 2, dtype=np.float32)])
@@ -39,7 +39,7 @@ FUNCTIONS = {
 
 @pytest.fixture
 def evaluate(needs):
-    """A function of the file at every number of an array, on the OpenCL device."""
+    """Return a function that evaluates a function of the file at every number of an array, on the OpenCL device."""
     selection = needs("opencl")
     import pyopencl as cl
 
@@ -80,7 +80,7 @@ def test_errors_in_ulps(function, evaluate):
 
 
 def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
-    """What is added to t for arctan t, in ulps of arctan t."""
+    """The rest that is added to t for arctan t, in ulps of arctan t."""
     t = spread(1e-30, 0.41421356)
     exact = np.arctan(t.astype(np.float64))
     off = np.abs(evaluate("arc_rest", t) - (exact - t)) / np.spacing(exact.astype(np.float32))
@@ -105,7 +105,7 @@ def test_ends(evaluate):
 
 
 def derived() -> ModuleType:
-    """bench/lane_constants.py."""
+    """Import bench/lane_constants.py."""
     path = ROOT / "bench" / "lane_constants.py"
     spec = importlib.util.spec_from_file_location("lane_constants", path)
     module = importlib.util.module_from_spec(spec)

@@ -22,7 +22,7 @@ KERNELS = ("cast_ranges", "score_beams", "score_field")
 
 @pytest.fixture
 def device(needs):
-    """The OpenCL device, asked for a number of lanes by the test."""
+    """Return a function that opens the OpenCL device with a number of lanes."""
     backend = get_backend(needs("opencl"))
     before = backend.info
 
@@ -35,7 +35,7 @@ def device(needs):
 
 
 def scene(particles: int, beams: int):
-    """Poses inside, on edges, in walls and off the map; a scan with max and missing readings."""
+    """Return poses inside, on edges, in walls and off the map; a scan with max and missing readings."""
     rng = np.random.default_rng([particles, beams])
     cells = rng.choice([0, 100, -1], (37, 53), p=[0.93, 0.05, 0.02])
     grid = gs.OccupancyGrid(cells, 0.25, (3.0, -2.0, 0.3))
@@ -64,7 +64,7 @@ def results(device, particles: int, beams: int, outside: str):
 
 @pytest.fixture
 def compiled(device, monkeypatch):
-    """The lanes of every kernel that was asked for, by its name."""
+    """Record the lanes of every kernel that is compiled, by its name."""
     backend, found = device(1), defaultdict(set)
     kind = type(backend)
     compile_ = kind.compile

@@ -90,7 +90,7 @@ for kind, precision, outside in itertools.product(("cpu", "gpu"), ("float32", "f
     casts = [gs.RayCaster(grid, 1.0, backend=b, precision=precision, outside=outside).cast(poses, bearings)
              for b in (BACKEND, "numpy")]
     wrong += np.count_nonzero(casts[0] != casts[1])
-# Tiles, orders, sums and blocks, which GPUs have: scans alone are scans with parts. Changed maps are mended.
+# Tiles, orders, sums and blocks, which GPUs have: scans alone are scans with parts. Tables of changed maps are updated.
 for order, (kind, options) in itertools.product(((1, 1), (1 << 22, 1 << 12)), (
     (gs.BeamModel, {}), (gs.BeamModel, dict(specialize=False)), (gs.LikelihoodFieldModel, {}),
     (gs.LikelihoodFieldModel, dict(specialize=False)), (gs.LikelihoodFieldModel, dict(compat="amcl")),
@@ -111,7 +111,7 @@ for method, outside in itertools.product((*CASTERS, March(0.5, "centre"), Lookup
     wrong += np.count_nonzero(casts[0] != casts[1])
 worst = 0.0
 field = gs.LikelihoodFieldParameters
-# What is accessed does not depend on the precision, so each kind of scene has one of its own.
+# Accesses do not depend on the precision, so each kind of scene has one.
 for parameters, (precision, specialize) in itertools.product(
     (gs.BeamParameters(), gs.BeamParameters(0.8, 0.1, 0.1, 0.0), gs.BeamParameters(1.0, 0.0, 0.0, 0.0),
      field(), field(0.9, 0.1, 0.0), field(interpolation="bilinear"), field(0.9, 0.1, 0.0, interpolation="bilinear")),
@@ -186,7 +186,7 @@ def test_every_opencl_kernel_runs_clean_and_right():
     check(run(_WORK, "opencl:oclgrind"))
 
 
-def test_oclgrind_would_tell():
+def test_oclgrind_detects_a_write_out_of_bounds():
     assert any("Invalid write" in line for line in complaints(run(_OUT_OF_BOUNDS)))
 
 
@@ -195,7 +195,7 @@ def test_every_warp_kernel_runs_clean_and_right_with_bounds_checks(needs):
     check(run(_WORK, "warp:cpu"))
 
 
-def test_warp_would_tell(needs, tmp_path):
+def test_warp_detects_a_write_out_of_bounds(needs, tmp_path):
     needs("warp")
     result = run(_WARP_OUT_OF_BOUNDS, "warp:cpu", str(tmp_path))
     assert result.returncode != 0

@@ -37,7 +37,7 @@ FAMOUS = 6381956970095103 * 2.0**797  # of all float64 numbers the nearest to a 
 
 
 def errors(theta: np.ndarray) -> np.ndarray:
-    """Errors of cosines and sines in ulps of float64, against as many digits as are needed."""
+    """Return errors of cosines and sines in ulps of float64, against as many digits as are needed."""
     found = []
     with mp.workdps(400):
         for angle, *values in zip(theta, *heading.cos_sin(theta), strict=True):
@@ -89,7 +89,7 @@ def test_no_heading_leaves_the_circle():
 
 
 def derived() -> ModuleType:
-    """bench/heading_constants.py."""
+    """Import bench/heading_constants.py."""
     path = ROOT / "bench" / "heading_constants.py"
     spec = importlib.util.spec_from_file_location("heading_constants", path)
     module = importlib.util.module_from_spec(spec)
@@ -143,7 +143,7 @@ def grid_of(name: str) -> gs.OccupancyGrid:
 
 
 def poses_of(name: str) -> np.ndarray:
-    """Poses inside and around the map, on edges and corners of cells, negative, huge, with headings of all kinds."""
+    """Return poses inside and around the map, on edges and corners of cells, negative, huge, with any headings."""
     resolution, origin, _ = FRAMES[name]
     rng = np.random.default_rng(6)
     theta = np.concatenate([rng.uniform(-7, 7, 1000), rng.uniform(-1e6, 1e6, 300), *ANGLES.values()])
@@ -165,7 +165,7 @@ def rounded(poses: np.ndarray, given_as: str) -> np.ndarray:
 def launch(
     backend: Backend, given_poses: np.ndarray, grid: gs.OccupancyGrid, mount, real: str, names=("CAREFUL",)
 ) -> dict[str, np.ndarray]:
-    """The kernel's outputs on a device."""
+    """Return the kernel's outputs on a device."""
     count, dtype = len(given_poses), np.dtype(real)
     flags = set(names) | ({"FLOAT64"} if real == "float64" else set())
     if (np.abs(given_poses[:, 2]) > heading.LIMIT).any():
@@ -244,7 +244,7 @@ def test_positions_and_headings_against_60_digits(name):
 
 
 def test_frames_without_yaw_and_mount_change_no_bit(backend):
-    """Nothing is added to what needs nothing: a heading is its own cosine and sine, a whole cell has no fraction."""
+    """Without yaw and mount nothing is added: a heading keeps its cosine and sine, a whole cell has no fraction."""
     poses = np.array([[3.0, 4.0, 0.1], [0.5, 0.25, -2.0], [600.0, 300.0, 1e5], [-0.0, -0.0, -0.0]])
     grid = gs.OccupancyGrid(np.zeros((ROWS, COLS), np.int8), 1.0)
     found = launch(get_backend(backend), poses, grid, (0.0, 0.0, 2.0), "float64")
@@ -273,7 +273,7 @@ NO_MOUNT = (0.0, 0.0, 0.0)
         (1e300, WINDOW.row, 1),
     ],
 )
-def test_one_sensor_outside_the_window_is_told(x, y, outside, backend):
+def test_one_sensor_outside_the_window_is_reported(x, y, outside, backend):
     poses = np.repeat(INSIDE, 1000, axis=0)
     poses[617, :2] = x, y
     assert launch(get_backend(backend), poses, PLAIN, NO_MOUNT, "float32")["verdict"].tolist() == [0, outside]
@@ -299,7 +299,7 @@ def test_a_verdict_is_kept_over_launches_until_it_is_cleared(backend):
 @pytest.mark.parametrize("yaw", [0.0, 3 * math.pi / 4])
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("given_as", PRECISIONS)
-def test_poses_that_are_not_finite_are_told_and_harmless(yaw, real, given_as, backend):
+def test_poses_that_are_not_finite_are_reported_and_harmless(yaw, real, given_as, backend):
     bad = np.repeat(INSIDE, 9, axis=0).astype(given_as)
     for i, (value, column) in enumerate(itertools.product((np.nan, np.inf, -np.inf), range(3))):
         bad[i, column] = value

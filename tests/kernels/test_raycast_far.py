@@ -28,7 +28,7 @@ from gpusense.reference.ray import crossed
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_long_corridors(backend, precision):
-    """20 000 cells along an axis and aslant: the far wall at its distance, whatever lies beside the way."""
+    """20 000 cells along an axis and aslant: the far wall at its distance, whatever lies beside the ray."""
     length = 20_000
     occupied = np.zeros((9, length), bool)
     occupied[:, -1] = True
@@ -48,7 +48,7 @@ MOST = 1 << 20
 
 
 def rounded(value: Fraction, real: np.dtype) -> Fraction:
-    """The number of a precision that is nearest, and even between two; for 0 and positive normal ones."""
+    """Return the nearest number of a precision, ties to even; for 0 and positive normal numbers."""
     if value == 0:
         return value
     exponent = math.floor(math.log2(value))

@@ -26,7 +26,7 @@ def robotlaser(ranges, start, view, step, range_max=80.0, remissions=(), name="R
 
 @pytest.fixture
 def log(tmp_path):
-    """Write lines to a log and give its path."""
+    """Return a function that writes lines to a log and returns its path."""
 
     def write(*lines, name="run.log", end="\n"):
         file = tmp_path / name
@@ -55,7 +55,7 @@ def test_plain_and_compressed(log, name, end):
     assert len(list(read_log(log(flaser([1.0]), flaser([2.0]), name=name, end=end)))) == 2
 
 
-def test_compression_is_told_by_content(log, tmp_path):
+def test_compression_is_recognised_by_content(log, tmp_path):
     file = log(flaser([1.0]), name="run.log.gz")
     assert len(list(read_log(file.rename(tmp_path / "run.log")))) == 1
 

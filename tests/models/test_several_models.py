@@ -34,7 +34,7 @@ def scans(scanner: gs.Scanner, *shape: int) -> np.ndarray:
 
 
 def models_of(backend: str) -> list[gs.BeamModel | gs.LikelihoodFieldModel]:
-    """Two maps, two sensors, two kinds."""
+    """Return models of two maps, two sensors, two kinds."""
     made: list[gs.BeamModel | gs.LikelihoodFieldModel] = [
         gs.BeamModel(grid(1, 40), SCANNERS[0], backend=backend),
         gs.LikelihoodFieldModel(grid(1, 40), SCANNERS[0], backend=backend, temperature=0.5),

@@ -1,4 +1,4 @@
-"""Drawing: where things land on the picture, what colours mean, and files written whole."""
+"""Drawing: places on the picture, meanings of colours, and files written whole."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TURNED = (5e5, -3e5, 0.6)
 
 
 def lone_cell(origin: tuple[float, float, float]) -> gs.OccupancyGrid:
-    """A grid of 20 x 30 cells of 0.1 m: one block occupied, one unknown, the rest free."""
+    """Return a grid of 20 x 30 cells of 0.1 m: one block occupied, one unknown, the rest free."""
     cells = np.zeros((20, 30), np.int8)
     cells[3:7, 20:25] = 100
     cells[12:17, 4:9] = -1
@@ -24,7 +24,7 @@ def lone_cell(origin: tuple[float, float, float]) -> gs.OccupancyGrid:
 
 
 def colour_at(figure, ax, x: float, y: float) -> tuple[float, ...]:
-    """The colour of the rendered pixel at a point of the axes' data, 0 to 1."""
+    """Return the colour of the rendered pixel at a point of the axes' data, 0 to 1."""
     figure.canvas.draw()
     pixels = np.asarray(figure.canvas.buffer_rgba())
     across, up = ax.transData.transform((x, y))

@@ -20,17 +20,17 @@ FOUND = 1e-7
 
 
 def turned(angle):
-    """A rotation matrix."""
+    """Return a rotation matrix."""
     return np.array([(math.cos(angle), -math.sin(angle)), (math.sin(angle), math.cos(angle))])
 
 
 def near_truth(fix, truth):
-    """The solution of a fix that is nearest to the truth (two circles have two)."""
+    """Return the solution of a fix that is nearest to the truth (two circles have two)."""
     return fix.solutions[np.argmin(np.hypot(*(fix.solutions[:, :2] - truth[:2]).T))]
 
 
 def apart(found, truth):
-    """The difference of two solutions, of headings within +-pi."""
+    """Return the difference of two solutions, of headings within +-pi."""
     difference = np.asarray(found) - truth[: len(found)]
     difference[2:] = np.remainder(difference[2:] + np.pi, 2 * np.pi) - np.pi
     return difference
@@ -136,7 +136,7 @@ def test_whole_turns_change_nothing(case):
 
 
 def lowest(case, xy, values, sigma, theta, loss, scale, centre):
-    """The lowest cost that SciPy finds from starts all over the scene: an oracle that knows no closed form."""
+    """Return the lowest cost that SciPy finds from starts all over the scene: an oracle without closed forms."""
     half = xy.shape[0]
 
     def residuals(state):

@@ -1,4 +1,4 @@
-"""Geometry that leaves no position, two, or infinitely many: each is named, and what can be said is said."""
+"""Geometry that leaves no position, two, or infinitely many: each is named, with all that is determined."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_a_robot_on_the_circle_through_its_beacons(place, turn):
             fixes.append(gs.triangulate_triangle(xy, bearings))
         for fix in fixes:
             assert (fix.status, fix.degenerate, len(fix)) == ("circle", True, 0)
-    # A heading, or a beacon off the circle, mends it.
+    # A heading, or a beacon off the circle, removes the ambiguity.
     xy = place(SQUARE)
     theta = 0.7
     assert near(gs.triangulate(xy, bearings_to(xy, (*robot, theta)), theta), robot, atol=1e-5)
@@ -210,7 +210,7 @@ def test_three_bearings_in_bad_places(place):
     robot = place(np.array([(-3.0, 0.0)]))[0]
     fix = gs.triangulate_triangle(xy, bearings_to(xy, (*robot, -1.0)))
     assert fix.status == "unique" and near(fix, (*robot, -1.0), atol=1e-5)
-    # Equal bearings of three beacons that are not in line: nobody sees that.
+    # Equal bearings of three beacons that are not in line: no pose sees that.
     assert gs.triangulate_triangle(xy, (0.2, 0.2, 0.2)).status == "behind"
     # Beacons in the wrong order around the robot.
     inside = bearings_to(xy, (*place(np.array([(3.0, 1.5)]))[0], 0.0))

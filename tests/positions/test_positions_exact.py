@@ -16,7 +16,7 @@ FAR = [(0.0, 0.0), (5e6, 4.5e5)]
 
 
 def exact_circles(xy, ranges):
-    """Both crossings by the lectures' formulas in their own frame, turned and moved back."""
+    """Return both crossings by the lectures' formulas in their own frame, turned and moved back."""
     (x1, y1), (x2, y2) = [[mp.mpf(float(v)) for v in row] for row in xy]
     d1, d2 = (mp.mpf(float(d)) for d in ranges)
     a = mp.hypot(x2 - x1, y2 - y1)
@@ -76,7 +76,7 @@ def test_flat_triangles_keep_their_digits():
 
 
 def exact_pose(xy, bearings, start):
-    """The pose of three bearings by Newton's method; the unknowns are relative to the first beacon."""
+    """Return the pose of three bearings by Newton's method; the unknowns are relative to the first beacon."""
     m = [mp.mpc(float(x), float(y)) for x, y in xy]
     b = [mp.mpf(float(v)) for v in bearings]
 

@@ -10,13 +10,13 @@ import pytest
 
 import gpusense as gs
 
-# What single sightings show against the reference pose, the map's and the reference's own errors included.
+# Errors of single sightings against the reference pose, the map's and the reference's own errors included.
 SIGMA_RANGE, SIGMA_BEARING = 0.06, 0.03
 
 
 @pytest.fixture(scope="module")
 def sightings(data_dir):
-    """Moments at which two or more mapped beacons were seen: reference pose, beacons, ranges, bearings."""
+    """Return the moments at which two or more mapped beacons were seen: reference pose, beacons, ranges, bearings."""
     folder = data_dir / "beacons_enmt482"
     rows = np.genfromtxt(folder / "beacon_map.csv", delimiter=",", skip_header=1)
     places = {int(row[0]): row[1:3] for row in rows}
@@ -36,12 +36,12 @@ def sightings(data_dir):
 
 
 def errors(fixes, truths):
-    """Distances of the solutions nearest to the truth from it [m]."""
+    """Return the distance of the nearest solution of each fix from the truth [m]."""
     return np.array([np.hypot(*(f.solutions[:, :2] - t[:2]).T).min() for f, t in zip(fixes, truths, strict=True)])
 
 
 def quantiles(values):
-    """The median and the 90 % quantile."""
+    """Return the median and the 90 % quantile."""
     return np.quantile(values, [0.5, 0.9])
 
 
@@ -74,7 +74,7 @@ def test_two_fiducials(sightings):
 
 
 def cylinders(ranges):
-    """Bearings and ranges of cylinders in a scan of the LEGO robot: what lies between a jump nearer and one farther."""
+    """Return bearings and ranges of cylinders in a scan of the LEGO robot: between a jump nearer and one farther."""
     bearings = (np.arange(ranges.size) - 330) * 0.006135923 - 0.0698
     seen = ranges > 0.02
     found, inside = [], []

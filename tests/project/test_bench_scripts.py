@@ -1,4 +1,4 @@
-"""The benchmark scripts run on tiny sizes and write what they say; bench/ is no part of the wheel."""
+"""The benchmark scripts run on tiny sizes and write their reports; bench/ is no part of the wheel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BENCH = ROOT / "bench"
 
 
 def run_script(name: str, *arguments: str, output: Path) -> dict:
-    """The report of a script; its Markdown must be there, too."""
+    """Return the report of a script; its Markdown must be there, too."""
     command = [sys.executable, str(BENCH / name), *arguments, "--output", str(output)]
     # Scripts import their neighbours, which a safe path forbids.
     own = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
@@ -41,7 +41,7 @@ def run_script(name: str, *arguments: str, output: Path) -> dict:
 
 @pytest.fixture
 def scaling(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script as a module."""
+    """Import the script as a module."""
     monkeypatch.syspath_prepend(str(BENCH))
     return importlib.import_module("scaling")
 
@@ -74,7 +74,7 @@ def test_scaling_runs(selection: str, needs: Callable[[str], str], tmp_path: Pat
     assert drawn.stat().st_size > 10_000
 
 
-def test_what_does_not_fit_is_listed(needs: Callable[[str], str], tmp_path: Path) -> None:
+def test_sizes_that_do_not_fit_are_listed(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = [*SMALL, "--particles", "100,100000000", "--longest", "1e-9"]
     report = run_script("scaling.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "none")
     (device,) = report["devices"]
@@ -173,7 +173,7 @@ def test_absolute_runs(selection: str, needs: Callable[[str], str], tmp_path: Pa
 
 
 def test_sonar_field_runs(tmp_path: Path) -> None:
-    """Every way is tuned and scored, and the drawings are made; the recorded run is left out where there is none."""
+    """Every method is tuned and scored, and the drawings are made; an absent recorded run is left out."""
     report = run_script(
         "sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4", "--particles", "30",
         "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
@@ -314,7 +314,7 @@ def test_stretches_of_machine_code_end_at_labels_and_branches(
 
 
 def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
-    """A recorded map, on every device that is here."""
+    """A recorded map, on every device that is present."""
     arguments = ["--data", str(data_dir), "--map", "columbia", "--log", "none"]
     report = run_script("real_scores.py", *arguments, output=tmp_path / "real")
     rows = report["maps"]

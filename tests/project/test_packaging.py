@@ -83,7 +83,7 @@ print(module.double.func.__module__, values.numpy().tolist())
 
 @dataclass(frozen=True)
 class Layout:
-    """A way the package lies on a disk, and how to start Python so that it is the one imported."""
+    """Says where the package lies on a disk, and starts Python so that it is the one imported."""
 
     package: Path
     kernels: Path
@@ -124,7 +124,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the checkout in a folder with a space in its name; builds write nothing into the real one."""
+    """Copy the checkout to a folder with a space in its name; builds write nothing into the real one."""
     copy = tmp_path_factory.mktemp("check out") / "gpu sense"
     copy.mkdir()
     for path in ROOT.iterdir():
@@ -137,7 +137,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def sdist(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The unpacked source distribution, built without a network."""
+    """Build the source distribution without a network and unpack it."""
     folder = tmp_path_factory.mktemp("sdist")
     run([sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", folder, checkout], cwd=folder)
     with tarfile.open(next(folder.glob("*.tar.gz"))) as archive:
@@ -155,19 +155,19 @@ def unpacked_wheel(source: Path, folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The unpacked wheel, built from the checkout."""
+    """Build the wheel from the checkout and unpack it."""
     return unpacked_wheel(checkout, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def wheel_of_sdist(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The unpacked wheel, built from the source distribution."""
+    """Build the wheel from the source distribution and unpack it."""
     return unpacked_wheel(sdist, tmp_path_factory.mktemp("wheel-of-sdist"))
 
 
 @pytest.fixture(scope="module")
 def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The interpreter of a new virtual environment into which pip -e installs the copied checkout."""
+    """Return the interpreter of a new virtual environment into which pip -e installs the copied checkout."""
     environment = tmp_path_factory.mktemp("editable") / "venv"
     run([sys.executable, "-m", "venv", "--without-pip", environment], cwd=environment.parent)
     scripts = environment / ("Scripts" if os.name == "nt" else "bin")
@@ -185,7 +185,7 @@ def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 @pytest.fixture(params=["wheel", "sdist", "editable", "checkout"])
 def layout(request: pytest.FixtureRequest, checkout: Path) -> Layout:
-    """Each way in which the package may lie on a disk."""
+    """Return each layout of the package on a disk in turn."""
     if request.param == "editable":
         python: Path = request.getfixturevalue("editable_python")
         return Layout(checkout / "gpusense", checkout / "kernels", search_path=None, python=python)

@@ -11,18 +11,18 @@ mp.mp.dps = 60
 
 
 def number(value: Any) -> Any:
-    """A float as it is."""
+    """Return a float as it is."""
     return mp.mpf(float(value))
 
 
 def log_mixture(z_hit: float, hit: Any, z_rand: float, rand: Any) -> float:
-    """Log of two weighted densities' sum."""
+    """Return the log of two weighted densities' sum."""
     p = number(z_hit) * hit + number(z_rand) * rand
     return float(mp.log(p)) if p > 0 else -mp.inf
 
 
 def antenna(pose: Sequence[float], mount: Sequence[float]) -> tuple[Any, Any]:
-    """Where the antenna is in the world."""
+    """Return the place of the antenna in the world."""
     x, y, theta = (number(v) for v in pose)
     c, s = mp.cos(theta), mp.sin(theta)
     mx, my = number(mount[0]), number(mount[1])
@@ -30,7 +30,7 @@ def antenna(pose: Sequence[float], mount: Sequence[float]) -> tuple[Any, Any]:
 
 
 def position(pose: Any, fix: Any, p: Any, covariance: Any = None) -> float:
-    """log p of a position fix."""
+    """Return log p of a position fix."""
     if covariance is None:
         covariance = p.covariance
     if covariance is None:
@@ -49,7 +49,7 @@ def position(pose: Any, fix: Any, p: Any, covariance: Any = None) -> float:
 
 
 def heading(theta: float, reading: float, p: Any) -> float:
-    """log p of a heading."""
+    """Return log p of a heading."""
     r = number(reading) - number(p.offset) - number(theta)
     r -= 2 * mp.pi * mp.nint(r / (2 * mp.pi))
     if p.kind == "von_mises":
@@ -66,13 +66,13 @@ def heading(theta: float, reading: float, p: Any) -> float:
 
 
 def normal_density(r: Any, near: Any, far: Any, sigma: Any) -> Any:
-    """A normal with its mean near and far from the ends of an interval, at r from the mean."""
+    """Return a normal density at r from its mean, truncated to an interval that ends near and far from the mean."""
     mass = (mp.erf(near / sigma / mp.sqrt(2)) + mp.erf(far / sigma / mp.sqrt(2))) / 2
     return mp.exp(-((r / sigma) ** 2) / 2) / (sigma * mp.sqrt(2 * mp.pi)) / mass
 
 
 def t_density(r: Any, near: Any, far: Any, sigma: Any, nu: int) -> Any:
-    """The same of a Student t, by the incomplete beta function."""
+    """Return the same of a Student t, by the incomplete beta function."""
     half = mp.mpf(nu) / 2
     peak = mp.gamma(half + 0.5) / mp.gamma(half) / mp.sqrt(nu * mp.pi) / sigma
 
@@ -84,7 +84,7 @@ def t_density(r: Any, near: Any, far: Any, sigma: Any, nu: int) -> Any:
 
 
 def beacon(pose: Any, xy: Any, reading: float, p: Any) -> float:
-    """log p of one range."""
+    """Return log p of one range."""
     at = antenna(pose, p.mount)
     d = mp.hypot(number(xy[0]) - at[0], number(xy[1]) - at[1]) + number(p.bias)
     longest = number(p.range_max)
@@ -101,7 +101,7 @@ def beacon(pose: Any, xy: Any, reading: float, p: Any) -> float:
 
 
 def bump(squared_cells: int, side: float, radius: float, pressed: bool, p: Any) -> float:
-    """log P of a bumper whose nearest obstacle's centre is so far from the centre of the outline's cell."""
+    """Return log P of a bumper, from the squared distance of the nearest obstacle's centre to the outline's cell's."""
     gap = mp.sqrt(int(squared_cells)) * number(side) - number(side) / 2 - number(radius)
     x = gap / number(p.sigma) / mp.sqrt(2)
     # Beyond a few thousand nats mpmath's erfc is slow to ask and 0 all the same beside anything else.
@@ -114,7 +114,7 @@ def bump(squared_cells: int, side: float, radius: float, pressed: bool, p: Any) 
 
 
 def placed_point(pose: Any, point: Any, origin: Sequence[float], side: float) -> tuple[Any, Any, Any, Any]:
-    """Where a point of a robot is in a grid, in cells."""
+    """Return the place of a point of a robot in a grid, in cells."""
     x, y = antenna(pose, point)
     dx, dy, yaw = x - number(origin[0]), y - number(origin[1]), number(origin[2])
     c, s, cell = mp.cos(yaw), mp.sin(yaw), number(side)

@@ -20,7 +20,7 @@ SQUARE = np.array([(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)])
 
 
 def poses_around(grid: gs.OccupancyGrid, count: int = 60, seed: int = 1) -> np.ndarray:
-    """Poses in the grid and a little around it."""
+    """Return poses in the grid and a little around it."""
     rng = np.random.default_rng(seed)
     x, y = (rng.uniform(-0.2, n * grid.resolution + 0.2, count) for n in grid.shape[::-1])
     c, s = np.cos(grid.origin[2]), np.sin(grid.origin[2])
@@ -32,7 +32,7 @@ def poses_around(grid: gs.OccupancyGrid, count: int = 60, seed: int = 1) -> np.n
 
 
 def models(backend: str, precision: str = "float32", **options: float) -> dict[str, tuple[Any, tuple[Any, ...]]]:
-    """One model of each sensor and what it measures."""
+    """Return one model of each sensor and a measurement of it."""
     own: dict[str, Any] = dict(backend=backend, precision=precision, **options)
     return {
         "position": (gs.PositionModel(gs.PositionParameters(sigma=1.0, mount=(0.1, 0.2)), **own), ((5e6, -1.0),)),
@@ -43,7 +43,7 @@ def models(backend: str, precision: str = "float32", **options: float) -> dict[s
 
 
 def assert_close(found: np.ndarray, truth: object, precision: str, terms: np.ndarray | None = None) -> None:
-    """Within 16 eps (1 + |log p|) of each reading; infinite where the truth is."""
+    """Check results to within 16 eps (1 + |log p|) of each reading; infinite where the truth is."""
     truth = np.array(truth, float)
     size = 1 + np.abs(truth) if terms is None else (1 + np.abs(terms)).sum(axis=-1)
     assert not np.isnan(found).any()

@@ -1,4 +1,4 @@
-"""A library of arrays that is none: what it exports and imports is NumPy's or Warp's."""
+"""A made-up library of arrays, which exports and imports NumPy's or Warp's; arrays of Warp's processor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CPU, CUDA = 1, 2
 
 
 def counted_copies(monkeypatch: Any, backend: type) -> list[tuple[str, int]]:
-    """Bytes that a backend's class copies to the device ("up") and back ("down") from now on."""
+    """Record the bytes that a backend's class copies to the device ("up") and back ("down") from now on."""
     seen: list[tuple[str, int]] = []
     upload, download = backend.upload, backend.download
 
@@ -37,7 +37,7 @@ def to_device(array: np.ndarray):
 
 
 class Array:
-    """Delegates DLPack to another array; ``device`` is what it says of its memory."""
+    """Delegates DLPack to another array, and claims memory of a kind of ``device``."""
 
     def __init__(self, held: Any, device: int = CPU) -> None:
         self.held, self.device = held, device
@@ -57,7 +57,7 @@ class Array:
 
 
 class OldArray(Array):
-    """One of the first version, which cannot say whether memory may be written."""
+    """Exports DLPack's first version, which cannot say whether memory may be written."""
 
     def __dlpack__(self, stream: Any = None) -> Any:
         return self.held.__dlpack__()
@@ -67,7 +67,7 @@ class OldArray(Array):
 
 
 class Recorded(Array):
-    """One whose gradients are recorded, as PyTorch's are: it is not exported, and does not become NumPy's."""
+    """Records gradients, as PyTorch's arrays do: it is not exported, and does not become NumPy's."""
 
     requires_grad = True
 
@@ -86,7 +86,7 @@ def from_dlpack(held: Any) -> Array:
 
 
 def installed(monkeypatch: Any) -> None:
-    """The module ``fakelib`` with its ``from_dlpack`` and its arrays."""
+    """Install the module ``fakelib`` with its ``from_dlpack`` and its arrays."""
     module = types.ModuleType("fakelib")
     module.from_dlpack, module.Array = from_dlpack, Array
     monkeypatch.setitem(sys.modules, "fakelib", module)

@@ -1,4 +1,4 @@
-"""What bad input to the map, the scanner, the parameters and the logs is made with.
+"""Types and files for bad input to the map, the scanner, the parameters and the logs.
 
 Each case is (id, action, exception type, message). The action takes an empty folder; the files that it reads it first
 writes to ``input`` in there, so anything outside ``input`` was left behind by the library. ``{tmp}`` in a message

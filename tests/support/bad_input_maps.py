@@ -39,7 +39,7 @@ def yaml_with(text: str | bytes) -> Action:
 
 
 def png(cols: int, rows: int, raster: bytes) -> bytes:
-    """A grey PNG file that claims a size, with image data of any length."""
+    """Return a grey PNG file that claims a size, with image data of any length."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -50,7 +50,7 @@ def png(cols: int, rows: int, raster: bytes) -> bytes:
 
 
 def bmp(cols: int, rows: int, compression: int = 0, raster: bytes = b"") -> bytes:
-    """A BMP file of 24 bits that claims a size."""
+    """Return a BMP file of 24 bits that claims a size."""
     info = struct.pack("<IiiHHIIiiII", 40, cols, rows, 1, 24, compression, 0, 0, 0, 0, 0)
     return b"BM" + struct.pack("<IHHI", 54 + len(raster), 0, 0, 54) + info + raster
 

@@ -38,12 +38,12 @@ def beam(**changes: Any) -> Action:
 
 
 def field(**changes: Any) -> Action:
-    """The same for a likelihood field."""
+    """Make a likelihood field of which some arguments are bad."""
     return lambda: gs.LikelihoodFieldModel(**{"grid": GRID, "scanner": SCANNER, "backend": "numpy", **changes})
 
 
 def caster(**changes: Any) -> Action:
-    """The same for a ray caster."""
+    """Make a ray caster of which some arguments are bad."""
     return lambda: gs.RayCaster(**{"grid": GRID, "range_max": 5.0, "backend": "numpy", **changes})
 
 
@@ -58,12 +58,12 @@ def cast(poses: Any = POSE, bearings: Any = (0.0,)) -> Action:
 
 
 def distances(obstacles: Any) -> Action:
-    """A distance transform."""
+    """Compute a distance transform."""
     return lambda: gs.distance_transform(obstacles, backend="numpy")
 
 
 def absent(selection: str) -> Callable[[], str]:
-    """The message for a device that is not there: those that are, or why there is none and what mends it."""
+    """Return the message for a device that is absent: those present, or why there is none and the remedy."""
 
     def message() -> str:
         own = [device for device in gs.devices() if device.backend == selection.partition(":")[0]]
@@ -343,7 +343,7 @@ BACKEND_CASES = [
 
 
 def grid_array_message() -> str:
-    """The message for an array in place of a grid."""
+    """Return the message for an array in place of a grid."""
     return "grid: must be an OccupancyGrid, got array([[0., 0.], [0., 0.]])"
 
 

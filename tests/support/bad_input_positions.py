@@ -18,17 +18,17 @@ def ranges(xy: Any = XY, values: Any = (1.0, 2.0, 3.0), **options: Any) -> Actio
 
 
 def bearings(xy: Any = XY, values: Any = (0.1, 0.2, 0.3), **options: Any) -> Action:
-    """The same from bearings."""
+    """Triangulate with bad arguments."""
     return lambda: gs.triangulate(xy, values, **options)
 
 
 def triangle(xy: Any = XY, values: Any = (0.1, 0.2, 0.3), **options: Any) -> Action:
-    """The same from three bearings."""
+    """Triangulate three bearings with bad arguments."""
     return lambda: gs.triangulate_triangle(xy, values, **options)
 
 
 def both(xy: Any = XY, r: Any = (1.0, 2.0, 3.0), b: Any = (0.1, 0.2, 0.3), **options: Any) -> Action:
-    """The same from both."""
+    """Locate from both with bad arguments."""
     return lambda: gs.locate(xy, r, b, **{"sigma_range": 0.1, "sigma_bearing": 0.1, **options})
 
 

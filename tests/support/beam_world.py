@@ -19,7 +19,7 @@ def rounded(value: float, precision: str) -> float:
 
 
 def parameters(precision: str, range_max: float, sigma: float, rate: float, weights: tuple[float, ...]):
-    """Parameters that the precision holds exactly, so that the truth is asked the same question."""
+    """Return parameters that the precision holds exactly, so that the truth is asked the same question."""
     own = [rounded(w, precision) for w in weights]
     return gs.BeamParameters(
         *own, sigma_hit=rounded(sigma * range_max, precision), lambda_short=rounded(rate / range_max, precision)

@@ -36,7 +36,7 @@ def plan_of(*chosen, **changes):
 
 
 def candidate(run, problem="ranges", **changes):
-    """A candidate whose runner calls ``run(scene, poses)``."""
+    """Return a candidate whose runner calls ``run(scene, poses)``."""
 
     class Made:
         def __init__(self, scene):
@@ -50,7 +50,7 @@ def free_ranges(scene, poses):
 
 
 def made_point(**changes):
-    """A point of a report."""
+    """Return a point of a report."""
     point = {
         "scene": "s", "cloud": "global", "problem": "ranges", "backend": "numpy", "device": "d", "kind": "cpu",
         "method": "exact", "variant": "", "knob": "", "value": None, "precision": "float32", "exact": False,

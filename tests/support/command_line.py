@@ -21,7 +21,7 @@ def script(code: str, *, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def error_of(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line that a bad call prints, without the program's name."""
+    """Return the one line that a bad call prints, without the program's name."""
     assert cli.main(argv) == 2
     out, err = capsys.readouterr()
     assert out == ""

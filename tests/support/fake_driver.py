@@ -1,4 +1,4 @@
-"""OpenCL drivers that fail: PoCL behind a library of our own, built with the C compiler, that spoils one function."""
+"""OpenCL drivers that fail: PoCL behind a library, built here with the C compiler, that spoils one function."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ int32_t clGetPlatformInfo(void *platform, uint32_t what, size_t size, void *valu
 
 
 def pocl_library() -> str:
-    """The library of PoCL's wheel; the test is skipped without it."""
+    """Return the library of PoCL's wheel; skip the test without it."""
     import pyopencl
 
     found = sorted((Path(pyopencl.__file__).parent / ".libs").glob("libpocl*.so*"))
@@ -113,11 +113,11 @@ def build(folder: Path, mode: str, word: str = "distance", instead: str = "") ->
     """Build a driver and its ``.icd`` file.
 
     Args:
-        folder: Where.
+        folder: The folder for the library and ``vendors``.
         mode: ``"abort"``, ``"hang"`` or ``"refuse"`` when it builds a program, ``"wrong"`` to change what a program
             computes, ``"load"`` to abort when it is loaded, ``""`` for none of these.
-        word: What stands in the programs that it spoils.
-        instead: What stands there in a wrong program, of the same length.
+        word: A text of the programs that it spoils.
+        instead: The text of the same length that replaces it in a wrong program.
     """
     compiler = shutil.which("cc") or shutil.which("gcc")
     if not sys.platform.startswith("linux"):
@@ -137,7 +137,7 @@ def build(folder: Path, mode: str, word: str = "distance", instead: str = "") ->
 
 
 def environment(folder: Path, **variables: str) -> dict[str, str]:
-    """The environment of a process with a cold cache of its own."""
+    """Return the environment of a process with a cold cache."""
     (folder / "temporary").mkdir(exist_ok=True)
     places = {
         "GPUSENSE_CACHE_DIR": str(folder / "cold"),

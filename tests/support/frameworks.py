@@ -12,7 +12,7 @@ import gpusense as gs
 
 
 def framework(name: str) -> tuple[Any, ...]:
-    """A GPU's backend, and what makes an array there, what copies one back, and where it lies."""
+    """Return a GPU's backend, and functions that make an array there, copy one back, and give its address."""
     module = pytest.importorskip(name)
     cuda = next((d.selection for d in gs.devices() if d.available and d.selection.startswith("warp:cuda")), None)
     if cuda is None:

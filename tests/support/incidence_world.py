@@ -17,7 +17,7 @@ INCIDENCE = gs.IncidenceParameters(EDGES, KINDS)
 
 
 def place() -> tuple[gs.OccupancyGrid, np.ndarray, np.ndarray]:
-    """A slanted wall, a round post, a thick block and dots; poses all over, some in walls or off the map; bearings."""
+    """Return a slanted wall, a round post, a thick block and dots; poses, some in walls or off the map; bearings."""
     rng = np.random.default_rng(6)
     cells = np.zeros((90, 120), int)
     x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)

@@ -38,12 +38,12 @@ def run(
 
 
 def on_both(device: Backend, *call: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The outputs of a launch on the reference and on a device."""
+    """Return the outputs of a launch on the reference and on a device."""
     return run(get_backend("numpy"), *call), run(device, *call)
 
 
 def grids() -> dict[str, np.ndarray]:
-    """Small maps: ordinary, degenerate, thin, empty and full."""
+    """Return small maps: ordinary, degenerate, thin, empty and full."""
     rng = np.random.default_rng(7)
     rooms = np.zeros((61, 83), bool)
     rooms[[0, 30, 60]] = rooms[:, [0, 41, 82]] = True
@@ -68,7 +68,7 @@ each_grid = pytest.mark.parametrize("occupied", GRIDS.values(), ids=list(GRIDS))
 
 
 def directions(real: type) -> np.ndarray:
-    """(M, 2) cosines and sines: the axes and diagonals exactly, next to them, denormal, and some of no kind."""
+    """Return (M, 2) cosines and sines: the axes and diagonals exactly, next to them, denormal, and ordinary ones."""
     half, tiny = np.sqrt(0.5), np.finfo(real).smallest_subnormal
     exact = [(1, 0), (-1, 0), (0, 1), (0, -1), (-1, -0.0), (-0.0, 1)]
     diagonal = [(half, half), (-half, half), (half, -half), (-half, -half)]
@@ -78,7 +78,7 @@ def directions(real: type) -> np.ndarray:
 
 
 def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Cells and poses: fractions on edges, corners and next to them, in every kind of direction."""
+    """Return cells and poses: fractions on edges, corners and next to them, in every kind of direction."""
     rng = np.random.default_rng(13)
     rows, cols = occupied.shape
     tiny, below_one = np.finfo(real).smallest_subnormal, np.nextafter(real(1), real(0))
@@ -116,7 +116,7 @@ def sector_flags(sectors: int) -> frozenset[str]:
 
 
 def planes_of(occupied: np.ndarray, sectors: int = 1, kind: str = "cpu") -> np.ndarray:
-    """(4, sectors, rows + 2, cols + 2) rectangles by the reference's kernels for processors or for GPUs."""
+    """Return (4, sectors, rows + 2, cols + 2) rectangles by the reference's kernels for processors or for GPUs."""
     return _planes(occupied.tobytes(), occupied.shape, sectors, kind)
 
 
@@ -141,7 +141,7 @@ def ranges_on_both(
     pose: np.ndarray,
     sectors: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Expected ranges along every kind of bearing, by the reference with 1 sector and by a device with any number."""
+    """Return ranges along every kind of bearing, by the reference with 1 sector and by a device with any number."""
     ray = directions(real)
     ranges = np.full((len(pose), len(ray)), np.nan, real)
     size, counts = (len(ray), len(pose)), (*occupied.shape, len(pose), len(ray))
@@ -153,7 +153,7 @@ def ranges_on_both(
 
 
 def with_low_parts(terms, real):
-    """Rounded terms, then what rounding took from the first two."""
+    """Return rounded terms, then the rounding errors (low parts) of the first two."""
     rounded = np.array(terms).astype(real)
     with np.errstate(invalid="ignore"):
         low = np.nan_to_num(np.array(terms[:2]) - rounded[:2])
@@ -161,7 +161,7 @@ def with_low_parts(terms, real):
 
 
 def squared_distances(occupied: np.ndarray) -> np.ndarray:
-    """SciPy's squared distances; UNREACHABLE without obstacles."""
+    """Return SciPy's squared distances; UNREACHABLE without obstacles."""
     if not occupied.any():
         return np.full(occupied.shape, UNREACHABLE, np.int32)
     nearest = distance_transform_edt(~occupied, return_distances=False, return_indices=True)
@@ -169,7 +169,7 @@ def squared_distances(occupied: np.ndarray) -> np.ndarray:
 
 
 def assert_near(found: np.ndarray, truth: np.ndarray, bound: np.ndarray) -> None:
-    """Equal infinities, no NaN, and every difference within its bound."""
+    """Check for equal infinities, no NaN, and every difference within its bound."""
     assert not np.isnan(found).any()
     np.testing.assert_array_equal(np.isneginf(found), np.isneginf(truth))
     finite = np.isfinite(truth)

@@ -1,4 +1,4 @@
-"""A robot among landmarks, made up: poses, what it finds in each, and a folder of such a run in MRCLAM's format."""
+"""A simulated robot among landmarks: poses, its features at each, and a folder of such a run in MRCLAM's format."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIGMA_RANGE, SIGMA_BEARING, Z_FALSE, P_DETECT, RANGE_MAX = 0.12, 0.04, 0.08, 0.6
 
 @dataclass(frozen=True)
 class Seen:
-    """Features of all scans, the landmark and the scan of each, and which are false positives."""
+    """Holds the features of all scans, the landmark and the scan of each, and which are false positives."""
 
     xy: np.ndarray
     poses: np.ndarray
@@ -28,7 +28,7 @@ def wrap(angle):
 
 
 def simulate(seed, *, scans=120, landmarks=12, field_of_view=2 * math.pi, bias=(0.0, 0.0), noise=1.0):
-    """Features by the landmark model's own definition: in view, detected, within the limits, some replaced."""
+    """Draw features by the landmark model's own definition: in view, detected, within the limits, some replaced."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-5, 5, (landmarks, 2))
     poses = np.column_stack([rng.uniform(-4, 4, (scans, 2)), rng.uniform(-9, 9, scans)])
@@ -52,7 +52,7 @@ def simulate(seed, *, scans=120, landmarks=12, field_of_view=2 * math.pi, bias=(
 
 
 def write_run(folder: Path, *, seed: int = 0, swap: tuple[int, int] | None = None, seconds: float = 60.0) -> Path:
-    """A run of robot 1 in MRCLAM's files: subjects 6 to 15, barcodes 100 more; subjects of ``swap`` exchanged."""
+    """Write a run of robot 1 in MRCLAM's files: subjects 6 to 15, barcodes 100 more; subjects of ``swap`` exchanged."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-4, 4, (10, 2))
     time = np.arange(0, seconds, 0.1)

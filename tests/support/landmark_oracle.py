@@ -1,7 +1,7 @@
 """The landmark model in mpmath, written from its definition: every landmark, no gate, no buckets, no logarithm sums.
 
 ``exact_inputs`` takes the numbers that kernels get, so that what is judged is their arithmetic and not the rounding of
-positions, which no kernel can mend.
+positions, which no kernel can undo.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Table = tuple[list[Any], list[Any], Any]
 
 @dataclass(frozen=True)
 class Seen:
-    """A sensor: position, cosine and sine of its axis's heading (mount's yaw left out)."""
+    """Holds a sensor: position, cosine and sine of its axis's heading (mount's yaw left out)."""
 
     x: Any
     y: Any
@@ -33,7 +33,7 @@ class Seen:
 
 
 def wrap(angle: Any) -> Any:
-    """To (-pi, pi]."""
+    """Wrap an angle to (-pi, pi]."""
     return angle - 2 * mp.pi * mp.ceil((angle - mp.pi) / (2 * mp.pi))
 
 
@@ -42,13 +42,13 @@ def normal(residual: Any, sigma: Any) -> Any:
 
 
 def mass(low: Any, high: Any, sigma: Any) -> Any:
-    """Of a normal around 0 on [low, high]."""
+    """Return the mass of a normal around 0 on [low, high]."""
     scale = sigma * mp.sqrt(2)
     return (mp.erf(high / scale) - mp.erf(low / scale)) / 2
 
 
 def bearing_mass(expected: Any, half: Any, sigma: Any) -> Any:
-    """Mass of the wrapped difference to an expected bearing on [-half, half]; at the nearer end for one beyond."""
+    """Return the mass of the wrapped difference to a bearing on [-half, half]; at the nearer end for one beyond."""
     expected = min(max(expected, -half), half)
     low, high, found = -half - expected, half - expected, mp.mpf(0)
     for turn in (-1, 0, 1):
@@ -69,7 +69,7 @@ def span_of(p: gs.LandmarkParameters, signatures: Any) -> tuple[Any, Any]:
 def density(
     p: gs.LandmarkParameters, seen: Seen, landmark: Any, feature: Any, turn: Any, signature: Any, span: Any
 ) -> Any:
-    """p(f | j); ``turn`` is (cosine, sine) of the bearing on the robot."""
+    """Return p(f | j); ``turn`` is (cosine, sine) of the bearing on the robot."""
     dx, dy = landmark[0] - seen.x, landmark[1] - seen.y
     d, found = mp.sqrt(dx * dx + dy * dy), mp.mpf(1)
     if p.sigma_range is not None and feature[0] is not None:
@@ -106,7 +106,7 @@ def uniform(p: gs.LandmarkParameters, feature: Any, span: Any) -> Any:
 
 
 def candidate(p: gs.LandmarkParameters, seen: Seen, landmark: Any, feature: Any, yaw: float) -> bool:
-    """Whether an unknown feature may be a landmark: what it does not measure is within the sensor's limits."""
+    """Return whether an unknown feature may be a landmark: the parts not measured are within the sensor's limits."""
     dx, dy = landmark[0] - seen.x, landmark[1] - seen.y
     d = mp.sqrt(dx * dx + dy * dy)
     if (p.sigma_range is None or feature[0] is None) and d > p.range_max:
@@ -124,7 +124,7 @@ def log(p: Any) -> float:
 
 @dataclass(frozen=True)
 class World:
-    """Sensors, landmarks, features and their turns as exact numbers."""
+    """Holds sensors, landmarks, features and their turns as exact numbers."""
 
     seen: list[Seen]
     landmarks: list[Any]
@@ -134,7 +134,7 @@ class World:
 
 
 def exact_inputs(model: gs.LandmarkModel, poses: Any, features: Any, *, rounded: bool = True) -> World:
-    """What kernels have of a call, or with rounded=False what the caller gave."""
+    """Return the kernels' inputs of a call, or with rounded=False the caller's."""
     lm, yaw = model.landmarks, model.mount[2]
     given = np.full((len(features), 3), np.nan)
     given[:, : np.shape(features)[1]] = features
@@ -166,7 +166,7 @@ def exact_inputs(model: gs.LandmarkModel, poses: Any, features: Any, *, rounded:
 
 
 def prepared(model: gs.LandmarkModel, features: Any) -> np.ndarray:
-    """The numbers of features that all say something."""
+    """Return the numbers of features that all carry information."""
     from gpusense.models.landmark.features import check_features, prepare_features
 
     p, sensor = model.parameters, model._sensor
@@ -177,7 +177,7 @@ def prepared(model: gs.LandmarkModel, features: Any) -> np.ndarray:
 
 
 def table(model: gs.LandmarkModel, world: World) -> Table:
-    """(N, F, M) densities p(f | j), None where j is no candidate, and (F,) densities of false positives."""
+    """Return (N, F, M) densities p(f | j), None where j is no candidate, and (F,) densities of false positives."""
     p = model.parameters
     span = span_of(p, model.landmarks.signatures) if p.sigma_signature is not None else (0, 1)
     densities = [
@@ -194,7 +194,7 @@ def table(model: gs.LandmarkModel, world: World) -> Table:
 
 
 def likelihoods(model: gs.LandmarkModel, tabled: Table, correspondence: Any = None) -> np.ndarray:
-    """(N, F) float64 log p of each feature; by itself, so not for a joint association."""
+    """Return (N, F) float64 log p of each feature; by itself, so not for a joint association."""
     p, (densities, false, _) = model.parameters, tabled
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
     found = np.empty((len(densities), len(false)))
@@ -211,7 +211,7 @@ def likelihoods(model: gs.LandmarkModel, tabled: Table, correspondence: Any = No
 
 
 def joint(model: gs.LandmarkModel, tabled: Table) -> np.ndarray:
-    """(N,) float64 log p of the likeliest joint association, by trying all."""
+    """Return (N,) float64 log p of the likeliest joint association, by trying all."""
     p, (densities, false, _) = model.parameters, tabled
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
     found = np.full(len(densities), -np.inf)

@@ -14,7 +14,7 @@ NAN = np.nan
 
 @dataclass(frozen=True)
 class Scene:
-    """Parameters beside the defaults, the model's options, and which parts of which features are not measured."""
+    """Holds parameters beside the defaults, the model's options, and the parts of features that are not measured."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
@@ -51,7 +51,7 @@ SEEN = (0, 2, 4, 5, 6)
 
 
 def make(name: str) -> tuple[gs.LandmarkMap, gs.LandmarkParameters, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Map, parameters, poses, features and the model's options of a scene."""
+    """Return map, parameters, poses, features and the model's options of a scene."""
     scene = SCENES[name]
     rng = np.random.default_rng(len(name))
     parameters = gs.LandmarkParameters(**scene.parameters)
@@ -84,6 +84,6 @@ def make(name: str) -> tuple[gs.LandmarkMap, gs.LandmarkParameters, np.ndarray, 
 
 
 def model(name: str, backend: str, **options: Any) -> tuple[gs.LandmarkModel, np.ndarray, np.ndarray]:
-    """A scene's model, poses and features."""
+    """Return a scene's model, poses and features."""
     landmarks, parameters, poses, features, own = make(name)
     return gs.LandmarkModel(landmarks, parameters, backend=backend, **{**own, **options}), poses, features

@@ -20,7 +20,7 @@ TYPICAL = BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 1.0)
 def draw(
     parameters: BeamParameters, count: int, seed: int, low: float = 0.1, high: float = 0.9
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Readings and expected ranges between two parts of range_max."""
+    """Draw readings and expected ranges between two parts of range_max."""
     rng = np.random.default_rng(seed)
     expected = rng.uniform(low, high, count) * RANGE_MAX
     return sample_readings(expected, RANGE_MAX, parameters, rng), expected
@@ -41,7 +41,7 @@ def problem_of(
 
 
 def starts(z: np.ndarray, expected: np.ndarray, range_max: float, count: int) -> list[BeamParameters]:
-    """Starts at random, as ``restarts`` draws them."""
+    """Draw starts at random, as ``restarts`` does."""
     pairs = make_pairs(z, expected, range_max)
     bounds, rng = make_bounds(pairs), np.random.default_rng(5)
     guess = first_guess(pairs, bounds)

@@ -29,6 +29,6 @@ def chunk(kind, data):
 
 
 def png(cols, rows, raster, depth=8, colour=0, before=b""):
-    """A PNG file with the given bytes for its image data, filter bytes included."""
+    """Return a PNG file with the given bytes for its image data, filter bytes included."""
     head = chunk(b"IHDR", struct.pack(">IIBBBBB", cols, rows, depth, colour, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + head + before + chunk(b"IDAT", zlib.compress(raster)) + chunk(b"IEND", b"")

@@ -21,7 +21,7 @@ def room(shape: tuple[int, int] = (60, 80), seed: int = 0) -> gs.OccupancyGrid:
 
 
 def cloud(grid: gs.OccupancyGrid, count: int, seed: int = 1) -> np.ndarray:
-    """Poses in the map and somewhat around it."""
+    """Return poses in the map and somewhat around it."""
     rng = np.random.default_rng(seed)
     rows, cols = grid.shape
     xy = grid.cell_centers(rng.integers(-5, rows + 5, count), rng.integers(-5, cols + 5, count))
@@ -44,7 +44,7 @@ def make(kind: str, grid: gs.OccupancyGrid, backend: Any, bearings: np.ndarray =
 
 
 def parts_of_kind(model: object, kind: type) -> list[Any]:
-    """All objects of a class that a model owns, itself or through its caster."""
+    """Return all objects of a class that a model owns, itself or through its caster."""
     owned = [*vars(model).values(), *vars(getattr(model, "_caster", object)).values()]
     return [value for value in owned if isinstance(value, kind)]
 

@@ -24,7 +24,7 @@ mp.mp.dps = 60
 def placed(
     pose: Sequence[float], origin: Sequence[float], resolution: float, mount: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[Any, Any, Any, Any]:
-    """Sensor x and y in cells, heading cosine and sine, in the grid's frame; the mount's yaw is left to the beams."""
+    """Return the sensor's x, y in cells and its heading's cosine and sine in the grid's frame, without mount's yaw."""
     x, y, theta = (mp.mpf(float(v)) for v in pose)
     ox, oy, yaw = (mp.mpf(float(v)) for v in origin)
     mx, my = mp.mpf(float(mount[0])), mp.mpf(float(mount[1]))
@@ -35,7 +35,7 @@ def placed(
 
 
 def as_fraction(value: Any) -> Fraction:
-    """The multiple of 2^-120 just below an mpmath number."""
+    """Return the multiple of 2^-120 just below an mpmath number."""
     return Fraction(int(mp.floor(mp.ldexp(value, 120))), 1 << 120)
 
 
@@ -44,7 +44,7 @@ def as_fraction(value: Any) -> Fraction:
 
 @dataclass(frozen=True)
 class Mixture:
-    """The beam model of one reading, book section 6.3, by mpmath."""
+    """Evaluates the beam model of one reading, book section 6.3, by mpmath."""
 
     z_hit: float
     z_short: float
@@ -56,26 +56,26 @@ class Mixture:
 
     @classmethod
     def of(cls, parameters: Any, range_max: float) -> Mixture:
-        """From any object with the parameters' names."""
+        """Return the mixture of any object with the parameters' names."""
         p = parameters
         return cls(p.z_hit, p.z_short, p.z_max, p.z_rand, p.sigma_hit, p.lambda_short, range_max)
 
     def hit(self, z: Any, expected: Any) -> Any:
-        """Normal density at z, mean z*, truncated to [0, range_max] and renormalised."""
+        """Return the normal density at z, mean z*, truncated to [0, range_max] and renormalised."""
         sigma, top = mp.mpf(self.sigma), mp.mpf(self.range_max)
         root = sigma * mp.sqrt(2)
         mass = (mp.erf((top - expected) / root) - mp.erf(-expected / root)) / 2
         return mp.exp(-(((z - expected) / sigma) ** 2) / 2) / (sigma * mp.sqrt(2 * mp.pi)) / mass
 
     def short(self, z: Any, expected: Any) -> Any:
-        """Exponential density on [0, z*], uniform for rate 0, nothing for z* = 0."""
+        """Return the exponential density on [0, z*], uniform for rate 0, nothing for z* = 0."""
         if expected == 0 or not 0 <= z <= expected:
             return mp.mpf(0)
         rate = mp.mpf(self.rate)
         return rate * mp.exp(-rate * z) / -mp.expm1(-rate * expected) if rate else 1 / expected
 
     def density(self, z: float, expected: float) -> Any:
-        """The continuous part at z in [0, range_max)."""
+        """Return the continuous part at z in [0, range_max)."""
         z_mp, e = mp.mpf(float(z)), mp.mpf(float(expected))
         total = mp.mpf(0)
         if self.z_hit:
@@ -87,12 +87,12 @@ class Mixture:
         return total
 
     def log_density(self, z: float, expected: float) -> Any:
-        """Its logarithm, -inf where it is 0."""
+        """Return its logarithm, -inf where it is 0."""
         p = self.density(z, expected)
         return mp.log(p) if p else -mp.inf
 
     def log_densities(self, z: np.ndarray, expected: np.ndarray) -> np.ndarray:
-        """The same in float64 for ordinary parameters: rate > 0, and a sigma that is neither tiny nor huge."""
+        """Return the same in float64 for ordinary parameters: rate > 0, and a sigma that is neither tiny nor huge."""
         hit = norm.pdf(z, expected, self.sigma) / (
             norm.cdf(self.range_max, expected, self.sigma) - norm.cdf(0, expected, self.sigma)
         )
@@ -101,7 +101,7 @@ class Mixture:
         return np.log(self.z_hit * hit + self.z_short * short + self.z_rand / self.range_max)
 
     def log_reading(self, z: float, expected: float, range_min: float = 0.0) -> Any:
-        """What any reading contributes: 0 if it says nothing, log z_max for a max reading, else the log density."""
+        """Return the term of any reading: 0 for a missing one, log z_max for a max reading, else the log density."""
         kind = classify(z, self.range_max, range_min)
         if kind == "missing" or (kind == "max" and self.z_max == 0):
             return mp.mpf(0)
@@ -109,14 +109,14 @@ class Mixture:
 
 
 def classify(z: float, range_max: float, range_min: float = 0.0) -> str:
-    """``"missing"``, ``"max"`` or ``"hit"``."""
+    """Return ``"missing"``, ``"max"`` or ``"hit"``."""
     if np.isnan(z) or z < 0 or z < range_min or (z == 0 and range_min > 0):
         return "missing"
     return "max" if z >= range_max else "hit"
 
 
 def informative(ranges: Iterable[float], range_max: float, range_min: float, z_max: float) -> list[int]:
-    """Indices of readings that say something."""
+    """Return the indices of informative readings."""
     kinds = [classify(float(z), range_max, range_min) for z in ranges]
     return [k for k, kind in enumerate(kinds) if kind == "hit" or (kind == "max" and z_max > 0)]
 
@@ -125,7 +125,7 @@ def informative(ranges: Iterable[float], range_max: float, range_min: float, z_m
 
 
 class Field:
-    """Table 6.3 in float64: end points, distances to the nearest occupied cell's centre, densities."""
+    """Evaluates table 6.3 in float64: end points, distances to the nearest occupied cell's centre, densities."""
 
     def __init__(
         self,
@@ -145,7 +145,7 @@ class Field:
         self.distances = np.minimum(metres, parameters.max_distance)
 
     def end_points(self, poses: np.ndarray, ranges: np.ndarray, bearings: np.ndarray) -> np.ndarray:
-        """(N, K, 2) in cells: lines 4 and 5 of the table, then into the grid's frame."""
+        """Return (N, K, 2) in cells: lines 4 and 5 of the table, then into the grid's frame."""
         x, y, theta = (poses[:, i, None] for i in range(3))
         angle = theta + self.mount[2] + bearings
         wx = x - self.origin[0] + self.mount[0] * np.cos(theta) - self.mount[1] * np.sin(theta) + ranges * np.cos(angle)
@@ -155,14 +155,14 @@ class Field:
         return np.stack([gx, gy], axis=-1) / self.resolution
 
     def cell_distance(self, col: np.ndarray, row: np.ndarray) -> np.ndarray:
-        """Capped distance of cells, max_distance outside."""
+        """Return the capped distance of cells, max_distance outside."""
         rows, cols = self.distances.shape
         inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
         held = self.distances[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)]
         return np.where(inside, held, self.parameters.max_distance)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance of points in cells, by the parameters' interpolation."""
+        """Return the distance of points in cells, by the parameters' interpolation."""
         if self.parameters.interpolation == "nearest":
             cell = np.floor(points).astype(np.int64)
             return self.cell_distance(cell[..., 0], cell[..., 1])
@@ -178,7 +178,7 @@ class Field:
     def parts(
         self, poses: np.ndarray, ranges: np.ndarray, bearings: np.ndarray, range_min: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(N, K) log-likelihoods of the readings, and how far their end points lie from a cell's edge."""
+        """Return (N, K) log-likelihoods of the readings, and the distances of their end points to a cell's edge."""
         p = self.parameters
         kinds = np.array([classify(float(z), self.range_max, range_min) for z in ranges], dtype=object)
         hits = np.flatnonzero(kinds == "hit")

@@ -1,4 +1,4 @@
-"""Beacons, a robot among them, and what it measures of them without noise."""
+"""Beacons, a robot among them, and its measurements of them without noise."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POSE = np.array([2.5, 3.1, 2.9])
 
 @dataclass(frozen=True)
 class Case:
-    """A public function on so many of the beacons; ``heading`` says whether it is told the heading."""
+    """Holds a public function and the number of its beacons; ``heading`` says whether it gets the heading."""
 
     name: str
     kind: str
@@ -23,7 +23,7 @@ class Case:
     heading: bool = False
 
     def solve(self, xy, values, theta=0.0, **options) -> gs.PositionFix:
-        """The fix; values are ranges, bearings, or both one after the other, with their deviations."""
+        """Return the fix; values are ranges, bearings, or both one after the other, with their deviations."""
         known = theta if self.heading else None
         if self.kind == "ranges":
             return gs.trilaterate(xy, values, **options)
@@ -38,7 +38,7 @@ class Case:
         )
 
     def measure(self, xy, pose):
-        """What is measured from a pose, without noise."""
+        """Return the measurements from a pose, without noise."""
         x, y, theta = pose
         dx, dy = xy[:, 0] - x, xy[:, 1] - y
         ranges, bearings = np.hypot(dx, dy), np.arctan2(dy, dx) - theta
@@ -46,7 +46,7 @@ class Case:
         return {"ranges": ranges, "both": np.append(ranges, bearings)}.get(self.kind, bearings)
 
     def sigmas(self, count):
-        """Small deviations that differ from beacon to beacon."""
+        """Return small deviations that differ from beacon to beacon."""
         ranges, bearings = 0.02 + 0.01 * np.arange(count), 0.002 + 0.001 * np.arange(count)
         return {"ranges": ranges, "both": np.append(ranges, bearings)}.get(self.kind, bearings)
 

@@ -17,7 +17,7 @@ Number = int | float | Fraction
 
 @dataclass(frozen=True)
 class Ray:
-    """A ray in cell units: the origin's cell and its fraction, a direction, and how far it is followed."""
+    """Holds a ray in cell units: the origin's cell and its fraction, a direction, and its limit."""
 
     cell: tuple[int, int]
     frac: tuple[Number, Number]
@@ -25,7 +25,7 @@ class Ray:
     limit: Number
 
     def moved(self, x: Number, y: Number, turn: Number) -> Ray:
-        """The ray with its origin moved and its direction turned by a small angle."""
+        """Return the ray with its origin moved and its direction turned by a small angle."""
         px = self.cell[0] + Fraction(self.frac[0]) + Fraction(x)
         py = self.cell[1] + Fraction(self.frac[1]) + Fraction(y)
         cell = math.floor(px), math.floor(py)
@@ -35,12 +35,12 @@ class Ray:
 
 
 def _gone(index: int, step: int, size: int) -> bool:
-    """Whether an index outside [0, size) moves farther away."""
+    """Return whether an index outside [0, size) moves farther away."""
     return (index < 0 and step < 0) or (index >= size and step > 0)
 
 
 def fraction_walk(occupied: np.ndarray, ray: Ray, outside_occupied: bool = False) -> Fraction | None:
-    """Distance to the first occupied cell by Amanatides and Woo's walk in fractions; None where nothing is nearer.
+    """Return the distance to the first occupied cell by Amanatides and Woo's walk in fractions, or None.
 
     Cells are half-open. A tie, the ray through a corner, steps in x first. The limit is looked at before the cell.
     The distance is in units of the direction's length, which is 1 but for rounding.
@@ -75,14 +75,14 @@ def fraction_walk(occupied: np.ndarray, ray: Ray, outside_occupied: bool = False
 
 @dataclass(frozen=True)
 class Hit:
-    """Where a walk ended: the distance (correctly rounded), and the face: cell, and the axis that was stepped."""
+    """Holds the end of a walk: the distance (correctly rounded), and the face: cell, and the axis that was stepped."""
 
     t: float
     face: tuple[int, int, str] | None
 
 
 def walk(occupied: Sequence[Sequence[bool]], ray: Ray, outside_occupied: bool = False) -> Hit:
-    """The same walk in integers, which is exact too and ten times as fast; a test holds it to ``fraction_walk``.
+    """Return the same by a walk in integers, exact too and ten times as fast; a test holds it to ``fraction_walk``.
 
     With fractions a / one and directions d / unit, the boundary k lies at (k * one + a) * unit / (one * d).
     """
@@ -132,7 +132,7 @@ def backward_error_is_small(
     tolerance: float,
     outside_occupied: bool = False,
 ) -> bool:
-    """Whether a range is that of a ray whose origin is moved by at most ``move`` and direction turned by ``turn``.
+    """Return whether a range is that of a ray with its origin moved by at most ``move`` and turned by ``turn``.
 
     Rays on both sides of the asked one are walked. On one face the range varies continuously with the ray, so any
     value between two rays that end on the same face belongs to a ray between them.
@@ -159,7 +159,7 @@ def world_ray(
     range_max: float,
     mount: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Ray:
-    """The ray of a beam, its frame made by mpmath; the limit is in exact cells."""
+    """Return the ray of a beam, its frame made by mpmath; the limit is in exact cells."""
     x, y, _, _ = placed(pose, origin, resolution, mount)
     angle = mp.mpf(float(pose[2])) + mp.mpf(float(mount[2])) + mp.mpf(float(bearing)) - mp.mpf(float(origin[2]))
     fx, fy = as_fraction(x), as_fraction(y)

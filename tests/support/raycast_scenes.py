@@ -23,7 +23,7 @@ FLOAT64_RELATIVE, FLOAT64_MOVE, FLOAT64_TURN = 1e-12, 1e-13, 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Rays in cell units. Every number is a float32, so both precisions are asked exactly the same."""
+    """Holds rays in cell units. Every number is a float32, so both precisions are asked exactly the same."""
 
     occupied: np.ndarray
     cell: np.ndarray
@@ -39,14 +39,14 @@ class Scene:
 
     @functools.cached_property
     def exact(self) -> np.ndarray:
-        """The walk's ranges, correctly rounded."""
+        """Return the walk's ranges, correctly rounded."""
         cells = self.occupied.tolist()
         return np.array([walk(cells, self.ray(i), self.outside_occupied).t for i in range(len(self.cell))])
 
 
 @functools.cache
 def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: bool = False) -> np.ndarray:
-    """The kernel's ranges in cells; poses carry the direction as their heading, the one ray is along it.
+    """Return the kernel's ranges in cells; poses carry the direction as their heading, the one ray is along it.
 
     Args:
         scene: Map and rays.
@@ -92,7 +92,7 @@ def unit(angle: np.ndarray) -> np.ndarray:
 
 
 def random_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Anything at all, origins outside included."""
+    """Yield scenes of any kind, origins outside included."""
     scenes = []
     for number in range(10):
         occupied = some_map(rng)
@@ -105,7 +105,7 @@ def random_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def lattice_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Origins on edges and corners, directions of small rational slope: many rays run exactly through corners."""
+    """Yield origins on edges and corners, directions of small rational slope: many rays run exactly through corners."""
     scenes = []
     for number in range(10):
         occupied = some_map(rng)
@@ -119,7 +119,7 @@ def lattice_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def axis_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Rays along the axes, on edges as well as off them; -0 is a direction component too."""
+    """Yield rays along the axes, on edges as well as off them; -0 is a direction component too."""
     scenes = []
     for number in range(6):
         occupied = some_map(rng)
@@ -131,7 +131,7 @@ def axis_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def diagonal_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Exactly 45 degrees and slopes of a power of two, in maps of walls that touch at corners only."""
+    """Yield exactly 45 degrees and slopes of a power of two, in maps of walls that touch at corners only."""
     scenes = []
     for number in range(8):
         occupied = np.zeros((32, 32), bool)
@@ -150,7 +150,7 @@ def diagonal_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def tiny_component_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Direction components that are denormal, near the least that is told from zero, or merely small."""
+    """Yield direction components that are denormal, near the least that differs from zero, or merely small."""
     scenes = []
     sizes = as_float32(np.array([1e-45, 1e-40, 9e-31, 1.1e-30, 1e-20, 1e-8, 3e-7]))
     for number in range(4):
@@ -165,7 +165,7 @@ def tiny_component_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def small_map_scenes(rng: np.random.Generator) -> list[Scene]:
-    """1 x 1, 1 x N, N x 1, empty and full maps."""
+    """Yield 1 x 1, 1 x N, N x 1, empty and full maps."""
     scenes = []
     for shape in ((1, 1), (1, 30), (30, 1), (12, 9)):
         for density in (0.0, 0.1, 1.0):
@@ -178,7 +178,7 @@ def small_map_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def limit_scenes(rng: np.random.Generator) -> list[Scene]:
-    """A wall exactly at the limit, one ulp of float32 before it and one behind it."""
+    """Yield a wall exactly at the limit, one ulp of float32 before it and one behind it."""
     scenes = []
     occupied = np.zeros((20, 20), bool)
     occupied[:, 15] = occupied[15, :] = True
@@ -193,7 +193,7 @@ def limit_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def corner_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Rays aimed at corners of cells, within a few units of the last place of float32."""
+    """Yield rays aimed at corners of cells, within a few units of the last place of float32."""
     scenes = []
     for number in range(6):
         occupied = some_map(rng, 0.08, 30)

@@ -38,7 +38,7 @@ IMPOSSIBLE = (0.0, 0.0, 1.0, 0.0)
 
 
 def mixed(seed: int, beams: int = BEAMS) -> np.ndarray:
-    """A scan with ranges, and missing and max readings among them."""
+    """Return a scan with ranges, and missing and max readings among them."""
     rng = np.random.default_rng(seed)
     values = rng.uniform(0, 4.99, beams)
     some = rng.random(beams) < 0.4

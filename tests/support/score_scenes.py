@@ -36,7 +36,7 @@ MIXTURES = {
 
 
 def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarray]:
-    """Flags and terms of the mixture kernels."""
+    """Return flags and terms of the mixture kernels."""
     z_hit, z_short, z_rand, sigma, decay = MIXTURES[name]
     range_max = LIMIT * RESOLUTION
     flags = {flag for flag, z in (("HIT", z_hit), ("SHORT", z_short), ("RAND", z_rand)) if z > 0}
@@ -55,7 +55,7 @@ def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarra
 
 
 def scan(expected: np.ndarray, real: type, *, all_readings: bool) -> np.ndarray:
-    """Readings around one pose's expected ranges: equal to them, 0, next to range_max, and noisy."""
+    """Return readings around one pose's expected ranges: equal to them, 0, next to range_max, and noisy."""
     rng = np.random.default_rng(17)
     range_max = real(LIMIT * RESOLUTION)
     highest = np.nextafter(range_max, real(0))
@@ -81,7 +81,7 @@ FIELDS = {
 
 
 def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.ndarray]:
-    """Table, terms, poses and end points; many end points lie exactly on edges and corners of cells."""
+    """Return table, terms, poses and end points; many end points lie exactly on edges and corners of cells."""
     occupied = GRIDS["rooms"]
     rng = np.random.default_rng(23)
     z_hit, z_rand, sigma, range_max = 0.9, (0.1 if "LINEAR" in FIELDS[name] else 1e-40), 0.2, LIMIT * RESOLUTION
@@ -142,7 +142,7 @@ NOWHERE = np.zeros(1, np.int32)
 
 
 def items(count: int, spread: int, group: int = TILE_PARTICLES, each: int = TILE) -> tuple[int]:
-    """The size of a launch whose groups have so many particles and work-items each."""
+    """Return the size of a launch whose groups have ``group`` particles and ``each`` work-items."""
     return ((-(-count // group) << spread) * each,)
 
 
@@ -161,7 +161,7 @@ def an_order(count: int) -> np.ndarray:
 
 
 def strides(count: int, each: int, way: str) -> tuple[int, int]:
-    """(across, along): parts of a particle, or of a reading, lie together; or with gaps between them."""
+    """Return (across, along): parts of a particle, or of a reading, lie together; or with gaps between them."""
     return {"particles": (1, count), "readings": (each, 1), "gaps": (2 * each + 3, 2)}[way]
 
 
@@ -176,7 +176,7 @@ def room_for(count: int, each: int, way: str, real: type) -> np.ndarray:
 
 
 def guards_of(point: np.ndarray) -> np.ndarray:
-    """How near to an edge an end point of each block of readings may be."""
+    """Return the distance to an edge below which an end point of each block of readings is doubtful."""
     length = np.where(np.isfinite(point[:, 0]), np.hypot(*point.T), 0.0)
     longest = np.maximum.reduceat(length, np.arange(0, len(point), BLOCK_TERMS))
     return (_GUARD * np.finfo(point.dtype).eps * (longest + 2)).astype(point.dtype)

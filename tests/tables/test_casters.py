@@ -1,4 +1,4 @@
-"""All ways to find expected ranges: the bits of NumPy on every backend, origins off the map, models, tables' sizes."""
+"""All casters: the bits of NumPy on every backend, origins off the map, models, tables' sizes."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_origins_far_off_the_map(kind, backend):
 
 
 def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.ndarray:
-    """Ranges in cells of rays that are given to the last bit."""
+    """Return ranges in cells of rays that are given to the last bit."""
     device, real = get_backend(backend), np.dtype(precision)
     rows, cols = scene.occupied.shape
     flags = {kind.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
@@ -165,7 +165,7 @@ def test_a_table_too_large_for_the_device_is_an_error_that_names_sizes(name, nee
     assert np.isfinite(model.log_likelihood(poses, bearings)).all()
 
 
-def test_methods_tell_what_there_is():
+def test_methods_list_every_caster():
     methods = {method.name: method for method in gs.RayCaster.methods()}
     assert list(methods) == ["exact", "dda", "march", "bresenham", "cddt", "lookup"] == list(casters.CASTERS)
     for name, method in methods.items():

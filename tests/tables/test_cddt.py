@@ -1,4 +1,4 @@
-"""Directional tables by brute force, and what their ranges may miss."""
+"""Directional tables by brute force, and the obstacles that their ranges may miss."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpusense.tables.directional import directional_table
 
 
 def clipped_begin(col: int, row: int, turn: float, line: int) -> float | None:
-    """Where a cell begins on a line of its bin's direction, in plain Python; None if it is not on the line.
+    """Return where a cell begins on a line of its bin's direction, in plain Python; None if it is not on the line.
 
     It is the point of the cell's outline that is farthest back on the middle of the line, or, where the cell does not
     reach the middle, its corner that is nearest to it.
@@ -86,7 +86,7 @@ def test_directional_ranges_on_the_middle_of_a_line_are_exact(pruned, backend):
 
 @functools.cache
 def floor() -> tuple[gs.OccupancyGrid, np.ndarray, np.ndarray]:
-    """A floor of a building and poses in its free cells; distances from the poses to the nearest obstacle's centre."""
+    """Return a floor of a building, poses in its free cells, and their distances to the nearest obstacle's centre."""
     grid = building(3, (12.0, 10.0), 0.1)
     poses = cloud_uniform(grid, 1500, np.random.default_rng(4))
     row, col = np.nonzero(grid.occupied)
@@ -116,7 +116,7 @@ def test_directional_ranges_end_near_an_obstacle_and_pass_none(bins):
 
 
 def test_pruned_ranges_differ_beside_an_obstacle_only(backend):
-    """Nothing is left out but what begins beside another obstacle of its line: it is seen from beside that, too."""
+    """Only obstacles that begin beside another one of their line are left out: these are seen from beside that, too."""
     grid, poses, clearance = floor()
     for bins in (36, 216):
         every, pruned = (gs.RayCaster(grid, 6.0, method=Cddt(bins, p), backend=backend) for p in (False, True))

@@ -19,7 +19,7 @@ from gpusense.world import windows
 
 
 def wall(angle: float, thick: float, shift: tuple[float, float]) -> gs.OccupancyGrid:
-    """A straight wall through the middle of 81 x 81 cells; 0 for a half plane."""
+    """Return a straight wall through the middle of 81 x 81 cells; 0 for a half plane."""
     x, y = np.meshgrid(np.arange(81) + 0.5, np.arange(81) + 0.5)
     off = math.cos(angle) * (y - 40.5 - shift[1]) - math.sin(angle) * (x - 40.5 - shift[0])
     return gs.OccupancyGrid(100 * (off <= 0 if thick == 0 else np.abs(off) <= thick / 2), 1.0)
@@ -49,7 +49,7 @@ def test_normals_of_straight_walls(thick, record_property):
 @pytest.mark.parametrize("radius", [5, 12, 40])
 @pytest.mark.parametrize("filled", [True, False])
 def test_normals_of_circles(radius, filled):
-    """A disc's point outwards; a thin ring's lie along the radius, whichever way."""
+    """A disc's point outwards; a thin ring's lie along the radius, in either direction."""
     side = 2 * radius + 11
     x, y = np.meshgrid(*2 * [np.arange(side) + 0.5 - side / 2])
     far = np.hypot(x, y)
@@ -115,7 +115,7 @@ def test_normals_do_not_depend_on_how_a_map_is_cut():
 
 
 def hit_cells(scene: Scene, real: np.dtype) -> tuple[np.ndarray, list[tuple[int, int] | None]]:
-    """Ranges and cells of a plain walk from cell to cell whose every operation is rounded to a precision."""
+    """Return ranges and cells of a plain walk from cell to cell whose every operation is rounded to a precision."""
     one, limit = real.type(1), real.type(scene.limit)
     rows, cols = scene.occupied.shape
     ranges, cells = np.full(len(scene.cell), limit, real), []

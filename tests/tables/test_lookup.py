@@ -1,4 +1,4 @@
-"""Look-up tables: what they hold, and the files in which they are kept."""
+"""Look-up tables: their contents, and the files in which they are kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpusense.tables.lookup_files import read_lookup, write_lookup
 
 
 def saved(path: Path, backend: str = "numpy", bins: int = 12, **options: object) -> np.ndarray:
-    """Write a table of the small map; its numbers, (rows, cols, bins)."""
+    """Write a table of the small map; return its numbers, (rows, cols, bins)."""
     grid, _, _ = place()
     gs.RayCaster(grid, RANGE, method=Lookup(bins), backend=backend, **options).save_table(path)
     head, _, body = path.read_bytes().partition(b"\n")

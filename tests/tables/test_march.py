@@ -16,7 +16,7 @@ LEAST_PART = 2.0**-22
 
 
 def scattered(seed: int, density: float = 0.03) -> tuple[gs.OccupancyGrid, np.ndarray]:
-    """Single obstacles, all corners, in cells of 1 m, and 60 poses in free cells."""
+    """Return single obstacles, all corners, in cells of 1 m, and 60 poses in free cells."""
     rng = np.random.default_rng(seed)
     cells = np.where(rng.random((50, 60)) < density, 100, 0)
     grid = gs.OccupancyGrid(cells, 1.0)
@@ -26,7 +26,7 @@ def scattered(seed: int, density: float = 0.03) -> tuple[gs.OccupancyGrid, np.nd
 
 
 def passages(occupied: np.ndarray, x: float, y: float, angle: float, limit: float) -> np.ndarray:
-    """(M, 2) where a ray enters obstacles and leaves them again, by cutting it at all lines of the lattice."""
+    """Return (M, 2) places where a ray enters and leaves obstacles, by cutting it at all lines of the lattice."""
     dx, dy = math.cos(angle), math.sin(angle)
     cuts = [(np.arange(-90, 150) - start) / speed for start, speed in ((x, dx), (y, dy))]
     t = np.unique(np.clip(np.concatenate([*cuts, [0, limit]]), 0, limit))
@@ -41,7 +41,7 @@ def passages(occupied: np.ndarray, x: float, y: float, angle: float, limit: floa
 
 @pytest.mark.parametrize("tolerance", [1.0, 0.1, 0.01])
 def test_marching_is_too_long_by_the_tolerance_or_clips_less_of_a_corner(tolerance, backend):
-    """Each ray: what it passed is shorter than the least step there; what it found begins less than that before."""
+    """Each ray passes obstacles for less than the least step there, and stops less than that before one."""
     bearings, limit, clipped = np.linspace(0, 6, 7), 40.0, 0
     grid, poses = scattered(2)
     rays = [passages(grid.occupied, x, y, theta + b, limit) for x, y, theta in poses for b in bearings]
@@ -59,7 +59,7 @@ def test_marching_is_too_long_by_the_tolerance_or_clips_less_of_a_corner(toleran
 
 
 def room(seed: int) -> tuple[gs.OccupancyGrid, np.ndarray]:
-    """Four walls and nothing else: no corner that a ray could clip."""
+    """Return four walls and nothing else: no corner that a ray could clip."""
     cells = np.full((30, 40), 100)
     cells[2:-2, 2:-2] = 0
     rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def room(seed: int) -> tuple[gs.OccupancyGrid, np.ndarray]:
 
 
 class Counting:
-    """A table that counts how often it is looked up."""
+    """Counts how often a table is looked up."""
 
     def __init__(self, table: np.ndarray) -> None:
         self.table, self.count = table, 0
@@ -78,7 +78,7 @@ class Counting:
 
 
 def steps(grid: gs.OccupancyGrid, poses: np.ndarray, kind: March, limit: float) -> int:
-    """Look-ups of the reference, a ray along each pose's heading."""
+    """Return the look-ups of the reference, a ray along each pose's heading."""
     table = Counting(kind.prepare(get_backend("numpy"), Window(grid.occupied, limit, "free")).buffer)
     cell = np.floor(poses[:, :2])
     pose = np.column_stack([poses[:, :2] - cell, np.cos(poses[:, 2]), np.sin(poses[:, 2])])

@@ -1,4 +1,4 @@
-"""Poses on their way into a grid's frame, against 60 digits."""
+"""Poses in a grid's frame, against 60 digits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.world.frames import place_poses, ray_vectors, split
 
 FLOAT64, FLOAT32 = np.dtype(np.float64), np.dtype(np.float32)
 NO_MOUNT = (0.0, 0.0, 0.0)
-# What a number below 1 may lose as the sum of two rounded ones.
+# The largest error of a number below 1 as the sum of two rounded ones.
 TWO_PARTS = {"float64": 0.0, "float32": 2.0**-48}
 
 FRAMES = {
@@ -29,7 +29,7 @@ FRAMES = {
 
 
 def poses_around(origin, resolution: float, count: int = 200) -> np.ndarray:
-    """Poses up to 3000 cells from a grid's origin, with all kinds of headings."""
+    """Return poses up to 3000 cells from a grid's origin, with all kinds of headings."""
     rng = np.random.default_rng(1)
     xy = np.array(origin[:2]) + rng.uniform(-3000, 3000, (count, 2)) * resolution
     theta = rng.uniform(-7, 7, count)

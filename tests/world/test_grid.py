@@ -42,7 +42,7 @@ def test_threshold_is_inclusive():
     assert OccupancyGrid(CELLS, occupied_threshold=1).occupied.sum() == 4
 
 
-def test_obstacles_count_unknown_as_told():
+def test_obstacles_count_unknown_as_asked():
     grid = OccupancyGrid(CELLS)
     assert grid.obstacles().tolist() == grid.occupied.tolist()
     assert grid.obstacles(unknown="occupied").tolist() == (grid.occupied | grid.unknown).tolist()

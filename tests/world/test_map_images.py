@@ -17,7 +17,7 @@ from gpusense.world.map_files import read_map
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale"])
-def test_what_is_not_opaque_is_unknown(place, mode):
+def test_pixels_that_are_not_opaque_are_unknown(place, mode):
     image = Image.fromarray(np.array([[[0, 255], [0, 254], [255, 255], [255, 0]]], np.uint8), "LA")
     assert read_map(place(image, "map.png", mode=mode)).cells.tolist() == [[100, -1, 0, -1]]
 

@@ -25,7 +25,7 @@ def test_dictionaries_round_trip_through_json(parameters):
     assert type(parameters).from_dict(values) == parameters
 
 
-def test_what_a_dictionary_leaves_out_is_the_default():
+def test_entries_that_a_dictionary_lacks_are_the_defaults():
     assert BeamParameters.from_dict({"sigma_hit": 0.3}) == BeamParameters(sigma_hit=0.3)
 
 

@@ -1,4 +1,4 @@
-"""A user's queue of pyopencl, and what tests of arrays on it need."""
+"""Fixtures of tests of arrays on a user's queue of pyopencl."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.backends import get_backend
 
 @pytest.fixture
 def queue(needs) -> Any:
-    """A queue of a context of its own on the device under test."""
+    """Return a queue of a new context on the device under test."""
     import pyopencl as cl
 
     return cl.CommandQueue(cl.Context([get_backend(needs("opencl"))._device]))
@@ -22,7 +22,7 @@ def queue(needs) -> Any:
 
 @pytest.fixture
 def there(queue):
-    """What makes an array on that queue."""
+    """Return the function that copies an array to that queue."""
     import pyopencl.array
 
     return lambda array: pyopencl.array.to_device(queue, np.ascontiguousarray(array))
@@ -30,7 +30,7 @@ def there(queue):
 
 @pytest.fixture
 def as_gpu(queue, monkeypatch):
-    """The queue's backend, whose device counts as a GPU: bound calls keep their launches there."""
+    """Return the queue's backend, whose device counts as a GPU: bound calls record their launches there."""
     device = get_backend(queue)
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
     return device
@@ -38,7 +38,7 @@ def as_gpu(queue, monkeypatch):
 
 @pytest.fixture
 def copies(monkeypatch):
-    """Bytes that models copy to the device and back."""
+    """Record the bytes that models copy to the device and back."""
     from gpusense.backends.opencl.backend import OpenCLBackend
 
     return counted_copies(monkeypatch, OpenCLBackend)

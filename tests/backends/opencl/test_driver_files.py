@@ -18,7 +18,7 @@ from gpusense.backends.opencl import drivers
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """A machine with one driver of the system's, one beside pyopencl, and no child processes."""
+    """Imitate a machine with one driver of the system, one beside pyopencl, and no child processes."""
     vendors, beside = tmp_path / "vendors", tmp_path / "pyopencl" / ".libs"
     for folder in (vendors, beside):
         folder.mkdir(parents=True)
@@ -38,7 +38,7 @@ def machine(tmp_path, monkeypatch):
 
 @pytest.fixture
 def intel(machine, monkeypatch):
-    """Intel's wheel, installed."""
+    """Install a stand-in for Intel's wheel."""
     library = machine / "lib" / "libintelocl.so"
     library.parent.mkdir()
     library.write_text("")
@@ -118,7 +118,7 @@ print(json.dumps([found, sorted(changed - {"PYOPENCL_HOME"})]))
 
 
 def test_a_runtime_from_a_wheel_is_found_proved_and_used_beside_pocl(needs, tmp_path):
-    """A library of our own that stands for Intel's, in a wheel of that name."""
+    """A stand-in for Intel's library, in a wheel of that name."""
     needs("opencl")
     wheel = tmp_path / "site"
     (wheel / "intel_opencl_rt-1.0.dist-info").mkdir(parents=True)

@@ -21,7 +21,7 @@ METHODS = ("log_likelihood", "field", "expected_ranges", "cast", "cones", "absol
 
 
 def call_of(method: str, backend: Any) -> Any:
-    """What takes poses and out=."""
+    """Return the call that takes poses and ``out=``."""
     if method == "cast":
         caster = gs.RayCaster(GRID, 5.0, backend=backend)
         return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options)
@@ -111,7 +111,7 @@ def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, m
 
 
 def test_parts_of_parts(queue, there, monkeypatch):
-    """What begins within a buffer, or is a part of one itself, has no parts of its own."""
+    """An array that begins within a buffer, or is a sub-buffer itself, has no sub-buffers."""
     import pyopencl as cl
     import pyopencl.array
 
@@ -196,14 +196,14 @@ def test_a_device_without_float64_places_no_poses(as_gpu, queue, there, monkeypa
             call(there(cloud(1)))
 
 
-def test_what_another_queue_still_writes_is_waited_for(queue, there):
-    """Before anything is started that reads it."""
+def test_writes_of_another_queue_are_waited_for(queue, there):
+    """The wait comes before any launch that reads the array."""
     import pyopencl as cl
 
     model, poses = FIELD(GRID, SCANNER, backend=queue), there(cloud(1))
 
     class Busy:
-        """A queue that writes poses when it is waited for."""
+        """Writes poses when it is waited for."""
 
         def finish(self) -> None:
             cl.enqueue_copy(queue, poses.base_data, cloud(2))
@@ -232,7 +232,7 @@ def test_a_pose_that_is_not_finite(queue, there):
 
 
 def test_backends_of_queues(queue):
-    """One for each queue, for as long as somebody has it."""
+    """A queue has one backend, for as long as it is referenced."""
     import pyopencl as cl
 
     device = get_backend(queue)
@@ -298,7 +298,7 @@ def test_results_that_cannot_be_written(queue, there):
 
 
 def test_arrays_of_other_places(queue, there, needs):
-    """Each says what to do."""
+    """Each message names the remedy."""
     for selection in ("numpy", needs("warp"), needs("opencl")):
         expected = "must be of the context of" if selection.startswith("opencl") else "must be in host memory for"
         with pytest.raises(TypeError, match=rf"^poses: {expected} .*backend=<the array's queue>"):

@@ -16,7 +16,7 @@ from gpusense.models.scan import binding
 
 @pytest.mark.parametrize("case", CASES)
 def test_bound_calls(case, as_gpu, queue, there):
-    """They have the bits of ordinary ones, whatever the arrays hold then, with the maps of then; NumPy's arrays too."""
+    """They have the bits of ordinary calls with the arrays' and the map's contents at that time; NumPy's arrays too."""
     model = CASES[case](backend=queue)
     beams = model.scanner.count
     for real in (np.float32, np.float64):
@@ -106,7 +106,7 @@ def test_a_bound_call_whose_device_is_gone(as_gpu, queue, there, monkeypatch):
 
 
 def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies, monkeypatch):
-    """It makes no buffer, and what it copies is poses and readings, results and the verdict on poses."""
+    """It makes no buffer, and copies only poses and readings, results and the status of the poses."""
     for kind in MODELS:
         call = kind(GRID, NEAR, backend=queue).bind(cloud(1).astype(np.float32), mixed(1))
         call()
@@ -122,7 +122,7 @@ def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies
 
 
 def test_a_new_table_finds_room(as_gpu, queue, there, monkeypatch):
-    """Launches that are kept let go of the old one before the new one is made."""
+    """Recorded launches release the old table before the new one is made."""
     model = FIELD(GRID, NEAR, backend=queue, specialize=False)
     call = model.bind(there(cloud(1)), there(mixed(1)))
     expected = call().get()
@@ -149,8 +149,8 @@ def test_only_launches_can_be_recorded(as_gpu):
     as_gpu.upload(np.ones(4, np.float32), buffer)
 
 
-def test_processors_take_the_ordinary_way(queue, there):
-    """Their kernels in vectors have scans that the host prepared."""
+def test_processors_take_the_ordinary_path(queue, there):
+    """Their vector kernels take scans that the host prepared."""
     if queue.device.type & 4:
         pytest.skip("the device is a GPU")
     model = FIELD(GRID, NEAR, backend=queue)

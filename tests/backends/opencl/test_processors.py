@@ -1,4 +1,4 @@
-"""The processor for which PoCL compiles, for processors that people have."""
+"""The processor for which PoCL compiles, for common processors."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ PROCESSORS = [
 
 
 class Described:
-    """A device of PoCL's whose description holds numbers, addresses of nothing, and the two names at words 79, 80."""
+    """Imitates PoCL's description of a device: numbers, dangling addresses, and the two names at words 79 and 80."""
 
     def __init__(self, target: str, name: str, *, version: str = "3.0", platform: str = "Portable Computing Language",
                  width: int = 8) -> None:  # fmt: skip
@@ -88,7 +88,7 @@ X86 = "x86_64-unknown-linux-gnu"
 
 
 def width_of(flags: str) -> int:
-    """Numbers of the processor's widest vectors, as PoCL tells."""
+    """Return the width of the processor's widest vectors, as PoCL reports it."""
     return 16 if "avx512f" in flags.split() else 8 if "avx" in flags.split() else 4
 
 
@@ -125,7 +125,7 @@ def test_no_name_stands_for_instruction_sets_that_the_processor_lacks():
         assert library.needs | library.uses <= sets, name
 
 
-def test_a_processor_that_no_library_fits_is_told(of):
+def test_a_processor_that_no_library_fits_is_reported(of):
     """A Xeon Phi: PoCL takes its library for AVX-512, most of which the processor lacks."""
     of(f"{HASWELL} avx512f avx512cd avx512er avx512pf")
     made = Described(X86, "knl", width=16)
@@ -177,7 +177,7 @@ def test_the_wheels_pocl_compiles_for_the_processor_of_its_library(needs):
     backend.compile("distance_lines", frozenset())
 
 
-def test_the_fingerprint_tells_processors_apart(monkeypatch, tmp_path):
+def test_the_fingerprint_distinguishes_processors(monkeypatch, tmp_path):
     texts = [
         "processor\t: 0\nmodel name\t: A\nflags\t\t: avx avx2\n\nprocessor\t: 1\nflags\t: other\n",
         "processor\t: 0\nmodel name\t: A\nflags\t\t: avx2 avx\n",

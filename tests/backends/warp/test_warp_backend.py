@@ -20,7 +20,7 @@ from gpusense.backends import Backend, get_backend
 
 @pytest.fixture
 def warp_backend(needs: Callable[[str], str]) -> Backend:
-    """The Warp backend."""
+    """Return the Warp backend."""
     return get_backend(needs("warp"))
 
 
@@ -46,7 +46,7 @@ def test_every_type_goes_to_the_device_and_back(dtype: type, warp_backend: Backe
     )
 
 
-def test_what_does_not_fit_is_a_memory_error(warp_backend: Backend) -> None:
+def test_a_buffer_that_does_not_fit_is_a_memory_error(warp_backend: Backend) -> None:
     with pytest.raises(MemoryError, match="cannot hold a buffer of"):
         warp_backend.empty(warp_backend.info.max_buffer // 4 + 1, np.dtype(np.float32))
     with pytest.raises(MemoryError, match="and 2147483647 numbers"):
@@ -128,7 +128,7 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
 
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
-    """A launcher of the field's scores that three threads share, and what runs a launcher on some particles."""
+    """Return a launcher of the field's scores that three threads share, and a function that runs one on particles."""
     from gpusense.backends.warp import backend as _warp
     from gpusense.backends.warp import pieces as _warp_pieces
 

@@ -1,4 +1,4 @@
-"""What ``gpusense bench`` measures: costs, failures that show, outside candidates."""
+"""Measurements of ``gpusense bench``: costs, failures that show, outside candidates."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_costs_of_a_caster():
     assert cost.device_bytes < cost.table_bytes + 20_000
 
 
-def test_what_is_slow_to_make_is_made_once(monkeypatch):
+def test_a_table_that_is_slow_to_make_is_made_once(monkeypatch):
     scene, made = quick_scene(), []
     poses = scene.clouds["global"]
     slow = candidate(free_ranges)
@@ -101,7 +101,7 @@ def fail(scene, poses):
         (candidate(free_ranges, missing="not installed"), "left out", "not installed"),
     ],
 )
-def test_what_goes_wrong_is_shown(made, status, reason):
+def test_failures_are_shown(made, status, reason):
     plan = plan_of(replace(made, outside="somewhere"))
     outcome = runner.run(plan)
     assert [(p["status"], p["reason"], p["errors"]) for p in outcome.points] == [(status, reason, None)] * 2
@@ -175,7 +175,7 @@ def test_peers_are_read_from_a_file(tmp_path):
 
 @pytest.fixture
 def baselines():
-    """The checkout's outside candidates; skipped for an installed package."""
+    """Return the checkout's outside candidates; skip the test for an installed package."""
     file = peers.default_file()
     if file is None:
         pytest.skip("the package is not imported from a checkout")

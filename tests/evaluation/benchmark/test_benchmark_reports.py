@@ -1,4 +1,4 @@
-"""What ``gpusense bench`` makes of its points: fronts and profiles by hand, comparisons of reports."""
+"""Reports of ``gpusense bench``: fronts and profiles by hand, comparisons."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ EDGE = np.pi / 4
 
 
 def scene(counts: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Readings, expected ranges and angles: so many below and above 45 degrees, each with its own parameters."""
+    """Draw readings, expected ranges and angles: numbers below and above 45 degrees, each with parameters."""
     rng = np.random.default_rng(seed)
     expected = rng.uniform(1, 9, sum(counts))
     angles = np.concatenate([rng.uniform(0, EDGE, counts[0]), rng.uniform(EDGE, np.pi / 2, counts[1])])

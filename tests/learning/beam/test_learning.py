@@ -32,7 +32,7 @@ def identified(fit: gs.BeamFit) -> np.ndarray:
 
 
 def worst_fall(fit: gs.BeamFit) -> float:
-    """The largest fall of the log-likelihood in an iteration, over its size."""
+    """Return the largest fall of the log-likelihood in an iteration, over its size."""
     return float(np.max(-np.diff(fit.trace), initial=0.0)) / abs(fit.log_likelihood)
 
 
@@ -126,7 +126,7 @@ def test_a_fit_of_the_model_scores_highest(needs) -> None:
 @pytest.mark.parametrize(
     ("method", "scenes"), [("em", (15, 23, 31, 38)), ("gradient", (23, 31)), ("hill_climb", (31,))]
 )
-def test_other_ways_reach_the_optimum_from_ten_starts(method: str, scenes: tuple[int, ...], needs) -> None:
+def test_other_methods_reach_the_optimum_from_ten_starts(method: str, scenes: tuple[int, ...], needs) -> None:
     backend = needs("opencl")
     for number in scenes:
         scene = learning_scenes(50)[number]
@@ -218,7 +218,7 @@ def test_an_offset_of_correct_ranges(backend: str) -> None:
     # To first order the plain fit knows of it.
     assert abs(plain.range_bias - fit.range_bias) < 0.02
     assert worst_fall(fit) <= TOLERANCES["exact EM falls"].value
-    # Readings from which the offset is taken tell the same.
+    # Readings without the offset give the same fit.
     moved = gs.fit_beam_parameters(z - fit.range_bias, expected, RANGE_MAX + 1, backend=backend)
     assert moved.parameters.sigma_hit == pytest.approx(fit.parameters.sigma_hit, rel=0.02)
 
@@ -264,7 +264,7 @@ def test_restarts_never_end_lower_and_repeat() -> None:
     assert (values(more) == values(again)).all()
 
 
-def test_results_tell_what_happened(capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_report_their_history(capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
     z, expected = draw(TYPICAL, 400, 12)

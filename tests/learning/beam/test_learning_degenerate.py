@@ -1,4 +1,4 @@
-"""Readings that do not tell all parameters, or make the likelihood unbounded, and bad arguments."""
+"""Readings that do not determine all parameters, or make the likelihood unbounded, and bad arguments."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ PRIOR = Prior(np.array([3.0, 2.0, 1.0, 0.5]), 0.3, 0.7, 0.01)
 
 
 def exact_objective(z: list[float], expected: list[float], prior: Prior | None, x: list[mp.mpf]) -> mp.mpf:
-    """Log-likelihood and log prior by mpmath, from coordinates (log weights, log sigma, log rate, bias)."""
+    """Return log-likelihood and log prior by mpmath, from coordinates (log weights, log sigma, log rate, bias)."""
     total = sum(mp.exp(log) for log in x[:4])
     hit, short, top, rand = (mp.exp(log) / total for log in x[:4])
     sigma, rate, bias = mp.exp(x[4]), mp.exp(x[5]), x[6]
@@ -95,7 +95,7 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
 
 
 def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
-    """Whether sums are those of the reference, within the tolerance."""
+    """Return whether sums are those of the reference, within the tolerance."""
     # Terms of either sign: their magnitudes are at most some 30 times those of r u^2.
     scale = np.maximum(np.abs(truth), np.abs(truth[7]))[: len(found)]
     tolerance = TOLERANCES[f"{np.dtype(precision).name} sums to learn from"]

@@ -38,7 +38,7 @@ MIXTURES = {
 
 
 def exact(number) -> Fraction:
-    """A number of mpmath, to the last of its digits; 0 for what has thousands of zeros."""
+    """Return a number of mpmath as a fraction, to its last digit; 0 for one with thousands of leading zeros."""
     if abs(number) < mp.mpf(10) ** -2000:
         return Fraction(0)
     sign, man, exponent, _ = mp.mpf(number)._mpf_
@@ -47,7 +47,7 @@ def exact(number) -> Fraction:
 
 @functools.cache
 def spread_exactly(d: int, s: float):
-    """Share of readings d steps from the obstacle's: the integral of a triangle times a normal density."""
+    """Return the share of readings d steps from the obstacle's: the integral of a triangle times a normal density."""
     if s == math.inf:
         return mp.mpf(d == 0)
     # A narrow peak is cut up, so that nodes see it.
@@ -56,7 +56,7 @@ def spread_exactly(d: int, s: float):
 
 
 def walk(causes: list[list[Fraction]]) -> list[Fraction]:
-    """P of each step and of no return, step by step; each cause's probability of triggering at a step it reaches."""
+    """Return P of each step and of no return, from each cause's probability of triggering at a step it reaches."""
     reached, row = Fraction(1), []
     for probabilities in zip(*causes, strict=True):
         none = math.prod((1 - p for p in probabilities), start=Fraction(1))
@@ -98,9 +98,9 @@ def shared_exactly(p: gs.BeamParameters, bins: int, j: int) -> list[Fraction]:
 
 
 def assert_close(log_p: np.ndarray, truth: list[Fraction]) -> None:
-    """A sum of logarithms, each good to some eps of itself; 64 eps for a dozen of them."""
+    """Check a sum of logarithms, each good to some eps of itself: 64 eps for a dozen of them."""
     for found, wanted in zip(log_p, truth, strict=True):
-        if wanted < Fraction(10) ** -50:  # what 60 digits cannot tell from 0
+        if wanted < Fraction(10) ** -50:  # 60 digits do not distinguish it from 0
             assert found < -110
             continue
         log = float(mp.log(mp.mpf(wanted.numerator) / wanted.denominator))
@@ -145,7 +145,7 @@ def test_the_spread_of_a_detection_keeps_its_digits_everywhere(s):
 
 
 def simulate(c: gs.DiscreteCauses, bins: int, j: int, count: int, random: np.random.Generator) -> np.ndarray:
-    """Steps of readings by drawing where each cause would trigger, and taking the first."""
+    """Return steps of readings: draw where each cause would trigger, and take the first."""
     width = RANGE / bins
     first = np.full(count, bins)
     unknown = random.exponential(1 / c.lambda_short, count) // width
@@ -204,7 +204,7 @@ def test_without_noise_and_other_causes_one_step_has_it_all():
     np.testing.assert_array_equal(mixture.probabilities[:, -1], 1)
 
 
-def test_what_triggers_earlier_hides_what_comes_later():
+def test_causes_that_trigger_earlier_hide_later_ones():
     """The share of beams that go on falls along the beam, and everywhere with more unknown obstacles."""
 
     def survival(rate: float) -> np.ndarray:
@@ -222,7 +222,7 @@ def test_what_triggers_earlier_hides_what_comes_later():
 
 
 def densities(causes: object, bins: int, z: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Densities at readings, and probabilities of no return."""
+    """Return densities at readings, and probabilities of no return."""
     table = gs.DiscreteBeamModel(causes, RANGE, bins)
     none = table.log_likelihood(np.full(len(expected), math.inf), expected)
     each = np.broadcast_arrays(z, expected[:, None])
@@ -233,7 +233,7 @@ BINS = (64, 128, 256, 512, 1024)
 
 
 def assert_first_order(errors: list[float]) -> None:
-    """Halving the width halves the mean error; 1.6 leaves room for where in a bin the places lie."""
+    """Check that halving the width halves the mean error; 1.6 allows for the places within a bin."""
     assert (np.array(errors[:-1]) / errors[1:] > 1.6).all(), errors
 
 

@@ -25,7 +25,7 @@ TABLES = {
 
 @functools.cache
 def scene() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
-    """A corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max."""
+    """Return a corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max."""
     cells = np.zeros((1, 400), int)
     cells[0, -1] = 100
     poses = np.zeros((60, 3))
@@ -39,7 +39,7 @@ def model(table: gs.DiscreteBeamModel, backend: str = "numpy", **options: object
 
 
 def looked_up(table: gs.DiscreteBeamModel, ranges: list[float], expected: np.ndarray) -> np.ndarray:
-    """What each reading adds, in the precision of the expected ranges."""
+    """Return the term of each reading, in the precision of the expected ranges."""
     z = np.broadcast_to(np.array(ranges, expected.dtype), expected.shape)
 
     def bin_of(r):
@@ -77,7 +77,7 @@ def test_tiles_and_orders_change_nothing(gpu, as_gpu):
 
 
 def test_max_readings_depend_on_what_is_expected(backend):
-    """A wall that is there makes no return unlikely: all of it, and what is not seen, comes from the table."""
+    """A wall ahead makes no return unlikely: seen or not, the probability comes from the table."""
     _, scanner, poses = scene()
     table = TABLES["separate"]
     one = model(table, backend)
@@ -119,7 +119,7 @@ def test_the_plan_says_so():
 
 
 def simulated(causes: gs.DiscreteCauses, count: int, bins: int = BINS, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Readings drawn from the table's rows, anywhere in their step."""
+    """Draw readings from the table's rows, anywhere in their step."""
     random = np.random.default_rng(seed)
     expected = random.uniform(0.2, 1.1 * RANGE, count)
     cumulative = np.cumsum(gs.DiscreteBeamModel(causes, RANGE, bins).probabilities, axis=1)
@@ -203,7 +203,7 @@ def test_readings_are_counted_by_class_and_step(monkeypatch):
     ([0.01] * 50, [3.0] * 50, "sigma_hit"),
     ([2.0], [2.0], "sigma_hit"),
 ])  # fmt: skip
-def test_readings_that_tell_little_give_finite_causes_and_say_so(z, expected, unknown):
+def test_uninformative_readings_give_finite_causes_and_say_so(z, expected, unknown):
     table = gs.DiscreteBeamModel.learn(z, expected, RANGE, 20)
     assert all(math.isfinite(value) for value in table.causes.to_dict().values())
     assert math.isnan(table.fit.standard_errors[unknown]) and unknown in table.fit.status

@@ -151,7 +151,7 @@ def test_degenerate_data_are_named():
 
 @pytest.mark.parametrize("view", [2 * math.pi, 2.0])
 def test_landmarks_under_the_robot_have_no_bearing(view):
-    """Every bearing is as likely, 1 / field of view; landmarks at one place share what is theirs."""
+    """Every bearing is equally likely, 1 / field of view; landmarks at one place share their features."""
     rng = np.random.default_rng(0)
     lm = gs.LandmarkMap([[0, 0], [0, 0], [3, 1]])
     poses = np.zeros((40, 3))

@@ -25,8 +25,8 @@ IMPOSSIBLE = {
 
 @pytest.mark.parametrize("name", IMPOSSIBLE)
 @pytest.mark.parametrize("how", ["nearest", "joint", "negative"])
-def test_what_the_sensor_cannot_measure_is_left_out(name, how):
-    """As if it had not been given: live data must not stop a filter. ``explain`` counts it."""
+def test_features_that_the_sensor_cannot_measure_are_left_out(name, how):
+    """Such a feature counts as missing: live data must not stop a filter. ``explain`` counts it."""
     options = {"negative": True} if how == "negative" else {"association": how}
     model, poses, features = scenes.model("everything", "numpy", **options)
     with_it = np.insert(features, 2, IMPOSSIBLE[name], axis=0)
@@ -56,7 +56,7 @@ FEATURES = np.array([[3.0, 0.1], [6.0, np.nan], [2.0, -2.0]])
 
 
 def calls(backend: Any) -> dict[str, Any]:
-    """What takes poses and ``out=``, by sensor; each also with a reading that says nothing."""
+    """Return the calls that take poses and ``out=``, by sensor; each also with a reading without information."""
     xy = [(5e6, 0.0), (5e6 + 9, 3.0), (5e6 - 4, -2.0)]
     found = {name: (model, measured) for name, (model, measured) in models(backend).items()}
     landmarks = gs.LandmarkMap(xy)
@@ -88,7 +88,7 @@ def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypa
             found = call(given)
             assert type(found) is type(given)
             assert differing((found.held if wrap is Array else found).numpy(), truth) == 0
-            # What is measured goes there, and two numbers that tell whether all is finite come back.
+            # Measurements go there, and the two numbers of the status of poses come back.
             assert [size for way, size in warp_copies if way == "down"] == [8]
             assert all(size <= 400 for _, size in warp_copies)
             assert call(given, out=out) is out

@@ -21,14 +21,14 @@ KNOWN = (0, 2, -1, 5, 6)
 
 @functools.cache
 def tabled(name: str, precision: str) -> oracle.Table:
-    """The densities of a scene in mpmath, for what kernels are given."""
+    """Return the densities of a scene in mpmath, for the kernels' inputs."""
     model, poses, features = scenes.model(name, "numpy", precision=precision)
     return oracle.table(model, oracle.exact_inputs(model, poses, features))
 
 
 @functools.cache
 def truth(name: str, precision: str, how: str) -> np.ndarray:
-    """(N, F) log p of a scene's features in mpmath, or (N,) of their joint association."""
+    """Return (N, F) log p of a scene's features in mpmath, or (N,) of their joint association."""
     model, _, _ = scenes.model(name, "numpy", association="nearest" if how == "known" else how)
     densities = tabled(name, precision)
     if how == "joint":
@@ -37,7 +37,7 @@ def truth(name: str, precision: str, how: str) -> np.ndarray:
 
 
 def assert_within(found: np.ndarray, expected: np.ndarray, terms: int = 1) -> None:
-    """Equal infinities, no NaN, and the table's tolerance, so many times for a sum of so many terms."""
+    """Check for equal infinities, no NaN, and the table's tolerance times the number of terms of a sum."""
     eps = np.finfo(found.dtype).eps
     assert not np.isnan(found).any()
     np.testing.assert_array_equal(np.isneginf(found), np.isneginf(expected))
@@ -48,7 +48,7 @@ def assert_within(found: np.ndarray, expected: np.ndarray, terms: int = 1) -> No
 
 
 def scored(name: str, backend: str, precision: str, how: str) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) log p of a scene and (N, F) parts of it."""
+    """Return (N,) log p of a scene and (N, F) parts of it."""
     if how == "known":
         model, poses, features = scenes.model(name, backend, precision=precision)
         return model.log_likelihood(poses, features, KNOWN), model._evaluate(poses, features, KNOWN, each=True)[2]
@@ -93,7 +93,7 @@ def test_joint_association_tries_all(backend, name, precision):
 
 
 @on_every_backend(on_warp=lambda precision: precision == "float32", precision=PRECISIONS)
-def test_what_the_caller_gave(backend, precision):
+def test_features_as_the_caller_gave_them(backend, precision):
     """Rounding of positions, directions and readings included: float32 keeps them in two numbers."""
     model, poses, features = scenes.model("everything", backend, precision=precision)
     expected = oracle.likelihoods(

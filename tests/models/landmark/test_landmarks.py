@@ -18,7 +18,7 @@ FLOAT64 = dict(precision="float64")
 
 
 def forest(count: int, side: float, seed: int = 5) -> tuple[gs.LandmarkMap, np.ndarray, np.ndarray]:
-    """Landmarks evenly spread, poses all over them, and what is seen from the middle."""
+    """Return landmarks evenly spread, poses all over them, and the features seen from the middle."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-side / 2, side / 2, (count, 2))
     poses = np.concatenate(
@@ -166,7 +166,7 @@ def test_laws(backend, precision):
     np.testing.assert_array_equal(
         [model.log_likelihood(poses[n : n + 1], features)[0] for n in range(len(poses))], found
     )
-    # What positions of 5e6 m and turned ones lose in float64, beside deviations of 0.2 m and 0.05 rad at |u| < 100.
+    # Errors of positions of 5e6 m and of turned ones in float64, beside deviations of 0.2 m and 0.05 rad at |u| < 100.
     lost = 1e-5 if precision == "float32" else 1e-6
     for angle, shift in ((0.0, (5e6, -3e6)), (2.0, (0.0, 0.0)), (-1.0, (1e3, 2e3))):
         c, s = np.cos(angle), np.sin(angle)
@@ -258,7 +258,7 @@ def test_a_particle_has_the_same_bits_among_any_others(backend, false):
 
 @pytest.mark.parametrize("association", ["nearest", "sum"])
 def test_100_000_landmarks_by_brute_force(needs, association):
-    """What is left out of a large map matters to no feature: plain NumPy over all landmarks, from the definition."""
+    """The landmarks left out of a large map matter to no feature: plain NumPy over all of them, from the definition."""
     landmarks, poses, features = forest(100_000, 1265.0)
     poses, features = poses[::4], features[:, :2]
     p = gs.LandmarkParameters()

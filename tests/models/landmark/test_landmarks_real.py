@@ -16,7 +16,7 @@ EVERY = 12
 
 
 def recorded(folder: Path, robot: int) -> tuple[gs.LandmarkMap, np.ndarray, np.ndarray, np.ndarray]:
-    """The map, and of some readings the true pose, range and bearing, and the landmark."""
+    """Return the map, and of some readings the true pose, range and bearing, and the landmark."""
     places = np.loadtxt(folder / "Landmark_Groundtruth.dat")
     swap = dict(zip(SWAPPED, SWAPPED[::-1], strict=True))
     index = {swap.get(int(row[0]), int(row[0])): i for i, row in enumerate(places)}

@@ -22,7 +22,7 @@ from gpusense.models.point.bumper import sample_outline
 
 
 def brute_force(pose, points, radius, pressed, p, *, unknown="free", outside="free"):
-    """log P of one segment; nan where a point is too near to a cell's edge to say which cell it is in."""
+    """Return log P of one segment; nan where a point is too near to a cell's edge to say which cell it is in."""
     pad = 30
     occupied = (CELLS >= 65) | ((CELLS == -1) if unknown == "occupied" else False)
     squared = squared_distances(np.pad(occupied, pad, constant_values=outside == "occupied"))
@@ -156,7 +156,7 @@ def test_batches_order_and_repetition_change_no_bit(backend: str, precision: str
         np.testing.assert_array_equal(model.log_likelihood(poses[order], *measured), whole[name][order])
 
 
-def test_what_the_host_places_has_the_same_bits(backend: str) -> None:
+def test_poses_that_the_host_places_have_the_same_bits(backend: str) -> None:
     """Devices without float64 get places and residuals from the host."""
     poses = poses_around(GRID)
     device = get_backend(backend)

@@ -12,7 +12,7 @@ from gpusense.backends import arrays, get_backend
 
 @pytest.fixture
 def gathering(needs, monkeypatch):
-    """A backend that gathers, and a list that grows with each start of a graph."""
+    """Return a backend that gathers, and a list that grows with each start of a graph."""
     needs("warp")
     import warp as wp
 

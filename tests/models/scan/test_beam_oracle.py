@@ -33,7 +33,7 @@ RANGE_MAX = (1.0, 80.0)
 
 
 def readings_around(expected: float, p: gs.BeamParameters, range_max: float, real: np.dtype) -> np.ndarray:
-    """Readings that matter for an expected range: the ends, z* and its neighbours, deviations and decay lengths."""
+    """Return readings that matter for an expected range: the ends, z* and neighbours, deviations and decay lengths."""
     top, last = real.type(range_max), np.nextafter(real.type(range_max), real.type(0))
     z = real.type(expected)
     beside = [0.0, z, np.nextafter(z, real.type(0)), np.nextafter(z, top), last, range_max / 3, expected / 2]
@@ -44,7 +44,7 @@ def readings_around(expected: float, p: gs.BeamParameters, range_max: float, rea
 
 
 def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps: float) -> float:
-    """The error over eps (1 + |log p|); infinite where exactly one of the two is, or where it is NaN."""
+    """Return the error over eps (1 + |log p|); infinite where exactly one of the two is, or where it is NaN."""
     truth = exact_log_density(mixture, float(z), float(expected))
     if mp.isinf(truth) or not math.isfinite(found):
         return 0.0 if truth == -mp.inf and found == -math.inf else math.inf
@@ -130,7 +130,7 @@ def test_where_the_logarithm_cancels(precision):
 @pytest.mark.parametrize("sigma", [1e-3, 0.1, 5.0, 1e5])
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 0.5, 200.0])
 def test_continuous_part_and_atom_sum_to_one(share, sigma, rate):
-    """Gauss-Legendre quadrature of the float64 density; what p_short would have at z* = 0 is lost, as in the book."""
+    """Gauss-Legendre quadrature of the float64 density; the mass of p_short at z* = 0 is lost, as in the book."""
     range_max = 8.0
     p = gs.BeamParameters(0.5, 0.2, 0.1, 0.2, sigma_hit=sigma, lambda_short=rate)
     scanner = gs.Scanner([0.0], range_max)

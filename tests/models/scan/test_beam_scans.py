@@ -57,7 +57,7 @@ def room() -> tuple[gs.OccupancyGrid, np.ndarray]:
 
 @functools.cache
 def exact_ranges(unknown: str, outside: str, mount: tuple[float, float, float]) -> np.ndarray:
-    """z* by the rational walk."""
+    """Return z* by the rational walk."""
     grid, poses = room()
     stops = ((grid.cells >= 65) | ((grid.cells < 0) & (unknown == "occupied"))).tolist()
     scene = dict(origin=grid.origin, resolution=grid.resolution, range_max=RANGE, mount=mount)
@@ -103,7 +103,7 @@ def test_whole_scans(options, specialize, backend):
 
 
 def used_beams(beams: object, parts: np.ndarray, scan: list[float], range_min: float, z_max: float) -> list[int]:
-    """The beams that must count. Which ``beams=n`` takes is the library's choice: n informative ones, evenly."""
+    """Return the beams that must count. The library chooses for ``beams=n``: n informative ones, evenly."""
     says = informative(scan, RANGE, range_min, z_max)
     if beams is None:
         return says
@@ -120,7 +120,7 @@ def used_beams(beams: object, parts: np.ndarray, scan: list[float], range_min: f
 
 
 def test_thinning_counts_informative_beams_only(backend):
-    """A scan with two readings that say something: beams=2 must find them, wherever they are."""
+    """A scan with two informative readings: beams=2 must find them, wherever they are."""
     _, poses = room()
     scan = [NAN] * 10
     scan[3], scan[8] = 1.5, 2.5

@@ -1,4 +1,4 @@
-"""Bound calls: what they give is what ``log_likelihood`` gives for what the arrays hold then."""
+"""Bound calls give the results of ``log_likelihood`` for the arrays' contents at the time of the call."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_bearings_that_repeat_are_cast_one_by_one(kind, gathering):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_a_map_that_changes(kind, gathering):
-    """Mended or made anew, and after calls with poses of the host, which need but a part of it."""
+    """The table is updated or made anew, and the host's poses need only a part of it."""
     device, _ = gathering
     model = kind(GRID, NEAR, backend=device)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
@@ -103,10 +103,10 @@ def test_out_and_pieces_and_no_particles(gathering, monkeypatch):
     for _ in range(3):
         out.zero_()
         assert call() is out is call.out and differing(out.numpy(), expected) == 0
-    nobody = model.bind(to_device(np.empty((0, 3))), ranges)
+    none = model.bind(to_device(np.empty((0, 3))), ranges)
     for _ in range(3):
-        assert nobody().shape == (0,)
-        nobody.check()
+        assert none().shape == (0,)
+        none.check()
 
 
 def test_no_beams(gathering):
@@ -118,7 +118,7 @@ def test_no_beams(gathering):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_pose_that_is_not_finite_is_told_by_check(value, gathering):
+def test_a_pose_that_is_not_finite_is_reported_by_check(value, gathering):
     model = FIELD(GRID, NEAR, backend=gathering[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     call = model.bind(poses, ranges)
@@ -128,7 +128,7 @@ def test_a_pose_that_is_not_finite_is_told_by_check(value, gathering):
     poses.assign(bad)
     call()
     poses.assign(cloud(1))
-    # It is told once, though the last call had none.
+    # It is reported once, though the last call had none.
     found = call().numpy()
     with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
         call.check()
@@ -151,7 +151,7 @@ def test_nothing_is_allocated_compiled_or_copied(gathering, monkeypatch):
 
 
 def test_without_graphs_launches_are_started_one_by_one(gathering, monkeypatch):
-    """Where a driver refuses, and beside other threads, for whom Warp would not wait while it records."""
+    """Where a driver refuses, and beside other threads, which Warp cannot wait for while it records."""
     import warp as wp
 
     device, started = gathering
@@ -248,7 +248,7 @@ def test_a_stream_that_is_none(gathering):
 
 @pytest.fixture(params=["warp", "torch", "cupy"])
 def library(request):
-    """A GPU's backend, what makes an array there, what changes one, and what copies one back."""
+    """Return a GPU's backend, and functions that make an array there, change one, and copy one back."""
     cuda = next((name for name in BACKENDS if name.startswith("warp:cuda")), None)
     if cuda is None:
         pytest.skip("GPUSENSE_TEST_BACKENDS names no CUDA device")

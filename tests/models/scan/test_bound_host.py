@@ -65,7 +65,7 @@ def test_limits_are_rounded_as_readings_are(kind, real, gathering):
     assert type(call) is binding._StagedCall and differing(call(), model.log_likelihood(poses, ranges)) == 0
 
 
-def test_what_is_not_short_takes_the_ordinary_way(gathering, monkeypatch):
+def test_calls_that_are_not_short_take_the_ordinary_path(gathering, monkeypatch):
     device, _ = gathering
     model = FIELD(GRID, NEAR, backend=device)
     integers = np.zeros((COUNT, 3), np.int64)
@@ -103,7 +103,7 @@ def test_arrays_of_the_host_on_every_backend(kind, backend):
 
 
 @pytest.mark.parametrize("compat", [None, "amcl"])
-def test_calls_that_take_the_ordinary_way_on_a_device(compat, gathering):
+def test_calls_that_take_the_ordinary_path_on_a_device(compat, gathering):
     """Poses or readings of the host, and weights for which the host makes the readings."""
     model = FIELD(GRID, NEAR, backend=gathering[0], compat=compat)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))

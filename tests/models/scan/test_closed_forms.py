@@ -14,7 +14,7 @@ BEARINGS = np.linspace(-math.pi, math.pi, 361)
 
 
 def room(resolution: float, origin: tuple[float, float, float]) -> tuple[gs.OccupancyGrid, tuple[int, int, int, int]]:
-    """A room of 40 x 25 cells with walls of one cell, and its free part (left, bottom, right, top) in cells."""
+    """Return a room of 40 x 25 cells with walls of one cell, and its free part (left, bottom, right, top) in cells."""
     cells = np.full((27, 42), 100)
     cells[1:-1, 1:-1] = 0
     return gs.OccupancyGrid(cells, resolution, origin), (1, 1, 41, 26)

@@ -26,7 +26,7 @@ EXPECTED = {"amcl": (6.0, 2 * math.sqrt(2), 3.0, 3.0), "beluga": (6.0, 2 * math.
 
 
 def beam_density(peer: str, p: BeamWeights, z: float, expected: float) -> float:
-    """p of one reading as the peer has it, from the formulas in words."""
+    """Return p of one reading by the peer's formula, written from its description."""
     hit = p.z_hit * math.exp(-((z - expected) ** 2) / (2 * p.sigma_hit**2))
     short = p.z_short * p.lambda_short * math.exp(-p.lambda_short * z) if z < expected else 0.0
     if peer == "beluga":

@@ -20,7 +20,7 @@ BOUND = 16  # eps (1 + |log p|)
 
 
 def exact_hit(z: float, expected: float, sigma: float, range_max: float) -> mp.mpf:
-    """Truncated normal, the normaliser as the difference of the tails on the far side of z*, at 90 digits."""
+    """Return the truncated normal, its normaliser the difference of the tails on the far side of z*, at 90 digits."""
     with mp.workdps(90):
         z, expected, sigma, range_max = (mp.mpf(float(v)) for v in (z, expected, sigma, range_max))
         root = sigma * mp.sqrt(2)
@@ -46,7 +46,7 @@ def eps_off(found: float, truth: mp.mpf, precision: str) -> float:
 
 
 def worst_of(cases, ours, naive, exact, precision):
-    """Worst error of ours, and the shares of cases that the textbook's formula loses altogether and gets wrong."""
+    """Return our worst error, and the shares of cases that the textbook's formula loses and gets wrong."""
     real, worst, lost, wrong = np.dtype(precision).type, (0.0, ()), 0, 0
     for case in cases:
         case = tuple(real(v) for v in case)

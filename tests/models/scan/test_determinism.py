@@ -31,7 +31,7 @@ def room() -> gs.OccupancyGrid:
 
 
 def cloud(count: int = COUNT) -> np.ndarray:
-    """Poses in the map and around it: off its lattice, on its corners at multiples of 45 degrees, far turned ones."""
+    """Return poses in and around the map, off its lattice, on corners at multiples of 45 degrees, huge headings."""
     rng = np.random.default_rng(1)
     (rows, cols), third = room().shape, count // 3
     centers = room().cell_centers(rng.integers(-5, rows + 5, count), rng.integers(-5, cols + 5, count))
@@ -42,7 +42,7 @@ def cloud(count: int = COUNT) -> np.ndarray:
 
 
 def scans() -> np.ndarray:
-    """Five scans: all hits, some of every class, all missing, all max, a single hit."""
+    """Return five scans: all hits, some of every class, all missing, all max, a single hit."""
     rng = np.random.default_rng(2)
     z = rng.uniform(0.1, RANGE, (5, len(BEARINGS)))
     z[1, ::5], z[1, 1::7], z[1, 2::11] = np.nan, np.inf, 0.0
@@ -63,7 +63,7 @@ def model(kind: str, precision: str, backend: str) -> gs.BeamModel | gs.Likeliho
 
 
 def make(kind: str, precision: str, backend: str) -> tuple[object, Call]:
-    """A caster or model, and what it makes of poses: ranges (N, K), or log p without and with parts, (N, 2 + K)."""
+    """Return a caster or model, and its function of poses: ranges (N, K), or log p without, with parts (N, 2 + K)."""
     if kind == "ranges":
         caster = gs.RayCaster(room(), RANGE, backend=backend, precision=precision)
         return caster._caster, lambda poses: caster.cast(poses, BEARINGS)
@@ -102,7 +102,7 @@ def test_twice(kind, call, backend):
 
 
 def hashes(backend: str) -> str:
-    """A line for each kind and precision."""
+    """Return a line for each kind and precision."""
     results = {(kind, p): make(kind, p, backend)[1](cloud()) for kind in KINDS for p in PRECISIONS}
     return "".join(f"{kind} {p} {hashlib.sha256(bits.tobytes()).hexdigest()}\n" for (kind, p), bits in results.items())
 
@@ -177,7 +177,7 @@ def test_several_scans_or_one_by_one(kind, precision, backend):
 
 
 def real_devices() -> list[str]:
-    """Every processor and GPU: PoCL's and Intel's OpenCL for the same processor are two."""
+    """Return every processor and GPU: PoCL's and Intel's OpenCL for the same processor are two."""
     return [device.selection for device in gs.devices() if device.available and device.kind != "simulator"]
 
 

@@ -17,7 +17,7 @@ from gpusense.world import windows
 
 
 def left_out(model: Any) -> dict[str, str]:
-    """What ``explain`` lists, by name."""
+    """Return the omissions that ``explain`` lists, by name."""
     lines = [line[2:] for line in model.explain().splitlines() if line.startswith("- ")]
     return dict(line.split("  ", 1) for line in lines)
 
@@ -57,7 +57,7 @@ def test_explain_of_a_model_that_leaves_nothing_out(kind):
 
 
 def test_explain_of_a_full_beam_model(backend):
-    """What is needed is not called unnecessary; what the other tests look at is host code, the same everywhere."""
+    """Needed parts are not called unnecessary; the other tests look at host code, the same everywhere."""
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())
@@ -86,7 +86,7 @@ def test_explain_of_a_field(kind):
 
 @pytest.fixture
 def pretend(monkeypatch) -> Callable[[str], Backend]:
-    """The reference, which says that it is a processor or a GPU: what is listed is decided on the host."""
+    """Return the reference, which says that it is a processor or a GPU: the host decides what is listed."""
 
     def as_kind(kind: str) -> Backend:
         device = get_backend("numpy")
@@ -102,7 +102,7 @@ HUGE, GUARD, CLAMPS, ORDER = (
 
 
 def placed(grid: gs.OccupancyGrid, row: int, heading: float = 0.5) -> np.ndarray:
-    """Eight poses in the middle of the columns."""
+    """Return eight poses in the middle of the columns."""
     return np.column_stack([grid.cell_centers([row] * 8, range(36, 44)), np.full(8, heading)])
 
 

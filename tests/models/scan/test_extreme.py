@@ -23,7 +23,7 @@ MODELS = {
 
 
 def room(rows: int = 98, cols: int = 98, cell: float = 0.125) -> gs.OccupancyGrid:
-    """An empty room with walls of one cell."""
+    """Return an empty room with walls of one cell."""
     return gs.OccupancyGrid(np.pad(np.zeros((rows, cols), np.int8), 1, constant_values=100), cell)
 
 
@@ -53,7 +53,7 @@ def test_weights_of_long_scans_and_of_many_particles(backend, name, beams, parti
     exact = np.array([math.fsum(row) for row in parts.tolist()])
     assert (np.abs(again - exact) <= per_scan(parts, "float32")).all()
     if beams == 100_000:
-        # What a product of densities would make of it: 0, or infinity where densities are above 1.
+        # A product of densities would be 0, or infinity where densities are above 1.
         with np.errstate(over="ignore"):
             product = np.exp(log_p.astype(np.float64))
         assert ((product == 0) | np.isinf(product)).all()
@@ -81,7 +81,7 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
     grid, scanner = gs.OccupancyGrid(cells, cell), look_around(24, range_max)
     del cells
     poses = np.random.default_rng(5).uniform((1500, 800, -4), (1503, 803, 4), (50, 3))
-    # What the poses can see, as a map of its own; its origin is exact.
+    # The part that the poses can see, as a map; its origin is exact.
     row, col = int(800 / cell) - reach, int(1500 / cell) - reach
     part = gs.OccupancyGrid(
         grid.cells[row : row + 2 * reach + 24, col : col + 2 * reach + 24], cell, (col * cell, row * cell, 0)

@@ -38,7 +38,7 @@ PARAMETERS = {
 
 
 def scene(resolution: float, origin: tuple[float, float, float], density: float = 0.08, seed: int = 0):
-    """A grid with unknown cells, and poses in it and around it; lengths are in units of 4 cells."""
+    """Return a grid with unknown cells, and poses in it and around it; lengths are in units of 4 cells."""
     rng = np.random.default_rng([seed, int(density * 100)])
     cells = rng.choice([0, 100, -1, 64], (50, 70), p=[0.9 - density, density, 0.05, 0.05])
     grid = gs.OccupancyGrid(cells, resolution, origin)
@@ -51,14 +51,14 @@ def scene(resolution: float, origin: tuple[float, float, float], density: float 
 
 
 def scaled(names: dict[str, float], resolution: float, interpolation: str) -> gs.LikelihoodFieldParameters:
-    """Parameters whose lengths are in units of 4 cells too."""
+    """Return parameters whose lengths are in units of 4 cells too."""
     p = gs.LikelihoodFieldParameters(**names, interpolation=interpolation)
     unit = 4 * resolution
     return p.replace(sigma_hit=p.sigma_hit * unit, max_distance=p.max_distance * unit)
 
 
 def compare(field: Field, model, poses, ranges, bearings, range_min=0.0) -> None:
-    """Parts and sums; beams whose end point lies on an edge to rounding may take either cell when it is nearest."""
+    """Compare parts and sums; a beam whose end point lies on an edge to rounding may take either nearest cell."""
     expected, clear = field.parts(poses, ranges, bearings, range_min)
     log_p, parts = model.log_likelihood(poses, ranges, per_beam=True)
     assert parts.dtype == log_p.dtype == np.dtype(model.precision)
@@ -159,7 +159,7 @@ def parts_of(precision: str, backend: str, grid, poses, ranges, bearings, sigma:
 
 
 def differing_cells(grid, poses, ranges, bearings, left: tuple[str, str], right: tuple[str, str]) -> np.ndarray:
-    """Beams whose parts differ by more than a few eps: end points that fell into cells of different distance."""
+    """Return beams whose parts differ by more than a few eps: end points that fell into cells of different distance."""
     sigma = 10 * grid.resolution
     a, b = (parts_of(precision, name, grid, poses, ranges, bearings, sigma) for precision, name in (left, right))
     return np.argwhere(np.abs(a - b) > 32 * np.finfo(np.float32).eps * (1 + np.abs(a)))
@@ -168,7 +168,7 @@ def differing_cells(grid, poses, ranges, bearings, left: tuple[str, str], right:
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-3.7, 2.2, 0.3), (4e5, 5e6, 1.0)])
 @pytest.mark.parametrize("longest", [5.0, 900.0])
 def test_float32_look_ups_hit_the_cells_of_float64(origin, longest, backend):
-    """40 000 end points anywhere, some hundreds of them nearer to an edge than float32 can tell."""
+    """40 000 end points anywhere, some hundreds of them nearer to an edge than float32 resolves."""
     rng = np.random.default_rng(6)
     grid = gs.OccupancyGrid((rng.random((200, 200)) < 0.1) * 100, 0.05, origin)
     inside = rng.uniform(1, 9, (200, 2))
@@ -186,7 +186,7 @@ def test_float32_look_ups_hit_the_cells_of_float64(origin, longest, backend):
 
 
 def lattice(resolution: float) -> tuple:
-    """Poses and readings in whole quarters of a cell, headings and bearings of whole quarter turns."""
+    """Return poses and readings in whole quarters of a cell, headings and bearings of whole quarter turns."""
     rng = np.random.default_rng(7)
     grid = gs.OccupancyGrid((rng.random((160, 160)) < 0.15) * 100, resolution)
     theta = np.array([0.0, np.pi / 2, -np.pi / 2, np.pi, 2 * np.pi])[rng.integers(0, 5, 400)]

@@ -15,7 +15,7 @@ from gpusense.tables.reachable import ReachableMap
 
 
 class FullDevice:
-    """A backend on which some allocations fail: those numbered in ``failing``, and those of too many numbers."""
+    """Fails some allocations of a backend: those numbered in ``failing``, and those of too many numbers."""
 
     def __init__(self, backend: str) -> None:
         self._backend = get_backend(backend)
@@ -70,7 +70,7 @@ def test_whichever_allocation_fails_the_model_goes_on(kind, backend):
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
-def test_a_table_that_does_not_fit_is_told_at_once(kind, backend, monkeypatch):
+def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatch):
     """The table is the same for fewer particles: it is tried once, and the message is the device's."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)

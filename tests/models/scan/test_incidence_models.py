@@ -29,7 +29,7 @@ def model_of(backend, **options) -> gs.BeamModel:
 
 
 def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(N, K) log densities, each with the parameters of its own angle."""
+    """Return (N, K) log densities, each with the parameters of its own angle."""
     parameters = model.incidence_parameters
     expected, angle = model.expected_ranges(poses).astype(float), model.incidence(poses).astype(float)
     which = np.searchsorted(parameters.edges[1:-1], np.nan_to_num(angle), side="right")
@@ -120,7 +120,7 @@ def test_max_readings_where_their_probability_depends_on_the_pose(backend):
     assert np.isneginf(never.log_likelihood(poses, z)).all()
 
 
-def test_what_is_left_out_changes_nothing(backend):
+def test_omissions_change_nothing(backend):
     _, poses, _ = place()
     z = a_scan()
     lean, whole = model_of(backend), model_of(backend, specialize=False)

@@ -66,7 +66,7 @@ def on(request: pytest.FixtureRequest, backend: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Scene:
-    """A map, its place, poses, a scanner and a scan."""
+    """Holds a map, its place, poses, a scanner and a scan."""
 
     cells: np.ndarray
     poses: np.ndarray
@@ -84,11 +84,11 @@ class Scene:
         return make(grid, scanner, parameters, **options)
 
     def cast(self, **on: str) -> np.ndarray:
-        """(N, K) expected ranges of the beam model."""
+        """Return (N, K) expected ranges of the beam model."""
         return self.model(gs.BeamParameters(), **on).expected_ranges(self.poses)
 
     def score(self, parameters: Any, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) log p and the beams' (N, K) parts."""
+        """Return (N,) log p and the beams' (N, K) parts."""
         return self.model(parameters, **options).log_likelihood(self.poses, self.z, per_beam=True)
 
     @property
@@ -98,7 +98,7 @@ class Scene:
 
 @functools.cache
 def scene(kind: str, seed: int, **changes: Any) -> Scene:
-    """Poses in the map, in walls and off it; half of the readings is what the first pose expects.
+    """Return poses in the map, in walls and off it; half of the readings are those that the first pose expects.
 
     For a likelihood field they end in the wall and not on its face, which is the edge of two cells.
     """
@@ -120,7 +120,7 @@ def same_bits(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 def same_scores(found: Scene, expected: Scene, parameters: Any, on: dict[str, str]) -> None:
-    """log p and its parts, and the expected ranges of a beam model, to the bit."""
+    """Check log p and its parts, and the expected ranges of a beam model, to the bit."""
     for results in zip(*(each.score(parameters, **on) for each in (found, expected)), strict=True):
         same_bits(*results)
     if isinstance(parameters, gs.BeamParameters):
@@ -128,14 +128,14 @@ def same_scores(found: Scene, expected: Scene, parameters: Any, on: dict[str, st
 
 
 def assert_near(found: np.ndarray, expected: np.ndarray, allowed: Any) -> None:
-    """Within what is allowed; infinite values must be equal."""
+    """Check that values are within the allowed difference; infinite ones must be equal."""
     with np.errstate(invalid="ignore"):
         apart = np.where(found == expected, 0, np.abs(found.astype(np.float64) - expected))
     assert (apart <= allowed).all(), float(np.max(apart - allowed))
 
 
 def near_ranges(found: np.ndarray, expected: np.ndarray, float64: float) -> None:
-    """Ranges of rays that were rounded differently: float32 keeps its tolerance against float64 on both sides."""
+    """Check ranges of rays that were rounded differently: float32 keeps its tolerance against float64 on both sides."""
     float32 = 2 * CELL * TOLERANCES["float32 ranges to float64"].value
     assert_near(found, expected, float32 if expected.dtype == np.float32 else float64)
 
@@ -146,12 +146,12 @@ def sum_error(parts: np.ndarray) -> np.ndarray:
 
 
 def plain_sum(log_p: np.ndarray, parts: np.ndarray) -> None:
-    """log p is the sum over the beams but for the roundings of the sum."""
+    """Check that log p is the sum over the beams but for the roundings of the sum."""
     assert_near(log_p, np.array([math.fsum(row) for row in parts.astype(np.float64)]), sum_error(parts))
 
 
 def turned_and_mirrored_scores(after: Scene, before: Scene, parameters: Any, on: dict[str, str]) -> None:
-    """To the bit; a distance that is interpolated from the other side keeps the tolerance of both sides."""
+    """Check to the bit; a distance that is interpolated from the other side keeps the tolerance of both sides."""
     if getattr(parameters, "interpolation", "nearest") == "nearest":
         same_scores(after, before, parameters, on)
     found, expected = after.score(parameters, **on)[1], before.score(parameters, **on)[1]

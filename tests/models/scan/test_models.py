@@ -1,4 +1,4 @@
-"""What must not change a result: batching, order, repetition, buffers, arguments."""
+"""Batching, order, repetition, buffers and arguments change no result."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ LAWS = settings(
 
 
 def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A map, poses off its lattice, and bearings."""
+    """Draw a map, poses off its lattice, and bearings."""
     rng = np.random.default_rng(seed)
     cells = np.where(rng.random(rng.integers(1, 25, 2)) < rng.choice([0.02, 0.1]), 100, 0)
     poses = np.column_stack([*(rng.uniform(-2, n + 2, 12) for n in cells.shape[::-1]), rng.uniform(-4, 4, 12)])

@@ -30,7 +30,7 @@ CELLS_FAR = 30.5
 
 @dataclass(frozen=True)
 class World:
-    """A grid with unknown cells, poses all around it, and the exact casts."""
+    """Holds a grid with unknown cells, poses all around it, and the exact casts."""
 
     grid: gs.OccupancyGrid
     poses: np.ndarray
@@ -80,7 +80,7 @@ def test_casts_of_a_world(name, unknown, outside, precision, backend):
 
 
 def forward_error(ray: Ray, exact: Hit) -> float:
-    """Float64: 1e-12 of the range, and what a rounded position and direction do to a ray that meets a wall aslant."""
+    """Return float64's bound: 1e-12 of the range, and the effect of rounded poses on a ray that meets a wall aslant."""
     normal = {"x": ray.direction[0], "y": ray.direction[1]}.get(exact.face[2] if exact.face else "", 1)
     size = 2e-15 * (1 + max(abs(ray.cell[0]), abs(ray.cell[1])))
     return 1e-12 * exact.t + (size + 1e-15 * exact.t) / max(abs(float(normal)), 1e-12)
@@ -119,7 +119,7 @@ def test_all_unknown_map(backend):
 
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi / 2, math.pi, 2 * math.pi])
 def test_a_ray_along_an_edge_stays_in_its_row(backend, heading):
-    """From the lower edge of a cell along that edge: the walls of the rows above and below are told apart."""
+    """From the lower edge of a cell along that edge: the walls of the rows above and below are distinguished."""
     cells = np.zeros((9, 9), int)
     cells[4, 7] = cells[7, 4] = cells[4, 1] = cells[1, 4] = 100
     grid = gs.OccupancyGrid(cells, 1.0)
@@ -134,7 +134,7 @@ def test_a_ray_along_an_edge_stays_in_its_row(backend, heading):
 
 @functools.cache
 def shapely_casts() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A map, 20 000 poses, and the distances to the union of the occupied squares."""
+    """Return a map, 20 000 poses, and the distances to the union of the occupied squares."""
     rng = np.random.default_rng(11)
     occupied = rng.random((40, 40)) < 0.04
     rows, cols = np.nonzero(occupied)

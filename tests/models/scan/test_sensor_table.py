@@ -1,4 +1,4 @@
-"""The tabulated beam mixture: what it holds, what it gives up, and that it treats readings as the formula does."""
+"""The tabulated beam mixture: its values, its errors, and readings treated as the formula treats them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WEIGHTS = {"all": (0.7, 0.1, 0.1, 0.1), "no short": (0.8, 0.0, 0.1, 0.1), "no ra
 
 @functools.cache
 def scene() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
-    """A corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max; four beams each way."""
+    """Return a corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max; four beams each way."""
     cells = np.zeros((1, 400), int)
     cells[0, -1] = 100
     poses = np.zeros((80, 3))
@@ -132,7 +132,7 @@ def test_impossible_scans_are_minus_infinity_and_no_others(backend):
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(weights, precision, backend):
-    """Expected ranges are the same bits everywhere, and the rest is looking up and adding in a fixed order."""
+    """Expected ranges are the same bits everywhere, and the rest is look-ups and sums in a fixed order."""
     _, _, poses = scene()
     for seed, options in ((0, {}), (1, {"temperature": 0.3}), (2, {"beams": 3})):
         z = readings(seed)

@@ -32,7 +32,7 @@ ATOMS = gs.LikelihoodFieldParameters(1.0, 0.0, 0.0)
 
 
 def scans_of(scanner: gs.Scanner = SCANNER) -> np.ndarray:
-    """Scans with every number of readings that blocks of 16 can tell apart, none among them; max and missing ones."""
+    """Return scans with every number of readings that blocks of 16 distinguish, 0 included; max and missing ones."""
     z = np.random.default_rng(8).uniform(0.1, 4.99, (11, scanner.count))
     z[1, 16:] = np.nan
     z[2, 17:] = -1.0
@@ -59,7 +59,7 @@ def field(scanner: gs.Scanner = SCANNER, **options: Any) -> Any:
     return functools.partial(gs.LikelihoodFieldModel, GRID, scanner, **{"temperature": 0.7} | options)
 
 
-# What models are made of, and whether Warp, which compiles each set of flags for seconds, has its turn.
+# Arguments of models, and whether Warp, which compiles each set of flags for seconds, has its turn.
 MODELS: dict[str, tuple[Any, bool]] = {
     "beam": (beam(), True),
     "beam, float64": (beam(precision="float64"), True),
@@ -87,7 +87,7 @@ MODELS: dict[str, tuple[Any, bool]] = {
 
 
 class Counting:
-    """A backend that counts its launches by kernel."""
+    """Counts the launches of a backend by kernel."""
 
     def __init__(self, backend: Any) -> None:
         self._backend, self.launches = backend, dict[str, int]()
@@ -96,7 +96,7 @@ class Counting:
         return getattr(self._backend, name)
 
     def mark(self) -> None:
-        """None: every launch is made, so that it is counted, where the backend would repeat some."""
+        """Return None, so that every launch is made and counted, where the backend would replay some."""
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Any:
         def launch(*arguments: Any) -> None:
@@ -108,7 +108,7 @@ class Counting:
 
 
 def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
-    """One call of all scans has the bits of calls of each, with and without a place for the result."""
+    """Check that one call of all scans has the bits of calls of each, with and without ``out=``."""
     found = model.log_likelihood(poses, z)
     assert model._together > 1, "nothing was scored together"
     each = np.stack([model.log_likelihood(own, scan) for own, scan in zip(poses, z, strict=True)])
@@ -263,7 +263,7 @@ def test_runs_of_scans():
     assert found([], [], 3) == [] and found([2, 2], [2, 2], 1) == [(0, 1), (1, 2)]
 
 
-def test_explain_tells_of_scans_that_share_launches():
+def test_explain_names_scans_that_share_launches():
     model = beam()(backend="numpy")
     model.log_likelihood(clouds(6, 50), scans_of()[5:])
     assert "SCANS" in model.explain().splitlines()[1].split()

@@ -1,4 +1,4 @@
-"""Ways that calls of few particles take, against the plain one: memory that is shared, launches that are gathered."""
+"""Paths of calls of few particles against the plain one: memory that is shared, launches that are gathered."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gpusense.models.scan import model as scan_model
 
 @pytest.fixture
 def two_ways(needs, monkeypatch):
-    """An OpenCL processor's backend that shares memory, and one that copies by commands."""
+    """Return an OpenCL processor's backend that shares memory, and one that copies by commands."""
     from gpusense.backends.opencl import backend as _opencl
 
     selection = needs("opencl")
@@ -42,7 +42,7 @@ def test_shared_memory_changes_no_bit(kind, two_ways):
     assert differing(found[1], expected[1]) == 0
 
 
-def test_what_is_started_sees_what_was_there(two_ways):
+def test_launches_see_the_contents_of_their_time(two_ways):
     """Copies keep their place among launches, and memory that is given up lives until these have ended."""
     device, numpy = two_ways[0], get_backend("numpy")
     size, int32 = (200_000,), np.dtype(np.int32)
@@ -62,8 +62,8 @@ def test_what_is_started_sees_what_was_there(two_ways):
     assert all(np.array_equal(a, b) for a, b in zip(results[:3], results[3:], strict=True))
 
 
-def test_shared_memory_that_is_not_to_be_had(two_ways):
-    """It is a MemoryError, and nothing else is said."""
+def test_shared_memory_that_cannot_be_allocated(two_ways):
+    """It is a MemoryError, without any other message."""
     from gpusense.backends.opencl.memory import SharedBuffer, driver_errors
 
     with pytest.raises(MemoryError, match="out of memory"), driver_errors():
@@ -74,7 +74,7 @@ def test_shared_memory_that_is_not_to_be_had(two_ways):
 
 
 def plainly(device, monkeypatch, run):
-    """A result without anything gathered."""
+    """Return a result without anything gathered."""
     with monkeypatch.context() as patch:
         patch.setattr(device, "_gathers", False)
         return run()
@@ -101,7 +101,7 @@ def test_graphs_change_no_bit(kind, gathering, monkeypatch):
             assert "ORIGINS_OUTSIDE" not in model._last_code
     # Of each of three sizes the first calls are plain, and so are those of other code.
     assert len(started) >= 3
-    # A changed map mends or makes the table anew.
+    # A changed map updates the table or makes it anew.
     for place in ((5, 6), (30, 30)):
         model.update_map(np.full((2, 3), 100), place)
         anew = kind(model.grid, SCANNER, backend=device)
@@ -196,7 +196,7 @@ def test_several_models_are_gathered(count, gathering, monkeypatch):
         bad[5, 2] = np.inf
         with pytest.raises(ValueError, match="poses: must be finite, got a pose on the device"):
             gs.log_likelihoods(models, [there[0], there[1], to_device(bad), there[3]], z)
-        # It is told once, and of no other model.
+        # It is reported once, and for no other model.
         assert differing(gs.log_likelihoods(models, there, z)[2].numpy(), expected[2]) == 0
 
 
@@ -214,7 +214,7 @@ def test_arrays_that_are_too_large_are_copied_at_once(gathering, monkeypatch):
 
 
 def test_a_call_that_fails_leaves_nothing_behind(gathering, monkeypatch):
-    """The table that it made is whole, and arrays of its own are not written later."""
+    """The table that it made is whole, and its arrays are not written later."""
     device, _ = gathering
     model = gs.BeamModel(GRID, SCANNER, backend=device)
     other = gs.BeamModel(GRID, SCANNER, backend=device)
@@ -282,7 +282,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering,
 
 
 def test_an_error_forgets_no_memory_that_launches_still_need(gathering, monkeypatch):
-    """What was gathered before is started first."""
+    """Launches that were gathered before are started first."""
     device, int32, seen = gathering[0], np.dtype(np.int32), []
     space, scatter = Workspace(device), device.scatter
     monkeypatch.setattr(device, "scatter", lambda: (seen.append(("verdict", int32) in space._buffers), scatter()))

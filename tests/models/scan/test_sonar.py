@@ -31,12 +31,12 @@ def ring(**options) -> gs.Scanner:
 
 
 def rays_alone(scanner: gs.Scanner) -> gs.Scanner:
-    """A laser along every ray of a sonar."""
+    """Return a laser along every ray of a sonar."""
     return gs.Scanner(scanner.ray_bearings.ravel(), scanner.range_max, mount=scanner.mount)
 
 
 def brute_force(scanner: gs.Scanner, backend, poses: np.ndarray, **options) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges of the nearest rays that return, and their angles of incidence, from rays one by one."""
+    """Return ranges of the nearest rays that return, and their angles of incidence, from rays one by one."""
     model = gs.BeamModel(place()[0], rays_alone(scanner), backend=backend, **options)
     shape = (len(poses), *scanner.ray_bearings.shape)
     ranges = model.expected_ranges(poses).reshape(shape)
@@ -220,7 +220,7 @@ def test_a_mirror_in_a_corner_and_a_wall_aslant():
 # ------------------------------------------------------------------------------------------------- the scanner
 
 
-def test_what_a_scanner_says_of_its_cones():
+def test_cones_of_a_scanner_in_attributes_and_repr():
     scanner = gs.Scanner([0.0, 1.0], 5.0, cone=0.2, cone_rays=3, critical_incidence=0.4)
     assert (scanner.cone, scanner.cone_rays, scanner.critical_incidence) == (0.2, 3, 0.4)
     np.testing.assert_allclose(scanner.ray_bearings, [(-0.1, 0, 0.1), (0.9, 1, 1.1)])

@@ -68,7 +68,7 @@ class Watch:
         self._count_buffers(device, monkeypatch)
 
     def _count_buffers(self, device, monkeypatch) -> None:
-        """What the driver is asked for, whoever asks."""
+        """Count the buffers that the driver is asked for, from any place."""
         if device.info.backend == "opencl":
             from gpusense.backends.opencl import backend as _opencl
 
@@ -102,14 +102,14 @@ class Watch:
 
 
 def scan_uploads(device, size: int, *counts: int) -> list[int]:
-    """Bytes of a scan's arrays: one copy of all, each from a multiple of 64 numbers on, where a call is gathered."""
+    """Return the bytes of a scan's arrays: a gathered call copies them at once, each begins at a multiple of 64."""
     if getattr(device, "_gathers", False):
         return [sum(size * -(-count // 64) * 64 for count in counts)]
     return [size * count for count in counts]
 
 
 def call_of(what: str, device, precision: str):
-    """What scores or casts poses, and the bytes that a call of some poses copies there and back."""
+    """Return the call that scores or casts poses, and the bytes that it copies there and back."""
     size = np.dtype(precision).itemsize
     if what == "caster":
         caster = gs.RayCaster(GRID, RANGE, backend=device, precision=precision)
@@ -200,7 +200,7 @@ def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):
 
     first = call(COUNT, 1)
     total = scans * BEAMS - sum(range(scans))
-    # What the sums begin with, and where scans begin and how much each has.
+    # Starts of the sums, and begins and numbers of readings of the scans.
     counts = (2 * total, total, scans) if what == "beam" else (2 * total, 2 * total, scans)
     counts = (*counts[:2], scans * BLOCKS, scans) if what == "field" and gpu else counts
     readings = [*scan_uploads(device, 4, *counts), *scan_uploads(device, 4, scans + 1, scans)]

@@ -36,7 +36,7 @@ FEW = [("free", "float32", True), ("occupied", "float64", False)]
 
 
 def world(seed: int = 3) -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
-    """A map, a scanner with two beams along one ray, and a scan with a missing and a max reading."""
+    """Return a map, a scanner with two beams along one ray, and a scan with a missing and a max reading."""
     rng = np.random.default_rng(seed)
     cells = np.where(rng.random((90, 120)) < 0.03, 100, 0).astype(np.int8)
     bearings, z = np.linspace(-3, 3, BEAMS), rng.uniform(0, 5.5, BEAMS)
@@ -56,7 +56,7 @@ Pretend = Callable[..., object]
 
 @pytest.fixture(params=[False, True], ids=["as given", "ordered"])
 def ordered(request, monkeypatch) -> bool:
-    """Whether every cloud is put in an order."""
+    """Return whether every cloud is put in an order."""
     if request.param:
         monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
     return request.param
@@ -206,7 +206,7 @@ def test_batches(kind, ordered, as_gpu):
 
 
 def lattice(resolution: float, quarter_turns: bool) -> np.ndarray:
-    """Poses on edges and corners of cells, whose end points lie on edges and corners too."""
+    """Return poses on edges and corners of cells, whose end points lie on edges and corners too."""
     at = np.arange(16, 80, 8) * resolution
     x, y = np.meshgrid(at, at)
     turns = np.arange(x.size) % 8 * (math.pi / 2 if quarter_turns else math.pi / 4)
@@ -231,7 +231,7 @@ def test_end_points_on_edges_of_cells(resolution, quarter_turns, as_gpu):
 
 
 def border_poses(grid: gs.OccupancyGrid, reach: float) -> np.ndarray:
-    """Clouds of 12 poses: far inside, then nearer and nearer to the border, over it, and off the map."""
+    """Return clouds of 12 poses: far inside, then nearer and nearer to the border, over it, and off the map."""
     low_x, low_y, high_x, high_y = grid.bounds()
     rng, found = np.random.default_rng(8), []
     for gap in np.concatenate([np.linspace(reach + 0.6, reach - 0.6, 13), [0.3, 0.0, -0.3, -3.0]]):
@@ -241,7 +241,7 @@ def border_poses(grid: gs.OccupancyGrid, reach: float) -> np.ndarray:
 
 
 def test_end_points_at_the_border(as_gpu, backend):
-    """Whether no end point leaves the table is known to the cell; both ways give the same."""
+    """The border is known to the cell: code with and without clamping gives the same."""
     cells = world()[0].cells
     grid = gs.OccupancyGrid(cells, 0.1)
     scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), 2.0)

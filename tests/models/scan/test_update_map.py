@@ -21,13 +21,13 @@ FIELDS = {
     "bilinear": {"max_distance": 0.72, "interpolation": "bilinear"},
     "uncapped": {"max_distance": 1e3},
 }
-# What a patch is made of: nothing, much unknown, some obstacles, only obstacles.
+# Contents of patches: nothing, much unknown, some obstacles, only obstacles.
 KINDS = ([0], [-1, 0], [0] * 9 + [100], [100])
 
 
 @pytest.fixture(params=["cpu", "gpu"])
 def device(request, backend, monkeypatch):
-    """Each backend with the kernels for processors and with those for GPUs."""
+    """Return each backend with the kernels for processors and with those for GPUs."""
     made = get_backend(backend)
     monkeypatch.setattr(made, "info", dataclasses.replace(made.info, kind=request.param))
     return made
@@ -38,7 +38,7 @@ def cells_of(rng, shape, share=0.01):
 
 
 def patches(rng, shape, count):
-    """Patches of cells and their places, the first in two corners."""
+    """Return patches of cells and their places, the first in two corners."""
     for k in range(count):
         rows, cols = (int(rng.integers(1, min(12, size) + 1)) for size in shape)
         place = [(0, 0), (shape[0] - rows, shape[1] - cols)][k] if k < 2 else None
@@ -116,7 +116,7 @@ def test_the_field_follows(field, outside, precision, device):
 
 
 @pytest.mark.parametrize("outside", ["free", "occupied"])
-def test_every_cell_of_a_mended_field_is_that_of_a_new_one(outside, device):
+def test_every_cell_of_an_updated_field_is_that_of_a_new_one(outside, device):
     """A cap of 7.2 cells: distances of 7 cells, just within reach of an edit, still count."""
     rng, shape = np.random.default_rng(14), (90, 80)
     parameters = gs.LikelihoodFieldParameters(max_distance=0.72)
@@ -151,7 +151,7 @@ def test_models_with_the_weights_of_others_follow(compat):
 
 
 def tables(model, ranges):
-    """How a model's table is found, and what it says of poses."""
+    """Return functions that find a model's table and score poses."""
     if isinstance(model, gs.RayCaster):
         return model._caster.map, lambda poses: model.cast(poses, BEARINGS)
     if isinstance(model, gs.BeamModel):
@@ -161,7 +161,7 @@ def tables(model, ranges):
 
 @pytest.fixture(params=[gs.RayCaster, gs.BeamModel, gs.LikelihoodFieldModel])
 def make(request, backend):
-    """Makes a model of each kind."""
+    """Return a function that makes a model of each kind."""
 
     def made(grid):
         if request.param is gs.RayCaster:
@@ -219,7 +219,7 @@ def test_the_first_obstacle_and_the_last(make):
     np.testing.assert_array_equal(says(poses), empty)
 
 
-def test_what_changes_no_obstacle_does_nothing(make, monkeypatch):
+def test_edits_that_change_no_obstacle_do_nothing(make, monkeypatch):
     rng = np.random.default_rng(8)
     grid = gs.OccupancyGrid(cells_of(rng, (60, 50)), RESOLUTION)
     model, poses = make(grid), poses_in(rng, (60, 50))
@@ -253,7 +253,7 @@ def test_a_grid_that_models_share_stays_as_it_is(make):
     np.testing.assert_array_equal(tables(other, RANGES)[1](poses), expected)
 
 
-def test_a_device_without_room_to_mend_makes_the_table_anew(make, monkeypatch):
+def test_a_device_without_room_for_an_update_makes_the_table_anew(make, monkeypatch):
     grid = gs.OccupancyGrid(np.zeros((50, 50), int), RESOLUTION)
     model, poses = make(grid), poses_in(np.random.default_rng(11), (50, 50))
     table, says = tables(model, RANGES)
@@ -269,8 +269,8 @@ def test_a_device_without_room_to_mend_makes_the_table_anew(make, monkeypatch):
     assert table.preparations == 2
 
 
-def test_only_what_can_change_is_made_again(monkeypatch):
-    """An edit of 5 x 5 cells in 2000 x 2000: what reaches the device."""
+def test_only_cells_that_can_change_are_computed_again(monkeypatch):
+    """An edit of 5 x 5 cells in 2000 x 2000: the bytes that reach the device."""
     grid = gs.OccupancyGrid(cells_of(np.random.default_rng(12), (2000, 2000)), RESOLUTION)
     device = get_backend("numpy")
     parameters, sizes = gs.LikelihoodFieldParameters(max_distance=0.72), []

@@ -333,6 +333,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, family):
     """Entries of verdicts, programs, and PoCL's and Warp's kernels, and folders in the place of entries."""
@@ -391,6 +392,7 @@ def test_a_full_file_system_is_named_and_stops_nothing(needs, tmp_path, expected
         subprocess.run(["umount", "-l", str(full)], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_path, expected, family):
     """25 processes of each family are killed with all they started, half of them while they prove the device."""
@@ -414,6 +416,7 @@ def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_p
     assert outcome(start(family, fake_driver.environment(tmp_path))) == (0, expected, "")
 
 
+@pytest.mark.slow
 @settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     families=st.tuples(*[st.sampled_from(["opencl", "warp:cpu"])] * 2),

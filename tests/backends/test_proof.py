@@ -303,6 +303,7 @@ def default_of(tmp_path, **variables):
     return first, runs[0].stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "words", "message"),
     [
@@ -333,6 +334,7 @@ def test_a_driver_that_fails_altogether_is_named_and_another_backend_is_the_defa
     assert message in found["named"] and found["named"].startswith("backend: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "words", "message", "left"),
     [
@@ -350,6 +352,7 @@ def test_a_driver_that_fails_in_part_keeps_the_rest(needs, tmp_path, mode, words
     assert errors.count("\n") == 1 and message in errors
 
 
+@pytest.mark.slow
 def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
     """Otherwise the tests above would show nothing."""
     needs("opencl")
@@ -358,6 +361,7 @@ def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
     assert found["lanes"] > 1 and found["float64"]
 
 
+@pytest.mark.slow
 def test_a_driver_that_dies_when_it_is_loaded_is_left_out_and_the_others_work(needs, tmp_path):
     """PoCL, from beside pyopencl, is still there."""
     needs("opencl")
@@ -372,6 +376,7 @@ def test_a_driver_that_dies_when_it_is_loaded_is_left_out_and_the_others_work(ne
     assert any(line.startswith(f"{icd}: it ends the process with SIGABRT") for line in listed.stdout.splitlines())
 
 
+@pytest.mark.slow
 def test_without_a_linker_pocl_says_what_to_install(needs, tmp_path):
     """PoCL needs the system's linker, and aborts without."""
     needs("opencl")
@@ -393,6 +398,7 @@ pocl.fit_target = misfit
 """
 
 
+@pytest.mark.slow
 def test_a_target_that_does_not_fit_the_library_ends_in_narrower_kernels(needs, tmp_path):
     """The fault of a Zen 4: PoCL is given a processor without the AVX-512 of its library."""
     needs("opencl")

@@ -22,6 +22,9 @@ from gpusense.interface.kernel_files import opencl_source
 
 COPIED = ("bench", "docs", "examples", "gpusense", "kernels", "tests")
 
+# Layouts that are built or installed from a copy of the checkout.
+BUILT = ("wheel", "sdist", "editable")
+
 needs_warp = pytest.mark.skipif(find_spec("warp") is None, reason="Warp has no wheel for this platform")
 
 # Reports where the package and the kernels were found, and every OpenCL source as it was read.
@@ -183,7 +186,7 @@ def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return python
 
 
-@pytest.fixture(params=["wheel", "sdist", "editable", "checkout"])
+@pytest.fixture(params=[*(pytest.param(name, marks=pytest.mark.slow) for name in BUILT), "checkout"])
 def layout(request: pytest.FixtureRequest, checkout: Path) -> Layout:
     """Return each layout of the package on a disk in turn."""
     if request.param == "editable":
@@ -201,17 +204,20 @@ def test_checkout_has_kernels() -> None:
     assert any(name.startswith("warp/") and name != "warp/__init__.py" for name in names)
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_package_with_the_kernels_and_nothing_else(wheel: Path, checkout: Path) -> None:
     kernels = {f"kernels/{name}": data for name, data in contents(checkout / "kernels").items()}
     assert contents(wheel / "gpusense") == contents(checkout / "gpusense") | kernels
     assert [path.suffix for path in sorted(wheel.iterdir())] == ["", ".dist-info"]
 
 
+@pytest.mark.slow
 def test_sdist_holds_the_sources_and_the_tests(sdist: Path, checkout: Path) -> None:
     for folder in ("gpusense", "kernels", "tests"):
         assert contents(sdist / folder) == contents(checkout / folder), folder
 
 
+@pytest.mark.slow
 def test_wheel_of_the_sdist_is_the_wheel_of_the_checkout(wheel: Path, wheel_of_sdist: Path) -> None:
     assert contents(wheel_of_sdist) == contents(wheel)
 
@@ -268,6 +274,7 @@ def test_the_installed_package_is_under_test() -> None:
     assert Path(gpusense.__file__).resolve() == installed.resolve()
 
 
+@pytest.mark.slow
 def test_dependencies_on_linux_x86_64(wheel: Path) -> None:
     metadata = next(wheel.glob("*.dist-info/METADATA")).read_text(encoding="utf-8")
     lines = [line.split(":", 1)[1] for line in metadata.splitlines() if line.startswith("Requires-Dist:")]

@@ -117,6 +117,7 @@ print(json.dumps([found, sorted(changed - {"PYOPENCL_HOME"})]))
 """
 
 
+@pytest.mark.slow
 def test_a_runtime_from_a_wheel_is_found_proved_and_used_beside_pocl(needs, tmp_path):
     """A stand-in for Intel's library, in a wheel of that name."""
     needs("opencl")

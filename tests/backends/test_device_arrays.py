@@ -13,7 +13,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import chunks
+from gpusense.models import run
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
 RNG = np.random.default_rng(12)
@@ -104,7 +104,7 @@ def test_scans_that_share_launches_on_the_device(kind, real, warp_as_gpu, warp_c
     for given in (to_device(several), Array(to_device(several))):
         warp_copies.clear()
         found = model.log_likelihood(given, scans)
-        assert type(found) is type(given) and model._together == 2
+        assert type(found) is type(given) and model._last.together == 2
         assert differing((found.held if isinstance(found, Array) else found).numpy(), expected) == 0
         # Poses stay there; the scan without readings is filled in.
         assert all(size <= 5 * 16 * BEAMS for way, size in warp_copies) and ("up", 24 * COUNT) not in warp_copies
@@ -129,7 +129,7 @@ def test_scans_that_share_launches_on_the_device(kind, real, warp_as_gpu, warp_c
 def test_in_pieces_on_the_device(method, warp_as_gpu, monkeypatch):
     call, _ = call_of(method, warp_as_gpu)
     expected = call(POSES)
-    monkeypatch.setattr(chunks, "CHUNK", 77)
+    monkeypatch.setattr(run, "CHUNK", 77)
     assert differing(call(to_device(POSES)).numpy(), expected) == 0
 
 
@@ -173,7 +173,7 @@ def test_a_pose_that_is_not_finite_is_reported_after_memory_ran_out(warp_as_gpu,
     poses = np.tile(POSES, (4, 1))
     model.log_likelihood(to_device(poses), SCAN)
     poses[3, 0] = np.nan
-    monkeypatch.setattr(chunks, "CHUNK", 600)
+    monkeypatch.setattr(run, "CHUNK", 600)
     before, calls = Workspace.empty, []
 
     def empty(self, name, count, dtype, *, zero=False):

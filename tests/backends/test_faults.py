@@ -15,7 +15,7 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface import sources
-from gpusense.models import chunks
+from gpusense.models import run
 
 
 def room() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
@@ -247,7 +247,7 @@ def test_a_long_batch_can_be_interrupted_and_the_model_still_works(backend, tmp_
 
 def test_work_on_a_processor_is_cut_into_pieces_that_can_be_interrupted():
     device = get_backend("numpy")
-    assert chunks.chunk_of(device, 360) == chunks.CHUNK_WORK // 360 // 256 * 256
-    assert chunks.chunk_of(device, 1 << 17) == chunks.CHUNK_WORK >> 17 == 128
-    assert chunks.chunk_of(device, 1 << 30) == 1
-    assert chunks.chunk_of(device, 4, 8) <= chunks.CHUNK_BYTES // 32
+    assert run.chunk_of(device, 360) == run.CHUNK_WORK // 360 // 256 * 256
+    assert run.chunk_of(device, 1 << 17) == run.CHUNK_WORK >> 17 == 128
+    assert run.chunk_of(device, 1 << 30) == 1
+    assert run.chunk_of(device, 4, 8) <= run.CHUNK_BYTES // 32

@@ -16,7 +16,7 @@ from gpusense.commands.cli import main
 from gpusense.evaluation import selftest, stiff
 from gpusense.evaluation.replay import Recorder, replay
 from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
-from gpusense.models import cloud
+from gpusense.models.scan import tiles
 from gpusense.reference import beam, distance, echo, mixture, order, ranges, sums
 from gpusense.reference.error_free import block_sums, strand_sums
 
@@ -290,7 +290,7 @@ def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind="gpu")
     monkeypatch.setattr(selftest, "_REPEATS", 2)
-    monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
+    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     module = {"sum_parts": sums, "order_fill": order, None: None}[kernel]
     if module is not None:
         right = getattr(module, kernel)

@@ -12,7 +12,7 @@ from support.kernel_scenes import PRECISIONS, on_both, scene_flags
 import gpusense as gs
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing
-from gpusense.models.scan.readings import choose_beams, prepare_scan
+from gpusense.models.scan.classed import Rules, choose_beams, class_scans
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED, is_chosen
 from gpusense.world.frames import frame_scalars, ray_vectors, split
@@ -75,12 +75,13 @@ def test_readings_are_placed_as_the_host_prepares_them(
         nearest = float((np.float32 if single else np.float64)(NEAREST))
         for ranges, chosen in itertools.product(scans(np.float32 if single else np.float64, count), (0, 7, 16, count)):
             chosen = min(chosen, count)
-            scan = prepare_scan(ranges, scanner, vectors, z_max, chosen, True, max_depends=kind == MAX_PLACED)
+            rules = Rules(scanner, vectors, z_max, chosen, True, max_depends=kind == MAX_PLACED)
+            scan = class_scans(ranges[None], rules)
             flags = scene_flags(precision, *(["END_POINTS"] if end_points else []))
             numbers = (chosen, chosen, kind, 1, nearest, np.log(z_max) if z_max else 0.0, np.inf)
             found = placed(device, flags, ranges, vectors[:, None], *numbers, some=chosen == 7)
             some = len(scan.readings)
-            assert found["fixed"][0] == real.type(scan.constant)
+            assert found["fixed"][0] == real.type(scan.constants[0])
             point = found["point"][: 2 * chosen].reshape(chosen, 2)
             if not end_points:
                 assert differing(found["reading"][:some], scan.readings.astype(real)) == 0
@@ -104,7 +105,7 @@ def test_readings_that_keep_their_places(device: Backend) -> None:
     (_, ranges, *_), count = scans(np.float32, 53), 53
     scanner = gs.Scanner(np.linspace(-3, 3, count), RANGE, NEAREST, cone=0.2, cone_rays=3)
     vectors = ray_vectors(scanner.ray_bearings, scanner.mount)
-    scan = prepare_scan(ranges, scanner, vectors[:, 1], 0.1, None, False)
+    scan = class_scans(ranges[None], Rules(scanner, vectors[:, 1], 0.1, None, False))
     top = np.float32(4.0)
     numbers = (count, count, MAX_PLACED, 1, float(np.float32(NEAREST)), 0.0, float(top))
     found = placed(device, frozenset({"ALL_READINGS"}), ranges, vectors, *numbers)

@@ -20,7 +20,7 @@ if BACKEND.startswith("warp"):
     warp.config.mode = "debug"
     warp.config.verify_fp = False
 import gpusense as gs
-import gpusense.models.cloud
+import gpusense.models.scan.tiles
 from gpusense.backends import get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.tables.casters import CASTERS, Lookup, March
@@ -86,7 +86,7 @@ ranges[2] = np.nan
 scanner = gs.Scanner(bearings, 1.0, mount=(0.1, 0.02, 0.1))
 for kind, precision, outside in itertools.product(("cpu", "gpu"), ("float32", "float64"), ("free", "occupied")):
     pretend(kind)
-    gpusense.models.cloud.LEAST_ORDERED = (1, 1) if outside == "free" else (1 << 22, 1 << 12)
+    gpusense.models.scan.tiles.LEAST_ORDERED = (1, 1) if outside == "free" else (1 << 22, 1 << 12)
     casts = [gs.RayCaster(grid, 1.0, backend=b, precision=precision, outside=outside).cast(poses, bearings)
              for b in (BACKEND, "numpy")]
     wrong += np.count_nonzero(casts[0] != casts[1])
@@ -95,7 +95,7 @@ for order, (kind, options) in itertools.product(((1, 1), (1 << 22, 1 << 12)), (
     (gs.BeamModel, {}), (gs.BeamModel, dict(specialize=False)), (gs.LikelihoodFieldModel, {}),
     (gs.LikelihoodFieldModel, dict(specialize=False)), (gs.LikelihoodFieldModel, dict(compat="amcl")),
 )):
-    gpusense.models.cloud.LEAST_ORDERED = order
+    gpusense.models.scan.tiles.LEAST_ORDERED = order
     model = kind(grid, scanner, backend=device, **options)
     for some in (poses, poses[:1] * 0.1 + 0.7):
         wrong += np.count_nonzero(model.log_likelihood(some, ranges)
@@ -147,7 +147,7 @@ if BACKEND.startswith("opencl"):
                       for kind in (gs.BeamModel, gs.LikelihoodFieldModel)]
             scores = [model.log_likelihood(many, readings, per_beam=True) for model in models]
             if b == BACKEND:
-                wrong += sum("WIDE" not in model._last_code for model in models)
+                wrong += sum("WIDE" not in model._last.flags for model in models)
             results.append((gs.RayCaster(grid, 1.0, backend=b, outside=outside).cast(many, turns), *scores))
         wrong += np.count_nonzero(results[0][0] != results[1][0])
         for found, right in zip(results[0][1:], results[1][1:]):

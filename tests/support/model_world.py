@@ -45,8 +45,9 @@ def make(kind: str, grid: gs.OccupancyGrid, backend: Any, bearings: np.ndarray =
 
 def parts_of_kind(model: object, kind: type) -> list[Any]:
     """Return all objects of a class that a model owns, itself or through its caster."""
-    owned = [*vars(model).values(), *vars(getattr(model, "_caster", object)).values()]
-    return [value for value in owned if isinstance(value, kind)]
+    owners = [model, *(getattr(model, name) for name in ("_caster", "_pipeline") if hasattr(model, name))]
+    owned = {id(value): value for owner in owners for value in vars(owner).values()}
+    return [value for value in owned.values() if isinstance(value, kind)]
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> None:

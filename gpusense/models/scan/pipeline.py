@@ -270,6 +270,8 @@ class ScanPipeline(ABC):
         last.together = 0
         for particles, scans in self.groups(request):
             last.scans = scans
+            if not particles.count:
+                continue
             most = self.chunk(scans.most_readings * self.rays_each, per_beam=request.per_beam)
             run_pieces(space, particles, most, _Scorer(self, request, particles, scans, space, last))
             if request.scans > 1:

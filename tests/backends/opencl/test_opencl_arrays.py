@@ -15,7 +15,7 @@ import gpusense as gs
 from gpusense import backends
 from gpusense.backends import get_backend, proof
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import chunks
+from gpusense.models import run
 
 METHODS = ("log_likelihood", "field", "expected_ranges", "cast", "cones", "absolute", "landmarks")
 
@@ -63,13 +63,13 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
     """Also where the device cannot begin with the particles of a scan, or those of a piece."""
     model = kind(GRID, SCANNER, backend=queue)
     monkeypatch.setattr(
-        "gpusense.models.scan.model.TOGETHER", {"gpu": 1 << 22 if share else 0} | {"cpu": 1 << 22 if share else 0}
+        "gpusense.models.scan.pipeline.TOGETHER", {"gpu": 1 << 22 if share else 0} | {"cpu": 1 << 22 if share else 0}
     )
     for count in (COUNT, 129, 256):
         poses = np.stack([cloud(i, count) for i in range(4)]).astype(np.float32)
         scans = np.stack([scan(1), np.full(BEAMS, np.nan), scan(2), scan(3, 20)])
         expected = model.log_likelihood(poses, scans)
-        assert (model._together > 1) == share
+        assert (model._last.together > 1) == share
         assert differing(model.log_likelihood(there(poses), there(scans)).get(), expected) == 0
         out = there(np.zeros((4, count), np.float32))
         # Poses that begin anywhere in their buffer are copied.
@@ -80,7 +80,7 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
 
 def test_pieces_of_calls(queue, there, monkeypatch):
     """Pieces of other sizes than the device can begin with become multiples of 256 particles."""
-    monkeypatch.setattr(chunks, "CHUNK", 300)
+    monkeypatch.setattr(run, "CHUNK", 300)
     poses = cloud(3, 1000)
     for kind in MODELS:
         model = kind(GRID, SCANNER, backend=queue)
@@ -91,7 +91,7 @@ def test_pieces_of_calls(queue, there, monkeypatch):
 @pytest.mark.parametrize("kind", MODELS)
 def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
     """They are written elsewhere and copied; bound calls, which copy nothing, have larger ones."""
-    monkeypatch.setattr(chunks, "CHUNK", 49)
+    monkeypatch.setattr(run, "CHUNK", 49)
     poses = cloud(3, 300).astype(np.float32)
     model, caster = kind(GRID, NEAR, backend=queue, precision="float64"), gs.RayCaster(GRID, 5.0, backend=queue)
     heading = gs.HeadingModel(backend=queue)
@@ -115,7 +115,7 @@ def test_parts_of_parts(queue, there, monkeypatch):
     import pyopencl as cl
     import pyopencl.array
 
-    monkeypatch.setattr("gpusense.models.scan.model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
+    monkeypatch.setattr("gpusense.models.scan.pipeline.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
     model, poses = FIELD(GRID, SCANNER, backend=queue), np.stack([cloud(i, 256) for i in range(3)])
     scans = np.stack([scan(1), scan(2), np.full(BEAMS, np.nan)])
     expected = model.log_likelihood(poses, scans)
@@ -136,7 +136,7 @@ def test_arrays_of_a_memory_pool(as_gpu, queue, monkeypatch):
 
     pool = pyopencl.tools.MemoryPool(pyopencl.tools.ImmediateAllocator(queue))
     model, poses = FIELD(GRID, NEAR, backend=queue), np.stack([cloud(1, 256), cloud(2, 256)])
-    monkeypatch.setattr("gpusense.models.scan.model.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
+    monkeypatch.setattr("gpusense.models.scan.pipeline.TOGETHER", dict.fromkeys(("gpu", "cpu"), 0))
     scans = np.stack([mixed(1), mixed(2)])
     given = pyopencl.array.to_device(queue, poses, allocator=pool)
     assert differing(model.log_likelihood(given, scans).get(), model.log_likelihood(poses, scans)) == 0
@@ -181,11 +181,11 @@ def test_an_error_leaves_no_verdict_behind(kind, queue, there, monkeypatch):
     def ends(*_: object) -> None:
         raise KeyboardInterrupt
 
-    for run in (lambda: model.log_likelihood(there(bad), scan(1)), lambda: several([model], there(bad), [scan(1)])):
+    for call in (lambda: model.log_likelihood(there(bad), scan(1)), lambda: several([model], there(bad), [scan(1)])):
         with monkeypatch.context() as patch:
             patch.setattr(model._workspace, "wait", ends)
             with pytest.raises(KeyboardInterrupt):
-                run()
+                call()
         assert differing(model.log_likelihood(there(poses), scan(1)).get(), expected) == 0
 
 

@@ -126,27 +126,16 @@ def test_a_new_table_finds_room(as_gpu, queue, there, monkeypatch):
     model = FIELD(GRID, NEAR, backend=queue, specialize=False)
     call = model.bind(there(cloud(1)), there(mixed(1)))
     expected = call().get()
-    old, prepare, alive = weakref.ref(call._table), model._map._prepare, []
+    old, prepare, alive = weakref.ref(call._table), model._pipeline.map._prepare, []
 
     def look(*given: Any) -> Any:
         gc.collect()
         alive.append(old() is not None)
         return prepare(*given)
 
-    monkeypatch.setattr(model._map, "_prepare", look)
-    model._map._table, model._map.version = None, model._map.version + 1
+    monkeypatch.setattr(model._pipeline.map, "_prepare", look)
+    model._pipeline.map._table, model._pipeline.map.version = None, model._pipeline.map.version + 1
     assert differing(call().get(), expected) == 0 and alive == [False]
-
-
-def test_only_launches_can_be_recorded(as_gpu):
-    buffer = as_gpu.empty(4, np.dtype(np.float32))
-    for run in (
-        lambda: as_gpu.upload(np.ones(4, np.float32), buffer),
-        lambda: as_gpu.download(buffer, np.ones(4, np.float32)),
-    ):
-        with pytest.raises(RuntimeError, match="only launches can be recorded"):
-            as_gpu.record(run)
-    as_gpu.upload(np.ones(4, np.float32), buffer)
 
 
 def test_processors_take_the_ordinary_path(queue, there):

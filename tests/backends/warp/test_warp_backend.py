@@ -151,7 +151,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     backend = _warp.WarpBackend(warp_backend.info, "cpu")
     flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
     launch = backend.compile("score_field", flags)
-    assert isinstance(launch, _warp_pieces._Pieces)
+    assert isinstance(launch, _warp_pieces.SharedLaunch)
     nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)
     inputs = [backend.upload(array) for array in (*arrays, *nowhere)]
     scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5, 1, 0)

@@ -21,8 +21,7 @@ def gathering(needs, monkeypatch):
     installed(monkeypatch)
     monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
     device = get_backend("warp:cpu")
-    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
-    monkeypatch.setattr(device, "_gathers", True)
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, graphs=True))
     monkeypatch.setattr(device, "_graphs", Graphs(device._device))
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))

@@ -129,7 +129,7 @@ def test_any_batches_of_a_cropped_map(kind, call, backend, monkeypatch):
     monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     owner, cropped = make(kind, whole.dtype.name, backend)
     found = np.concatenate([cropped(some) for some in np.split(cloud()[along], [1, 40, 99, 250])])
-    table = getattr(owner, "_map", None) or getattr(owner, "map", None) or owner._caster.map
+    table = owner._pipeline.map if hasattr(owner, "_pipeline") else owner.map
     assert table.preparations > 1
     same_bits(found, whole[along])
 

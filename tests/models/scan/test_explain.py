@@ -12,7 +12,7 @@ from support.model_world import INF, KINDS, NAN, REPEATED, cloud, make, room, sc
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
-from gpusense.models import cloud as cloud_module
+from gpusense.models.scan import tiles
 from gpusense.world import windows
 
 
@@ -148,11 +148,11 @@ def test_a_gpu_orders_particles_where_they_are_many(pretend, monkeypatch):
     model = make("beam", grid, pretend("gpu"))
     assert ORDER not in left_out(model)
     model.log_likelihood(placed(grid, 30), scan())
-    rays, particles = cloud_module.LEAST_ORDERED
+    rays, particles = tiles.LEAST_ORDERED
     assert f"a launch has fewer than {rays} rays or {particles} particles" in left_out(model)[ORDER]
     model.log_likelihood(placed(grid, 30), scan(), per_beam=True)
     assert "parts are wanted" in left_out(model)[ORDER]
-    monkeypatch.setattr(cloud_module, "LEAST_ORDERED", (1, 1))
+    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     model.log_likelihood(placed(grid, 30), scan())
     assert ORDER not in left_out(model) and "ORDERED" in model.explain()
     for kind, device in (("beam", "cpu"), ("field", "gpu")):

@@ -10,24 +10,19 @@ from support.model_world import BEARINGS, KINDS, RANGE, cloud, make, parts_of_ki
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.models import chunks
+from gpusense.backends.base import Proxy
+from gpusense.models import run
 from gpusense.tables.reachable import ReachableMap
 
 
-class FullDevice:
+class FullDevice(Proxy):
     """Fails some allocations of a backend: those numbered in ``failing``, and those of too many numbers."""
 
     def __init__(self, backend: str) -> None:
-        self._backend = get_backend(backend)
+        super().__init__(get_backend(backend))
         self.largest = 1 << 60
         self.failing: set[int] = set()
         self.calls = self.refused = 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._backend, name)
-
-    def compile(self, kernel: str, flags: frozenset[str]) -> Any:
-        return self._backend.compile(kernel, flags)
 
     def empty(self, count: int, dtype: np.dtype, **options: Any) -> Any:
         self.calls += 1
@@ -74,7 +69,7 @@ def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatc
     """The table is the same for fewer particles: it is tried once, and the message is the device's."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
-    monkeypatch.setattr(chunks, "SMALLEST_CHUNK", 1)
+    monkeypatch.setattr(run, "SMALLEST_CHUNK", 1)
 
     def score(device: Any) -> Any:
         if kind == "caster":

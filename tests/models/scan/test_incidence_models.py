@@ -11,7 +11,7 @@ from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
-from gpusense.models import cloud
+from gpusense.models.scan import tiles
 from gpusense.models.scan.densities import log_mixture
 
 
@@ -79,7 +79,7 @@ def test_equal_bins_are_the_plain_model(weights, backend):
         plain = model_of(backend, incidence=None, parameters=parameters, precision=precision)
         found, parts = model.log_likelihood(poses, z, per_beam=True)
         expected, plain_parts = plain.log_likelihood(poses, z, per_beam=True)
-        if "WIDE" in plain._last_code:
+        if "WIDE" in plain._last.flags:
             # Functions of vectors may round otherwise.
             assert (np.abs(parts - plain_parts) <= 2 * per_beam(plain_parts, precision)).all()
             assert (np.abs(found - expected) <= 2 * per_scan(plain_parts, precision)).all()
@@ -91,12 +91,12 @@ def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
     _, poses, _ = place()
     model, z = model_of(as_gpu(False)), a_scan()
     one_by_one, parts = model.log_likelihood(poses, z, per_beam=True)
-    assert "WIDE" not in model._last_code
-    for least in (cloud.LEAST_ORDERED, (1, 1)):
-        monkeypatch.setattr(cloud, "LEAST_ORDERED", least)
+    assert "WIDE" not in model._last.flags
+    for least in (tiles.LEAST_ORDERED, (1, 1)):
+        monkeypatch.setattr(tiles, "LEAST_ORDERED", least)
         tiled = model_of(as_gpu(True))
         assert differing(tiled.log_likelihood(poses, z), one_by_one) == 0
-        assert "INCIDENCE" in tiled._last_code
+        assert "INCIDENCE" in tiled._last.flags
     assert differing(tiled.log_likelihood(poses, z, per_beam=True)[1], parts) == 0
     as_gpu(False)
     assert differing(model.log_likelihood(poses[7:9], z), one_by_one[7:9]) == 0

@@ -13,11 +13,9 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import chunks
-from gpusense.models.scan import call as scan_call
-from gpusense.models.scan import model as scan_model
-from gpusense.models.scan.batch import join, part_of, prepare_batch, runs
-from gpusense.models.scan.readings import Batch, PreparedScan, prepare_scan
+from gpusense.models import run
+from gpusense.models.scan import pipeline
+from gpusense.models.scan.classed import ClassedScans, LeftOut, Rules, _join, class_scans
 
 BEAMS, RANGE = 37, 5.0
 RNG = np.random.default_rng(5)
@@ -92,12 +90,6 @@ class Counting:
     def __init__(self, backend: Any) -> None:
         self._backend, self.launches = backend, dict[str, int]()
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._backend, name)
-
-    def mark(self) -> None:
-        """Return None, so that every launch is made and counted, where the backend would replay some."""
-
     def compile(self, kernel: str, flags: frozenset[str]) -> Any:
         def launch(*arguments: Any) -> None:
             self.launches[kernel] = self.launches.get(kernel, 0) + 1
@@ -110,7 +102,7 @@ class Counting:
 def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
     """Check that one call of all scans has the bits of calls of each, with and without ``out=``."""
     found = model.log_likelihood(poses, z)
-    assert model._together > 1, "nothing was scored together"
+    assert model._last.together > 1, "nothing was scored together"
     each = np.stack([model.log_likelihood(own, scan) for own, scan in zip(poses, z, strict=True)])
     assert found.dtype == each.dtype and differing(found, each) == 0
     out = np.full_like(found, 7)
@@ -122,13 +114,13 @@ def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
 def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
     # Particles in an order as well, which GPUs would make of many.
-    monkeypatch.setattr("gpusense.models.cloud.LEAST_ORDERED", (1, 1))
+    monkeypatch.setattr("gpusense.models.scan.tiles.LEAST_ORDERED", (1, 1))
     model = MODELS[name][0](backend=device)
     z = scans_of(model.scanner)
     for count in (1, 63, 65, 130):
         assert_as_one_by_one(model, clouds(len(z), count), z)
     found, parts = model.log_likelihood(clouds(len(z), 65), z, per_beam=True)
-    assert model._together == 0
+    assert model._last.together == 0
     for own, scan, one, each in zip(clouds(len(z), 65), z, found, parts, strict=True):
         expected, expected_parts = model.log_likelihood(own, scan, per_beam=True)
         assert differing(one, expected) == 0 and differing(each, expected_parts) == 0
@@ -158,17 +150,18 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     model.log_likelihood(poses[5:], z[5:])
     launches(1)
     # Launches of at most 150 particles, which are three scans.
-    monkeypatch.setattr(chunks, "CHUNK", 150)
+    monkeypatch.setattr(run, "CHUNK", 150)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(2)
     # Scans that fill a launch by themselves.
-    monkeypatch.setattr(scan_model, "TOGETHER", {"cpu": 50 * BEAMS - 1, "gpu": 50 * BEAMS - 1})
+    before = pipeline.TOGETHER
+    monkeypatch.setattr(pipeline, "TOGETHER", {"cpu": 50 * BEAMS - 1, "gpu": 50 * BEAMS - 1})
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(6)
-    assert model._together == 0 and scan_call.TOGETHER["gpu"] >= scan_call.TOGETHER["cpu"] > 50 * BEAMS
+    assert model._last.together == 0 and before["gpu"] >= before["cpu"] > 50 * BEAMS
 
 
 def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch):
@@ -179,18 +172,18 @@ def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch
     z, poses = scans_of()[5:], clouds(6, 333)
     model.log_likelihood(poses, z)
     cut: list[int] = []
-    piece = _warp_pieces._Pieces._piece
+    piece = _warp_pieces.SharedLaunch._piece
     monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
     monkeypatch.setattr(_warp_pieces, "_threads", lambda: 5)
     monkeypatch.setattr(
-        _warp_pieces._Pieces, "_piece", lambda self, *given: cut.append(given[2]) or piece(self, *given)
+        _warp_pieces.SharedLaunch, "_piece", lambda self, *given: cut.append(given[2]) or piece(self, *given)
     )
     assert_as_one_by_one(model, poses, z)
     assert any(begin % 333 for begin in cut)
 
 
 @pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_scans_that_do_not_fit_together_are_scored_one_by_one(kind, backend, monkeypatch):
+def test_scans_that_do_not_fit_together_are_scored_in_smaller_groups(kind, backend, monkeypatch):
     model = kind(GRID, SCANNER, backend=backend)
     z, poses = scans_of(), clouds(11, 50)
     expected = np.stack([model.log_likelihood(own, scan) for own, scan in zip(poses, z, strict=True)])
@@ -203,7 +196,7 @@ def test_scans_that_do_not_fit_together_are_scored_one_by_one(kind, backend, mon
 
     monkeypatch.setattr(Workspace, "empty", refuse)
     assert differing(model.log_likelihood(poses, z), expected) == 0
-    assert model._together == 0
+    assert model._last.together == 2
 
 
 def test_a_pose_that_is_not_finite_is_named_by_its_scan(backend):
@@ -233,40 +226,23 @@ def test_other_numbers_and_lists_as_poses():
 def test_a_batch_is_its_scans_one_after_the_other(options, near):
     scanner = gs.Scanner(BEARINGS, RANGE, near)
     vectors = np.stack([np.cos(BEARINGS), np.sin(BEARINGS)], axis=1)
-    given = (scanner, vectors, options.get("z_max", 0.05), options.get("beams"), True)
+    rules = Rules(scanner, vectors, options.get("z_max", 0.05), options.get("beams"), True)
     for z in (scans_of(), scans_of().astype(np.float32), scans_of()[:1], scans_of()[3:5]):
-        alone = [prepare_scan(scan, *given, distinct=True) for scan in z]
-        whole = prepare_batch(z, *given, distinct=True)
-        for batch in (whole, join(alone)):
-            assert batch.batch is not None
+        alone = [class_scans(scan[None], rules) for scan in z]
+        for batch in (class_scans(z, rules), _join(alone)):
             assert [batch.most_readings, batch.most_rays] == [max(len(scan.readings) for scan in alone)] * 2
             for s, scan in enumerate(alone):
-                own = part_of(batch, s, s + 1)
-                for name in ("columns", "readings", "vectors", "rays", "first"):
-                    np.testing.assert_array_equal(getattr(own, name), getattr(scan, name))
-                assert batch.batch.constants[s] == scan.constant
-                assert own.batch is not None and own.batch.start.tolist() == [0, len(scan.rays)]
+                part = batch.part(s, s + 1)
+                for name in ("columns", "readings", "vectors", "rays", "first", "counts", "ray_counts", "constants"):
+                    np.testing.assert_array_equal(getattr(part, name), getattr(scan, name))
+            for name in ("missing", "ignored_max", "thinned"):
+                assert getattr(batch.left_out, name) == getattr(alone[-1].left_out, name)
+            np.testing.assert_array_equal(batch.left_out.constant_max, alone[-1].left_out.constant_max)
 
 
-def test_runs_of_scans():
+def test_groups_of_scans():
     """Rays and readings of each scan: none, as many, or fewer rays."""
-
-    def found(rays: list[int], counts: list[int], most: int) -> list[tuple[int, int]]:
-        whole = np.zeros(sum(counts))
-        batch = Batch(np.append(0, np.cumsum(rays)), np.array(counts, np.int32), np.zeros(len(counts)))
-        scan = PreparedScan(whole, whole, whole, np.zeros(sum(rays)), whole, 0.0, whole, 0, 0, 0, batch)
-        return [*runs(scan, most)]
-
-    rays, counts = [5, 4, 9, 0, 0, 3, 3, 3, 2, 2, 0], [5, 4, 9, 0, 0, 3, 3, 3, 7, 4, 0]
-    assert found(rays, counts, 2) == [(0, 2), (2, 3), (3, 4), (4, 5), (5, 7), (7, 8), (8, 10), (10, 11)]
-    assert found(rays, counts, 100) == [(0, 3), (3, 4), (4, 5), (5, 8), (8, 10), (10, 11)]
-    assert found([], [], 3) == [] and found([2, 2], [2, 2], 1) == [(0, 1), (1, 2)]
-
-
-def test_explain_names_scans_that_share_launches():
-    model = beam()(backend="numpy")
-    model.log_likelihood(clouds(6, 50), scans_of()[5:])
-    assert "SCANS" in model.explain().splitlines()[1].split()
-    assert "6 scans are scored together; saves 5 of 6 sets of launches" in model.explain()
-    model.log_likelihood(clouds(1, 50)[0], scans_of()[0])
-    assert "SCANS" not in model.explain() and "together" not in model.explain()
+    rays, counts = np.array([5, 4, 9, 0, 0, 3, 3, 3, 2, 2, 0]), np.array([5, 4, 9, 0, 0, 3, 3, 3, 7, 4, 0])
+    whole = np.zeros(counts.sum())
+    scans = ClassedScans(whole, whole, whole, whole, whole, rays, counts, whole, LeftOut(0, 0, whole, 0))
+    assert [*scans.groups()] == [(0, 3), (3, 4), (4, 5), (5, 8), (8, 10), (10, 11)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 
 import numpy as np
@@ -13,8 +14,8 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import chunks
-from gpusense.models.scan import model as scan_model
+from gpusense.models import run
+from gpusense.models.scan import model as model_module
 
 # ---- processors: memory of host and device
 
@@ -73,11 +74,11 @@ def test_shared_memory_that_cannot_be_allocated(two_ways):
 # ---- CUDA: launches and copies that are gathered, and graphs; Warp's processor stands in for a GPU
 
 
-def plainly(device, monkeypatch, run):
+def plainly(device, monkeypatch, call):
     """Return a result without anything gathered."""
     with monkeypatch.context() as patch:
-        patch.setattr(device, "_gathers", False)
-        return run()
+        patch.setattr(device, "info", dataclasses.replace(device.info, graphs=False))
+        return call()
 
 
 @pytest.mark.parametrize("kind", MODELS)
@@ -96,9 +97,9 @@ def test_graphs_change_no_bit(kind, gathering, monkeypatch):
         if kind is gs.BeamModel:
             # Code of calls that are kept shows as well.
             inside = np.full((50, 3), 3.0)
-            assert "ORIGINS_OUTSIDE" in model._last_code
+            assert "ORIGINS_OUTSIDE" in model._last.flags
             model.log_likelihood(inside, ranges)
-            assert "ORIGINS_OUTSIDE" not in model._last_code
+            assert "ORIGINS_OUTSIDE" not in model._last.flags
     # Of each of three sizes the first calls are plain, and so are those of other code.
     assert len(started) >= 3
     # A changed map updates the table or makes it anew.
@@ -138,7 +139,7 @@ def test_graphs_with_arrays_on_the_device(kind, gathering, monkeypatch):
 def test_scans_and_pieces_are_gathered_in_their_order(gathering, monkeypatch):
     """Buffers serve one piece after the other, so that an order lost would show."""
     device, started = gathering
-    monkeypatch.setattr(chunks, "CHUNK", 77)
+    monkeypatch.setattr(run, "CHUNK", 77)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     poses, scans = np.stack([cloud(1), cloud(2)]), np.stack([scan(1), scan(2)])
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(poses, scans))
@@ -221,7 +222,7 @@ def test_a_call_that_fails_leaves_nothing_behind(gathering, monkeypatch):
     expected = plainly(device, monkeypatch, lambda: other.log_likelihood(cloud(1), scan(1)))
     out = np.full(COUNT, 7, np.float32)
     with monkeypatch.context() as patch:
-        patch.setattr(scan_model, "finish", lambda *arguments: 1 / 0)
+        patch.setattr(model_module, "finish", lambda *arguments: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             model.log_likelihood(cloud(1), scan(1), out=out)
     assert device.gathering() is None and (out == 7).all()
@@ -278,15 +279,15 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering,
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(cloud(1, 77), scan(1)))
     for _ in range(3):
         assert differing(model.log_likelihood(cloud(1, 77), scan(1)), expected) == 0
-    assert device._graphs.failed
+    assert device._graphs.failure == "no graphs here"
 
 
 def test_an_error_forgets_no_memory_that_launches_still_need(gathering, monkeypatch):
     """Launches that were gathered before are started first."""
     device, int32, seen = gathering[0], np.dtype(np.int32), []
     space, scatter = Workspace(device), device.scatter
-    monkeypatch.setattr(device, "scatter", lambda: (seen.append(("verdict", int32) in space._buffers), scatter()))
+    monkeypatch.setattr(device, "scatter", lambda: (seen.append(("pose_status", int32) in space._buffers), scatter()))
     with pytest.raises(KeyboardInterrupt), space:
-        space.empty("verdict", 2, int32, zero=True)
+        space.empty("pose_status", 2, int32, zero=True)
         raise KeyboardInterrupt
     assert seen == [True] and not space._buffers

@@ -16,7 +16,7 @@ from support.selection import on_every_backend
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.evaluation.worlds import simulate_scan
-from gpusense.models import cloud
+from gpusense.models.scan import tiles
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables.casters import Lookup
 
@@ -123,10 +123,10 @@ def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
     scanner = gs.Scanner(np.append(RING, RING[3]), RANGE, mount=MOUNT, **SONAR)
     z = np.append(a_scan(), 2.0)
     expected, parts = gs.BeamModel(grid, scanner, backend=as_gpu(False)).log_likelihood(poses, z, per_beam=True)
-    monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
+    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     model = gs.BeamModel(grid, scanner, backend=as_gpu())
     assert differing(model.log_likelihood(poses, z), expected) == 0
-    assert {"SHARED_RAYS", "ECHO", "INCIDENCE"} <= model._last_code
+    assert {"SHARED_RAYS", "ECHO", "INCIDENCE"} <= model._last.flags
     alone = gs.BeamModel(grid, ring(**SONAR), backend=as_gpu(False)).log_likelihood(poses, a_scan(), per_beam=True)[1]
     assert differing(parts[:, :8], alone) == 0
     assert differing(model.expected_ranges(poses)[:, 8], model.expected_ranges(poses)[:, 3]) == 0
@@ -146,7 +146,7 @@ def test_a_cone_of_one_ray_is_a_laser(backend):
         one = gs.BeamModel(grid, ring(**options), backend=backend)
         assert differing(one.expected_ranges(poses), laser.expected_ranges(poses)) == 0
         assert differing(one.log_likelihood(poses, a_scan()), laser.log_likelihood(poses, a_scan())) == 0
-        assert "ECHO" not in one._last_code
+        assert "ECHO" not in one._last.flags
 
 
 def test_more_rays_never_lengthen_the_nearest_of_all():

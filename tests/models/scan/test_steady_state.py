@@ -8,7 +8,8 @@ from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
-from gpusense.models import chunks, cloud
+from gpusense.models import run
+from gpusense.models.scan import tiles
 from gpusense.reference.error_free import BLOCK_TERMS
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
@@ -103,7 +104,7 @@ class Watch:
 
 def scan_uploads(device, size: int, *counts: int) -> list[int]:
     """Return the bytes of a scan's arrays: a gathered call copies them at once, each begins at a multiple of 64."""
-    if getattr(device, "_gathers", False):
+    if device.info.graphs:
         return [sum(size * -(-count // 64) * 64 for count in counts)]
     return [size * count for count in counts]
 
@@ -134,7 +135,7 @@ def call_of(what: str, device, precision: str):
 def test_the_second_call(what, precision, path, as_gpu, monkeypatch):
     gpu, order = path != "processor", path == "gpu in order"
     if order:
-        monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
+        monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     device = as_gpu(gpu)
     watch = Watch(device, monkeypatch)
     call, up, down = call_of(what, device, precision)
@@ -168,7 +169,7 @@ def test_out_spares_the_host_an_array_but_changes_no_copy(gpu, as_gpu, monkeypat
 @pytest.mark.parametrize("gpu", [False, True])
 def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
-    monkeypatch.setattr(chunks, "CHUNK", 128)
+    monkeypatch.setattr(run, "CHUNK", 128)
     watch = Watch(device, monkeypatch)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     # Each piece has all corners of the box.
@@ -195,7 +196,7 @@ def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):
         for s in range(scans):
             z[s, BEAMS - (seed + s) % scans :] = np.nan
         found: np.ndarray = model.log_likelihood(np.stack([poses(count, seed + s) for s in range(scans)]), z)
-        assert model._together == scans
+        assert model._last.together == scans
         return found
 
     first = call(COUNT, 1)

@@ -16,7 +16,8 @@ from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
-from gpusense.models import chunks, cloud
+from gpusense.models import run
+from gpusense.models.scan import tiles
 
 RANGE, BEAMS, COUNT = 5.0, 53, 150
 BEAM = {
@@ -58,12 +59,12 @@ Pretend = Callable[..., object]
 def ordered(request, monkeypatch) -> bool:
     """Return whether every cloud is put in an order."""
     if request.param:
-        monkeypatch.setattr(cloud, "LEAST_ORDERED", (1, 1))
+        monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     return request.param
 
 
 def code_of(model) -> frozenset[str]:
-    return model._last_code
+    return model._last.flags
 
 
 def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses: np.ndarray, z: np.ndarray) -> None:
@@ -160,7 +161,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
 
     whole = results()
     for size in (16, 33, 117):
-        monkeypatch.setattr(chunks, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
+        monkeypatch.setattr(run, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
         for found, right in zip(results(), whole, strict=True):
             assert differing(found, right) == 0
 
@@ -174,7 +175,7 @@ def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gp
     for parameters in (*BEAM.values(), gs.BeamParameters(1.0, 0.0, 0.0, 0.0, sigma_hit=0.001)):
         found = []
         for enough in (1 << 21, 1):
-            monkeypatch.setattr(cloud, "_ENOUGH", enough)
+            monkeypatch.setattr(tiles, "ENOUGH", enough)
             model = gs.BeamModel(grid, scanner, parameters, backend=as_gpu(), precision=precision)
             alone = model.log_likelihood(several[0], z)
             assert ("STRANDED" in code_of(model)) == (enough == 1)

@@ -127,13 +127,13 @@ def test_every_cell_of_an_updated_field_is_that_of_a_new_one(outside, device):
         return model
 
     def table(model):
-        return device.download(model._map._table, np.empty((shape[0] + 4, shape[1] + 4), np.float32))
+        return device.download(model._pipeline.map._table, np.empty((shape[0] + 4, shape[1] + 4), np.float32))
 
     model = make(gs.OccupancyGrid(np.zeros(shape, int), RESOLUTION))
     for cells, place in patches(rng, shape, 30):
         model.update_map(cells, place)
         np.testing.assert_array_equal(table(model), table(make(model.grid)))
-    assert model._map.preparations == 1
+    assert model._pipeline.map.preparations == 1
 
 
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
@@ -156,7 +156,7 @@ def tables(model, ranges):
         return model._caster.map, lambda poses: model.cast(poses, BEARINGS)
     if isinstance(model, gs.BeamModel):
         return model._caster.map, lambda poses: model.log_likelihood(poses, ranges)
-    return model._map, lambda poses: model.log_likelihood(poses, ranges)
+    return model._pipeline.map, lambda poses: model.log_likelihood(poses, ranges)
 
 
 @pytest.fixture(params=[gs.RayCaster, gs.BeamModel, gs.LikelihoodFieldModel])

@@ -28,7 +28,7 @@ from gpusense.scan import Beams, PreparedScan
 from gpusense.scanner import Scanner
 
 # The table's ring, and the particles of a work-group of ``field_blocks`` or of vectors: the kernel files ``field`` and
-# ``field_lanes`` have the same numbers.
+# ``lanes/field.cl`` have the same numbers.
 _RING = 2
 _GROUP = 64
 # In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.

@@ -2,7 +2,6 @@
 // Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
 // requires: error_free caster echo tiles mixture sensor_table compat
 
-#if !WIDE
 // What one reading adds to the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const int cells, const real per_metre, const real range_max) {
@@ -32,60 +31,7 @@ real scan_log(const real sum) {
     return sum;
 #endif
 }
-#endif
 
-#if WIDE
-// One work-item a particle, LANES rays at a time, a block, each with one reading. Sums are those of the scalar kernel.
-kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                        global const real4 *pose, global const real2 *ray, global const int *first,
-                        global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global const int *start, global const real *fixed_of,
-                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
-                        const int rays, const int readings, const int kinds, const int cone_rays, const real critical,
-                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
-                        const real limit, const real resolution, const real range_max, const real fixed,
-                        const real temperature, const int per_scan, const int ahead) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-#if SCANS
-    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real lead = fixed_of[scan];
-    ray += start[scan];
-    reading += start[scan];
-#else
-    const int size = readings;
-    const real lead = fixed;
-#endif
-    real2 total = (real2)(lead, 0);
-    real one[LANES];
-    for (int k = 0; k < size; k += LANES) {
-        lanes x, y;
-        load_rays(ray, k, size, &x, &y);
-        const lanes expected = expected_ranges(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit, resolution,
-                                               range_max);
-        const int count = min(size - k, LANES);
-        lanes z;
-        if (count == LANES) {
-            z = load_lanes(0, reading + k);
-        } else {
-            for (int i = 0; i < LANES; ++i) one[i] = reading[k + min(i, count - 1)];
-            z = load_lanes(0, one);
-        }
-        lanes term = log_density(z, expected, terms);
-#if PER_BEAM
-        store_lanes(term, 0, one);
-        for (int i = 0; i < count; ++i) parts[(long)n * readings + k + i] = one[i];
-#endif
-        if (count < LANES) {
-            store_lanes(term, 0, one);
-            for (int i = count; i < LANES; ++i) one[i] = 0;
-            term = load_lanes(0, one);
-        }
-        total = add_strands(total, ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi);
-    }
-    log_p[n] = temperature * (total.x + total.y);
-}
-#else
 // One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several scans
 // each has its rays from start on, and first counts the readings of all.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
@@ -243,4 +189,3 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         }
     }
 }
-#endif

@@ -1,6 +1,6 @@
 // Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 // The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
-// requires: end_point field_lanes
+// requires: end_point
 
 // Particles of a work-group of field_blocks.
 #define GROUP 64
@@ -117,7 +117,6 @@ real careful_value(global const real *table, const int2 origin, const real4 lowe
 }
 #endif
 
-#if !WIDE
 // One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
@@ -231,4 +230,3 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         parts[(long)n * across + (long)block * along] = sum;
     }
 }
-#endif

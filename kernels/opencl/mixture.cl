@@ -2,17 +2,14 @@
 // terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding
 // took from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
 // z_rand / range_max; in the log domain their logarithms.
-// requires: lanes lane_math error_free
+// requires: error_free
 
 // Above this the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
 #define TINY_DECAY ((real)1e-30)
 #define SMALLEST_RANGE ((real)1e-37)
-// Up to this 1 - exp(-x) is x within a quarter of the last bit of float32.
-#define SMALL_DECAY 2.98023224e-08f
 
-#if !WIDE
 #if HIT
 // Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels. Most
 // ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
@@ -65,36 +62,7 @@ real short_peak(const real lambda, const real expected) {
     return (h > TINY_DECAY ? lambda * (1 + t) : (real)1) / (h > TINY_DECAY ? 2 * t : shortest);
 }
 #endif
-#endif
 
-#if WIDE
-#if !FLOAT64
-// p_rand is at least 1e-30 times the larger of 1 and the peak, so components may underflow one by one, from 2e-38 on, and
-// one logarithm is enough.
-lanes log_density(const lanes z, const lanes expected, global const real *terms) {
-    lanes p = terms[5];
-#if HIT
-    const lanes off = z - expected, hit = terms[0] * exp_lanes(off * (off * -terms[1]));
-    // The mass is 1 unless the nearer end is near.
-    const lanes below = expected * terms[2], above = (terms[6] - expected) * terms[2];
-    const lanes nearer = below < above ? below : above;
-    if (some(nearer < ERF_ONE))
-        p += hit / (0.5f * (erf_lanes(nearer) + erf_lanes(below < above ? above : below)));
-    else
-        p += hit;
-#endif
-#if SHORT
-    // short_factor(x) / z* with one division: (1 - exp(-x)) / lambda is z* to the last bit where x is small.
-    const lanes x = terms[4] * expected;
-    const lanes length = x > SMALL_DECAY ? one_minus_exp(-x) * (1 / terms[4]) : expected;
-    const lanes divisor = length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
-    const lanes within = terms[3] * exp_lanes(-terms[4] * z) / divisor;
-    p += ((z <= expected) & (expected > 0)) ? within : (lanes)0;
-#endif
-    return log_lanes(p);
-}
-#endif
-#else
 #if LINEAR
 // p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
 real log_density(const real z, const real expected, global const real *terms) {
@@ -141,5 +109,4 @@ real log_density(const real z, const real expected, global const real *terms) {
     return largest + log(p);
 #endif
 }
-#endif
 #endif

@@ -37,8 +37,8 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
     """List the files of a kernel file's program, the file itself last.
 
-    With ``WIDE``, ``lanes/<name>`` takes the place of ``<name>`` where there is such a file. Names that files require are
-    taken as they stand, so a file in lanes names what it needs of both folders; ``caster`` stands for the caster of the
+    With ``WIDE``, ``lanes/<name>`` takes the place of ``<name>`` where there is such a file. Names in ``// requires:``
+    are taken as they stand, so a file in lanes names files of both folders; ``caster`` stands for the caster of the
     flags.
     """
     return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)

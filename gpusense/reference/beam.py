@@ -16,6 +16,34 @@ from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.sensor_table import tabulated_density
 
 
+def reading_term(
+    flags: frozenset[str],
+    z: np.ndarray,
+    expected: np.ndarray,
+    terms: np.ndarray,
+    sensor: np.ndarray,
+    cells: int,
+    per_metre: np.floating,
+    range_max: np.floating,
+) -> np.ndarray:
+    """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
+    if "CUBES" in flags:
+        term = compat_density(flags, z, expected, terms) ** 3
+    elif "SENSOR_TABLE" in flags:
+        term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+    else:
+        term = log_density(flags, z, expected, terms)
+    if "ALL_READINGS" in flags:
+        atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), terms[7], term)
+        term = np.where(np.isnan(z), 0, atom).astype(expected.dtype)
+    return term
+
+
+def scan_log(flags: frozenset[str], total: np.ndarray) -> np.ndarray:
+    """Return the scan's logarithm from its sum."""
+    return np.log(total) if "CUBES" in flags else total
+
+
 def score_beams(
     flags: frozenset[str],
     map_table: np.ndarray,
@@ -72,7 +100,7 @@ def score_beams(
     ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
-        own = terms
+        bin_terms = terms
         if "ECHO" in flags:
             t, cosine, _ = echoes(
                 flags, map_table, normals, rows, cols, pose_cell[begin:end], pose[begin:end], ray, rays, cone_rays,
@@ -80,7 +108,7 @@ def score_beams(
             )  # fmt: skip
             ranges = expected_range(t, limit, resolution, range_max)
             if "INCIDENCE" in flags:
-                own = incidence_terms(terms, edges, kinds, cosine.reshape(end - begin, rays)[:, ray_of])
+                bin_terms = incidence_terms(terms, edges, kinds, cosine.reshape(end - begin, rays)[:, ray_of])
         else:
             ranges = np.empty((end - begin) * rays, real)
             cast_ranges(
@@ -89,15 +117,7 @@ def score_beams(
             )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        if "CUBES" in flags:
-            term = compat_density(flags, z, expected, own) ** 3
-        elif "SENSOR_TABLE" in flags:
-            term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
-        else:
-            term = log_density(flags, z, expected, own)
-        if "ALL_READINGS" in flags:
-            atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), own[7], term)
-            term = np.where(np.isnan(z), 0, atom).astype(real)
+        term = reading_term(flags, z, expected, bin_terms, sensor, cells, per_metre, range_max)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
         log_p[begin:end] = sum_terms(flags, term, fixed, temperature, strand_sums)
@@ -198,6 +218,4 @@ def sum_terms(
     total = (np.full(len(term), fixed, term.dtype), np.zeros(len(term), term.dtype))
     for part in plainly(finite).T:
         total = add_term(total, part)
-    scan = total[0] + total[1]
-    scan = np.log(scan) if "CUBES" in flags else scan
-    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan)
+    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan_log(flags, total[0] + total[1]))

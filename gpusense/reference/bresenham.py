@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.ray import make_ray, start_casts
+from gpusense.reference.rectangles import padded
 
 
 def cast_ray(
@@ -52,7 +53,7 @@ def cast_ray(
         x = np.where(flat[active], along, aside[active])
         y = np.where(flat[active], aside[active], along)
         at = first[:, active] + sign[:, active] * np.stack([x, y])
-        state = map_table[(at[1] + 1) * (cols + 2) + at[0] + 1]
+        state = map_table[padded(at[1], at[0], cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
         i, j = x[hit].astype(pose.dtype), y[hit].astype(pose.dtype)
         found[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)

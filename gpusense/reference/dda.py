@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.ray import make_ray, start_casts
+from gpusense.reference.rectangles import padded
 
 
 def cast_ray(
@@ -42,7 +43,7 @@ def cast_ray(
     origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        state = map_table[(at[1] + 1) * (cols + 2) + at[0] + 1]
+        state = map_table[padded(at[1], at[0], cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
         found[active[hit]] = t[active[hit]]
         active = active[state == 0]

@@ -55,6 +55,11 @@ def add_term(total: tuple[np.ndarray, np.ndarray], term: np.ndarray) -> tuple[np
     return head, total[1] + lost
 
 
+def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
+    """Choose between two numbers of two parts each, element by element."""
+    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
+
+
 def strands_in(terms: Any) -> Any:
     """How many strands so many terms have: STRANDS in each whole block, of what is left as many as there are terms."""
     return terms // BLOCK_TERMS * STRANDS + np.minimum(terms % BLOCK_TERMS, STRANDS)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
-from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
+from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum, where_pair
 from gpusense.reference.offsets import Quad, distance_pair
 
 # Range; cosine and sine of the bearing on the robot; signature.
@@ -55,11 +55,6 @@ ARCS = (
 ZERO_RANGE = 1e-6
 # arctan t = t + t^3 A(t^2), |t| <= 1 / 16, by its power series.
 ARC_POWERS = tuple((-1.0) ** (i + 1) / (2 * i + 3) for i in range(7))
-
-
-def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
-    """Of each pair of numbers the first or the second one."""
-    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
 
 
 def negative_where(when: np.ndarray, a: Pair) -> Pair:
@@ -106,6 +101,15 @@ def along(off: Quad, turned: Quad) -> Pair:
     return total[0], total[1] + ((x[1] + y[1]) + low)
 
 
+def arc_series(t: np.ndarray) -> np.ndarray:
+    """Return ``arctan t / t - 1`` for |t| <= 1 / 16 by its power series in t^2."""
+    real = t.dtype.type
+    square, series = t * t, real(0)
+    for power in ARC_POWERS[::-1]:
+        series = series * square + real(power)
+    return square * series
+
+
 def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     """Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series."""
     real = arcs.dtype.type
@@ -122,12 +126,9 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     t = top[0] / bottom[0]
     back = two_product(t, bottom[0])
     t_low = (((top[0] - back[0]) - back[1]) + (top[1] - t * bottom_low)) / bottom[0]
-    square, series = t * t, real(0)
-    for power in ARC_POWERS[::-1]:
-        series = series * square + real(power)
     base = arcs[step.astype(np.int32)]
     total = two_sum(base[:, 0], t)
-    arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * (square * series))))
+    arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * arc_series(t))))
     for when, whole in ((steep, arcs[ARC_STEPS + 1]), (np.signbit(ahead[0]), arcs[ARC_STEPS + 2])):
         arc = where_pair(when, pair_sum((whole[0], whole[1]), (-arc[0], -arc[1])), arc)
     return negative_where(np.signbit(side[0]), arc)

@@ -70,7 +70,15 @@ def short_peak(decay: np.floating, expected: np.ndarray) -> np.ndarray:
 def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
-        return _linear(flags, z, expected, terms)
+        # p_rand > 0 bounds the sum from below, so components may underflow and one logarithm is enough.
+        p = np.zeros(z.shape, terms.dtype)
+        if "HIT" in flags:
+            exponent = hit_exponent(flags, z, expected, terms)
+            p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
+        if "SHORT" in flags:
+            density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
+            p += np.where((z <= expected) & (expected > 0), density, 0)
+        return np.log(p + terms[5])
     parts = []
     if "HIT" in flags:
         parts.append(log_hit(flags, z, expected, terms))
@@ -81,14 +89,3 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
     if len(parts) == 1:
         return parts[0].astype(terms.dtype)
     return np.logaddexp.reduce(parts, axis=0).astype(terms.dtype)
-
-
-def _linear(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    p = np.zeros(z.shape, terms.dtype)
-    if "HIT" in flags:
-        exponent = hit_exponent(flags, z, expected, terms)
-        p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
-    if "SHORT" in flags:
-        density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
-        p += np.where((z <= expected) & (expected > 0), density, 0)
-    return np.log(p + terms[5])

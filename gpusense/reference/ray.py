@@ -29,6 +29,12 @@ class Ray:
     a: np.ndarray
 
 
+def off_grid(at: np.ndarray, rows: int, cols: int) -> np.ndarray:
+    """Whether cells, (2, M) columns and rows, are none of the grid's."""
+    col, row = at
+    return (col < 0) | (col >= cols) | (row < 0) | (row >= rows)
+
+
 def ray_direction(pose: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit direction in the grid's frame: pose (..., 4) = (frac x, frac y, cos, sin) turned by ray (..., 2)."""
     cos, sin = pose[..., 2], pose[..., 3]
@@ -55,12 +61,6 @@ def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, un
     k = np.maximum(np.rint(t * speed - a), 0)
     here = (k + a) * inv
     return k + np.where(until, here <= t, here < t)
-
-
-def off_grid(at: np.ndarray, rows: int, cols: int) -> np.ndarray:
-    """Whether cells, (2, M) columns and rows, are none of the grid's."""
-    col, row = at
-    return (col < 0) | (col >= cols) | (row < 0) | (row >= rows)
 
 
 def start_walk(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.ray import crossed, make_ray, start_casts
-from gpusense.reference.rectangles import OCCUPIED
+from gpusense.reference.rectangles import OCCUPIED, padded
 
 
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
@@ -56,10 +56,10 @@ def cast_ray(
     quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
     sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
     plane = quadrant * sectors + sector_of(sectors, *r.speed)
-    table = plane * ((rows + 2) * (cols + 2)) + (cols + 3)
+    table = plane * ((rows + 2) * (cols + 2))
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        sides = map_table[table[active] + at[1] * (cols + 2) + at[0]]
+        sides = map_table[table[active] + padded(at[1], at[0], cols)]
         stopped = sides <= OCCUPIED
         if stopped.any():
             hit = stopped if "OUTSIDE_OCCUPIED" in flags else sides == OCCUPIED

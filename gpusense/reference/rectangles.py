@@ -25,6 +25,11 @@ RECTANGLE_REACH = 254
 STACK = 256
 
 
+def padded(row: np.ndarray, col: np.ndarray, cols: int) -> np.ndarray:
+    """Return the index of a cell in a padded plane."""
+    return (row + 1) * (cols + 2) + col + 1
+
+
 def reach_begin(way: int, low: int) -> int:
     """First of the cells whose rectangles, growing that way, can hold the cell low or one beyond it."""
     return max(low - RECTANGLE_REACH, 0) if way > 0 else low

@@ -7,16 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.error_free import Pair, pair_sum, two_sum
+from gpusense.reference.error_free import Pair, pair_sum, two_sum, where_pair
 from gpusense.reference.heading import LIMIT, QUARTER, QUARTER_LOW, cos_sin, reduce_huge, reduce_ordinary
 
 # Farther off than this is as good as here; squares of it are finite in float32.
 FARTHEST = float(1 << 60)
-
-
-def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
-    """Of each pair of numbers the first or the second one."""
-    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
 
 
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:
@@ -31,6 +26,14 @@ def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) ->
     angle = pair_sum(angle, (-np.asarray(target[0]), -np.asarray(target[1])))
     turns = np.where(angle[0] > 2 * QUARTER, -4.0, np.where(angle[0] < -2 * QUARTER, 4.0, 0.0))
     return pair_sum(angle, (turns * QUARTER, turns * QUARTER_LOW))
+
+
+def rounded_place(at: Pair, real: np.dtype) -> Pair:
+    """Round coordinates to sums of two numbers in the model's precision."""
+    high = np.fmin(np.fmax(at[0], -FARTHEST), FARTHEST)
+    low = np.where(high == at[0], at[1], 0.0)
+    rounded = high.astype(real)
+    return rounded, ((high - rounded.astype(np.float64)) + low).astype(real)
 
 
 def place_relative(
@@ -59,11 +62,8 @@ def place_relative(
         moved = two_sum(x_y[0], arm)
         near = (np.abs(x_y[0]) <= FARTHEST).all(axis=1, keepdims=True)
         x_y = where_pair(near, two_sum(moved[0], moved[1] + x_y[1]), x_y)
-    near = finite[:, np.newaxis] & (np.abs(x_y[0]) <= FARTHEST)
-    high = np.where(finite[:, None], np.fmin(np.fmax(x_y[0], -FARTHEST), FARTHEST), 0.0)
-    low = np.where(near, x_y[1], 0.0)
-    place[:particles, 0::2] = high
-    place[:particles, 1::2] = (high - place[:particles, 0::2].astype(np.float64)) + low
+    x_y = where_pair(finite[:, np.newaxis], x_y, (np.zeros_like(x_y[0]), np.zeros_like(x_y[0])))
+    place[:particles, 0::2], place[:particles, 1::2] = rounded_place(x_y, place.dtype)
 
 
 def wrap_headings(

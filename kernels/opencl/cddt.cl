@@ -31,7 +31,7 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const real x = (real)cell.x + pose.x, y = (real)cell.y + pose.y;
     const real along = c * x + s * y, across = c * y - s * x;
     if (fabs(across) > FARTHEST) return limit;
-    const int whole = (int)across, line = whole - ((real)whole > across) - map_table[3 + 3 * bin];
+    const int line = floor_int(across) - map_table[3 + 3 * bin];
     if (line < 0 || line >= lines) return limit;
     const int from = (int)(along > FARTHEST ? FARTHEST * ENTRY_UNIT : along < -FARTHEST ? -FARTHEST * ENTRY_UNIT
                                                                                        : along * ENTRY_UNIT);

@@ -27,12 +27,6 @@ real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2
 }
 #endif
 
-// Largest integer not above a.
-int floor_int(const real a) {
-    const int whole = (int)a;
-    return whole - ((real)whole > a);
-}
-
 // Whole cells below an offset of two parts. What is left of it in [0, 1) is rest, and what is missing to 1 is to_next:
 // both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or less short
 // of an edge lies on it, so that end points on edges fall into the same cell in every precision.
@@ -88,7 +82,7 @@ EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, co
 #if QUICK
 // What is left of half a cell where end points are off by guard if products are rounded, by 3.12 eps of the reading and 1.5
 // altogether. Here they are not, as GPUs do that in one operation: it is 2 eps and 1.6.
-real sure_of(const real guard) { return 0.5f - 0.6875f * guard; }
+real rounding_margin(const real guard) { return 0.5f - 0.6875f * guard; }
 
 // What cells have too much that are the bits of a number to which ROUNDING was added.
 #define ROUNDING_BITS 0x4b400000

@@ -41,6 +41,12 @@ real2 pair_product(const real2 a, const real2 b) {
 #define ROUNDING ((real)12582912)
 #endif
 
+// Largest integer not above a; some drivers call floor as a function.
+int floor_int(const real a) {
+    const int whole = (int)a;
+    return whole - ((real)whole > a);
+}
+
 // Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of
 // compensating every term, at nearly the cost of none.
 #define BLOCK_TERMS 16

@@ -5,17 +5,6 @@
 // Particles of a work-group of field_blocks.
 #define GROUP 64
 
-// Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
-// squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is beyond.
-kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
-                       const int cols, const int cap, const real beyond, const int from_col, const int from_row,
-                       const int width, const int height, const int begin, const int stride) {
-    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
-    if (i >= width || j >= height) return;
-    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
-    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
-}
-
 #if BILINEAR
 // a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their digits.
 real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const real2 b) {
@@ -40,12 +29,17 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 #if !LOG_TABLE
 // terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1}: z_hit / (sigma sqrt(2 pi))
 // and z_rand / range_max, logarithms in the log domain. Where the peak is high, exponent and log peak nearly cancel.
-real log_field(const real2 distance, global const real *terms) {
+real2 field_exponent(const real2 distance, global const real *terms) {
 #if SHARP
-    const real2 exponent = pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
+    return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
 #else
-    const real2 exponent = (real2)(distance.x * (distance.x * terms[1]), 0);
+    return (real2)(distance.x * (distance.x * terms[1]), 0);
 #endif
+}
+
+// log p of a distance from an end point to the nearest obstacle.
+real log_field(const real2 distance, global const real *terms) {
+    const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
     real p = terms[2];
 #if HIT
@@ -116,6 +110,17 @@ real careful_value(global const real *table, const int2 origin, const real4 lowe
     return table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)];
 }
 #endif
+
+// Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
+// squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is beyond.
+kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
+                       const int cols, const int cap, const real beyond, const int from_col, const int from_row,
+                       const int width, const int height, const int begin, const int stride) {
+    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
+    if (i >= width || j >= height) return;
+    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
+    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
+}
 
 // One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
@@ -197,7 +202,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         real sum = 0;
 #if QUICK
         real worst = 0;
-        const real sure = sure_of(guard[block]);
+        const real sure = rounding_margin(guard[block]);
         if (begin + BLOCK_TERMS <= size) {
 #if SCANS
 #pragma unroll

@@ -10,11 +10,6 @@ typedef float entry;
 // A step that is told from none at any distance, as a part of it.
 #define LEAST_STEP ((real)2.384185791015625e-7)
 
-int whole_below(const real a) {
-    const int whole = (int)a;
-    return whole - ((real)whole > a);
-}
-
 // Distance in cells to a place in an occupied cell, or limit where none is found nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
@@ -31,8 +26,8 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     }
 #endif
     while (t < limit) {
-        const int col = cell.x + whole_below(pose.x + t * r.direction.x);
-        const int row = cell.y + whole_below(pose.y + t * r.direction.y);
+        const int col = cell.x + floor_int(pose.x + t * r.direction.x);
+        const int row = cell.y + floor_int(pose.y + t * r.direction.y);
 #if OUTSIDE_OCCUPIED
         if (off_grid(col, row, rows, cols)) return t;
 #else

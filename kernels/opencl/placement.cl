@@ -23,7 +23,7 @@ double within_reach(const double position) {
 }
 
 // floor, which some drivers call as a function; 0 of -0.
-double whole_below(const double position) {
+double floor_cells(const double position) {
     const double whole = (double)(int)position;
     return whole > position ? whole - 1.0 : whole;
 }
@@ -62,7 +62,7 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
         x = y = -FARTHEST;
         cosine = 1, sine = 0;
     }
-    const double whole_x = whole_below(x), whole_y = whole_below(y);
+    const double whole_x = floor_cells(x), whole_y = floor_cells(y);
     const int2 cell = (int2)((int)whole_x - first_col, (int)whole_y - first_row);
     if (cell.x < 0 || cell.y < 0 || cell.x >= cols || cell.y >= rows) atomic_or(&verdict[1], 1);
     pose_cell[particle] = cell;

@@ -34,6 +34,11 @@ typedef struct {
     real t;
 } Walk;
 
+// Whether a cell is none of the grid's.
+int off_grid(const int col, const int row, const int rows, const int cols) {
+    return col < 0 || col >= cols || row < 0 || row >= rows;
+}
+
 // pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
 real2 ray_direction(const real4 pose, const real2 ray) {
     const real dx = pose.z * ray.x - pose.w * ray.y;
@@ -61,11 +66,6 @@ real crossed(const real t, const real speed, const real a, const real inv, const
     const real place = (t * speed - a) + COUNT, count = place > COUNT ? place : COUNT;
     const real here = ((count - COUNT) + a) * inv;
     return (here < t) | (until & (here == t)) ? count + 1 : count;
-}
-
-// Whether a cell is none of the grid's.
-int off_grid(const int col, const int row, const int rows, const int cols) {
-    return col < 0 || col >= cols || row < 0 || row >= rows;
 }
 
 // The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a ray

@@ -25,7 +25,7 @@ def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """careful_offset, whole_cells, end_point, sure_of, rounded_cell, table_origin and table_cell for a set of flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
@@ -128,7 +128,7 @@ def functions(flags):
     return static_cast<{one}>(0.5) - guard;
     #endif
     """)
-    def sure_of(guard: real) -> real: ...
+    def rounding_margin(guard: real) -> real: ...
 
     # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest, and ROUNDING_BITS too
     # much. How far the place is off a cell's centre comes second.
@@ -166,7 +166,7 @@ def functions(flags):
         whole_cells=whole_cells,
         EndPoint=EndPoint,
         end_point=end_point,
-        sure_of=sure_of,
+        rounding_margin=rounding_margin,
         rounded_cell=rounded_cell,
         table_origin=table_origin,
         table_cell=table_cell,

@@ -32,6 +32,7 @@ def functions(flags):
     ALL_READINGS = "ALL_READINGS" in flags
     BILINEAR = "BILINEAR" in flags
     HIT = "HIT" in flags
+    LINEAR = "LINEAR" in flags
     LOG_TABLE = "LOG_TABLE" in flags
     SHARP = "SHARP" in flags
     ZERO, ONE = real(0.0), real(1.0)
@@ -67,22 +68,25 @@ def functions(flags):
         else:
             return vec2(distance.x * (distance.x * terms[1]), ZERO)
 
-    @wp.func
-    def log_field_linear(distance: vec2, terms: wp.array(dtype=real)):
-        p = terms[2]
-        if HIT:
+    # log p of a distance from an end point to the nearest obstacle.
+    if LINEAR:
+
+        @wp.func
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+            p = terms[2]
+            if HIT:
+                exponent = field_exponent(distance, terms)
+                p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
+            return wp.log(p)
+
+    else:
+
+        @wp.func
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
             exponent = field_exponent(distance, terms)
-            p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
-        return wp.log(p)
-
-    @wp.func
-    def log_field_log(distance: vec2, terms: wp.array(dtype=real)):
-        exponent = field_exponent(distance, terms)
-        hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
-        largest = wp.max(hit, terms[2])
-        return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
-
-    log_field = log_field_linear if "LINEAR" in flags else log_field_log
+            hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
+            largest = wp.max(hit, terms[2])
+            return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
 
     # What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
     # capped distances in metres where it is interpolated.
@@ -126,7 +130,7 @@ def make(name, flags):
     reading_value = functions(flags).reading_value
     ends = end_points.functions(flags)
     end_point, rounded_cell, ROUNDING_BITS = ends.end_point, ends.rounded_cell, ends.ROUNDING_BITS
-    table_origin, table_cell, sure_of = ends.table_origin, ends.table_cell, ends.sure_of
+    table_origin, table_cell, rounding_margin = ends.table_origin, ends.table_cell, ends.rounding_margin
     add_term = error_free.functions(flags).add_term
     CAREFUL = "CAREFUL" in flags
     CUBES = "CUBES" in flags
@@ -272,7 +276,7 @@ def make(name, flags):
             # the time; with points read as vec2, or a maximum in place of a count, it would not.
             lowered = from_pose - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, cols)
-            sure = sure_of(guard)
+            sure = rounding_margin(guard)
             cells = block_cells()
             while k < size:
                 first = begin + k
@@ -374,7 +378,7 @@ def make(name, flags):
             total = real(0.0)
             own_guard = number_at(guard, guards + block)
             if QUICK:
-                sure = sure_of(own_guard)
+                sure = rounding_margin(own_guard)
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
                     if SCANS:

@@ -24,6 +24,7 @@ def functions(flags):
     SHARP = "SHARP" in flags
     at = reader(real)
     HIT = "HIT" in flags
+    LINEAR = "LINEAR" in flags
     SHORT = "SHORT" in flags
     RAND = "RAND" in flags
     SINGLE = "SINGLE" in flags
@@ -101,52 +102,53 @@ def functions(flags):
             below = t + t
         return above / below
 
-    # p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
-    @wp.func
-    def log_density_linear(z: real, expected: real, terms: wp.array(dtype=real)):
-        p = real(0.0)
-        if HIT:
-            exponent = hit_exponent(z, expected, terms)
-            hit = at(terms, 0) * wp.exp(-exponent.x) * (ONE - exponent.y)
-            mass = hit_mass(expected, at(terms, 2), at(terms, 6))
-            if mass == ONE:
-                p += hit
-            else:
-                p += hit / mass
-        if SHORT:
-            if z <= expected and expected > ZERO:
-                p += at(terms, 3) * wp.exp(-at(terms, 4) * z) * short_peak(at(terms, 4), expected)
-        return wp.log(p + at(terms, 5))
-
-    # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
-    @wp.func
-    def log_density_log(z: real, expected: real, terms: wp.array(dtype=real)):
-        hit = NEVER
-        shorter = NEVER
-        largest = NEVER
-        if HIT:
-            hit = log_hit(z, expected, terms)
-            largest = hit
-        if SHORT:
-            shorter = log_short(z, expected, terms)
-            largest = wp.max(largest, shorter)
-        if RAND:
-            largest = wp.max(largest, at(terms, 5))
-        if SINGLE:
-            return largest
-        else:
-            if wp.isinf(largest):
-                return largest
+    if LINEAR:
+        # p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+        @wp.func
+        def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
             p = real(0.0)
             if HIT:
-                p += wp.exp(hit - largest)
+                exponent = hit_exponent(z, expected, terms)
+                hit = at(terms, 0) * wp.exp(-exponent.x) * (ONE - exponent.y)
+                mass = hit_mass(expected, at(terms, 2), at(terms, 6))
+                if mass == ONE:
+                    p += hit
+                else:
+                    p += hit / mass
             if SHORT:
-                p += wp.exp(shorter - largest)
-            if RAND:
-                p += wp.exp(at(terms, 5) - largest)
-            return largest + wp.log(p)
+                if z <= expected and expected > ZERO:
+                    p += at(terms, 3) * wp.exp(-at(terms, 4) * z) * short_peak(at(terms, 4), expected)
+            return wp.log(p + at(terms, 5))
 
-    log_density = log_density_linear if "LINEAR" in flags else log_density_log
+    else:
+        # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
+        @wp.func
+        def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
+            hit = NEVER
+            shorter = NEVER
+            largest = NEVER
+            if HIT:
+                hit = log_hit(z, expected, terms)
+                largest = hit
+            if SHORT:
+                shorter = log_short(z, expected, terms)
+                largest = wp.max(largest, shorter)
+            if RAND:
+                largest = wp.max(largest, at(terms, 5))
+            if SINGLE:
+                return largest
+            else:
+                if wp.isinf(largest):
+                    return largest
+                p = real(0.0)
+                if HIT:
+                    p += wp.exp(hit - largest)
+                if SHORT:
+                    p += wp.exp(shorter - largest)
+                if RAND:
+                    p += wp.exp(at(terms, 5) - largest)
+                return largest + wp.log(p)
+
     return SimpleNamespace(
         hit_mass=hit_mass, short_factor=short_factor, log_hit=log_hit, log_short=log_short, log_density=log_density
     )

@@ -19,40 +19,6 @@ EACH = 16
 stretch_counts = wp.types.vector(length=16, dtype=wp.int32)
 
 
-# One work-item a stretch of bins, which lie together: from how many particles each has to where they begin.
-@kernel
-def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
-    stretch = work_item(wp.tid())
-    if stretch >= ALL_BINS // STRETCH:
-        return
-    own = stretch * STRETCH
-    # All are read before any is added, so that a work-item waits once for them.
-    counts = stretch_counts()
-    for i in range(EACH):
-        counts[i] = bins[own + i]
-    total = int(0)
-    for i in range(EACH):
-        total += counts[i]
-    start = int(wp.atomic_add(bounds, 6, total))
-    for i in range(EACH):
-        bins[own + i] = start
-        start += counts[i]
-
-
-# One work-item a particle: it takes the next place of its bin.
-@kernel
-def order_fill(
-    bin_of: wp.array(dtype=wp.int32),
-    bins: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
-    particles: wp.int32,
-):
-    n = work_item(wp.tid())
-    if n >= particles:
-        return
-    order[wp.atomic_add(bins, bin_of[n], 1)] = n
-
-
 @functools.cache
 def make(name, flags):
     """A kernel of this file specialised by the flags."""
@@ -126,3 +92,37 @@ def make(name, flags):
 
     kernels = {"order_bounds": order_bounds, "order_count": order_count}
     return (kernels | {"order_starts": order_starts, "order_fill": order_fill})[name]
+
+
+# One work-item a stretch of bins, which lie together: from how many particles each has to where they begin.
+@kernel
+def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
+    stretch = work_item(wp.tid())
+    if stretch >= ALL_BINS // STRETCH:
+        return
+    own = stretch * STRETCH
+    # All are read before any is added, so that a work-item waits once for them.
+    counts = stretch_counts()
+    for i in range(EACH):
+        counts[i] = bins[own + i]
+    total = int(0)
+    for i in range(EACH):
+        total += counts[i]
+    start = int(wp.atomic_add(bounds, 6, total))
+    for i in range(EACH):
+        bins[own + i] = start
+        start += counts[i]
+
+
+# One work-item a particle: it takes the next place of its bin.
+@kernel
+def order_fill(
+    bin_of: wp.array(dtype=wp.int32),
+    bins: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    particles: wp.int32,
+):
+    n = work_item(wp.tid())
+    if n >= particles:
+        return
+    order[wp.atomic_add(bins, bin_of[n], 1)] = n

@@ -81,10 +81,10 @@ def score_position(
     first = bounded_square(pair_product(x, a))
     second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)))
     exponent = pair_sum(first, second)
-    found = (terms[6] - exponent[0]) + (terms[7] - exponent[1])
+    log_density = (terms[6] - exponent[0]) + (terms[7] - exponent[1])
     if "RAND" in flags:
-        found = either(found, terms[8])
-    log_p[:particles] = temperature * found
+        log_density = either(log_density, terms[8])
+    log_p[:particles] = temperature * log_density
 
 
 def score_heading(
@@ -100,13 +100,13 @@ def score_heading(
     r = residual[:particles, 0], residual[:particles, 1]
     scale = np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])
     if kind == SERIES:
-        found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
     else:
         root = half_sine(r) if kind == VON_MISES else r
         exponent = bounded_square(pair_product(root, scale))
-        found = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
+        log_density = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
         if kind == NEARBY:
-            found = found + log_other_turns(r, terms[DECAY])
+            log_density = log_density + log_other_turns(r, terms[DECAY])
     if "RAND" in flags:
-        found = either(found, terms[RANDOM])
-    log_p[:particles] = temperature * found
+        log_density = either(log_density, terms[RANDOM])
+    log_p[:particles] = temperature * log_density

@@ -72,12 +72,12 @@ def log_range(
     near = np.clip(d[0] + terms[BIAS], 0, terms[RANGE_MAX])
     far = terms[RANGE_MAX] - near
     if kind == STUDENT_T:
-        found = log_student_t(r, near, far, terms, series)
+        log_p = log_student_t(r, near, far, terms, series)
     else:
-        found = log_normal(r, near, far, terms, SCALE, PEAK)
+        log_p = log_normal(r, near, far, terms, SCALE, PEAK)
     if kind == TWO_NORMALS:
-        found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
-    return either(found, terms[RANDOM]) if "RAND" in flags else found
+        log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
+    return either(log_p, terms[RANDOM]) if "RAND" in flags else log_p
 
 
 def score_beacons(
@@ -94,10 +94,10 @@ def score_beacons(
     temperature: np.floating,
 ) -> None:
     """Sum over beacons of log p of their ranges; the first ``count`` numbers of the series are a t's."""
-    own = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
+    sensor = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
     zero = np.zeros(particles, place.dtype)
     total: Pair = (zero, zero)
     for one in beacon.reshape(-1)[: BEACON * beacons].reshape(-1, BEACON):
-        d = distance_pair(offset(one[None, [0, 2, 1, 3]], own))
+        d = distance_pair(offset(one[None, [0, 2, 1, 3]], sensor))
         total = add_term(total, log_range(flags, d, one, terms, series[:count], kind))
     log_p[:particles] = np.where(np.isinf(total[0]), total[0], temperature * (total[0] + total[1]))

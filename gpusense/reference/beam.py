@@ -87,12 +87,12 @@ def score_beams(
     """
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, per_scan, ahead):
-            begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
+            begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
             score_beams(
-                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone_rays :], own_first,
-                own_reading, terms, edges, sensor, start, fixed_of, log_p[part], parts, rows, cols,
-                part.stop - part.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
-                cells, per_metre, limit, resolution, range_max, fixed_of[scan], temperature, per_scan, 0,
+                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone_rays :],
+                scan_first, scan_reading, terms, edges, sensor, start, fixed_of, log_p[part], parts, rows, cols,
+                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), kinds, cone_rays, critical, bins, slack,
+                tolerance, cells, per_metre, limit, resolution, range_max, fixed_of[scan], temperature, per_scan, 0,
             )  # fmt: skip
         return
     real = pose.dtype
@@ -167,19 +167,19 @@ def beam_tiles(
     if "ORDERED" in flags:
         places[order[:particles]] = np.arange(particles)
     if "SCANS" in flags:
-        for scan, own in particles_of_scans(particles, per_scan):
-            begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
-            each = int(own_first[some])
+        for scan, part in particles_of_scans(particles, per_scan):
+            begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
+            each = int(scan_first[scan_rays])
             each = strands_in(each) if "STRANDED" in flags else each
-            found = np.empty((own.stop - own.start) * each, pose.dtype)
+            scan_parts = np.empty((part.stop - part.start) * each, pose.dtype)
             beam_tiles(
-                flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[own], pose[own], order,
-                ray[begin * cone_rays :], own_first, own_reading, terms, edges, sensor, start, found, rows, cols,
-                own.stop - own.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
-                cells, per_metre, limit, resolution, range_max, each, 1, spread, per_scan,
+                flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[part], pose[part], order,
+                ray[begin * cone_rays :], scan_first, scan_reading, terms, edges, sensor, start, scan_parts, rows, cols,
+                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), kinds, cone_rays, critical, bins, slack,
+                tolerance, cells, per_metre, limit, resolution, range_max, each, 1, spread, per_scan,
             )  # fmt: skip
-            at = places[own, None] * across + np.arange(each) * along
-            parts[at] = found.reshape(at.shape)
+            at = places[part, None] * across + np.arange(each) * along
+            parts[at] = scan_parts.reshape(at.shape)
         return
     real, single = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
@@ -199,8 +199,8 @@ def readings_of_scan(
     begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
     if "SHARED_RAYS" not in flags:
         return begin, rays, np.arange(rays + 1), reading[begin:]
-    own = first[begin : begin + rays + 1]
-    return begin, rays, own - own[0], reading[own[0] :]
+    scan_first = first[begin : begin + rays + 1]
+    return begin, rays, scan_first - scan_first[0], reading[scan_first[0] :]
 
 
 def sum_terms(

@@ -19,8 +19,8 @@ def unpacked(bits: np.ndarray, rows: int, cols: int, words: int) -> np.ndarray:
 def cells_right(cells: np.ndarray) -> np.ndarray:
     """Cells from each cell to the first occupied one to its right, itself included; NONE without one."""
     index = np.arange(cells.shape[1], dtype=np.int32)
-    found = np.minimum.accumulate(np.where(cells, index, NONE)[:, ::-1], axis=1)[:, ::-1]
-    return np.where(found == NONE, NONE, found - index)
+    nearest = np.minimum.accumulate(np.where(cells, index, NONE)[:, ::-1], axis=1)[:, ::-1]
+    return np.where(nearest == NONE, NONE, nearest - index)
 
 
 def cells_left(cells: np.ndarray) -> np.ndarray:

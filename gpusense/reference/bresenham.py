@@ -41,7 +41,7 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     first = origin + r.step * k.astype(np.int64)
     end = origin + np.floor(pose[:, :2].T + limit * r.direction).astype(np.int64)
     far = np.abs(end - first)
@@ -56,7 +56,7 @@ def cast_ray(
         state = map_table[padded(at[1], at[0], cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
         i, j = x[hit].astype(pose.dtype), y[hit].astype(pose.dtype)
-        found[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)
+        ranges[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)
         active = active[state == 0]
         error[active] += shorter[active]
         over = active[2 * error[active] >= longer[active]]
@@ -64,4 +64,4 @@ def cast_ray(
         error[over] -= longer[over]
         along += 1
         active = active[along <= longer[active]]
-    return found
+    return ranges

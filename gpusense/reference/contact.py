@@ -81,11 +81,11 @@ def score_contact(
 ) -> None:
     """Sum over segments; points start[s] to start[s + 1] - 1 belong to segment s, which is pressed if that is not 0."""
     total = np.zeros(particles, terms.dtype)
-    own, low = pose[:particles, None], pose_low[: particles if "CAREFUL" in flags else 1, None]
+    sensor_pose, low = pose[:particles, None], pose_low[: particles if "CAREFUL" in flags else 1, None]
     for s in range(segments):
         nearest = np.full(particles, NO_OBSTACLE, np.int32)
         for i in range(start[s], start[s + 1]):
-            end = end_point(flags, own, low, point[None, i : i + 1], point_low[None, i : i + 1])
+            end = end_point(flags, sensor_pose, low, point[None, i : i + 1], point_low[None, i : i + 1])
             col, row = pose_cell[:particles, 0] + end.col[:, 0], pose_cell[:particles, 1] + end.row[:, 0]
             nearest = np.minimum(nearest, table.reshape(-1)[field_cell(col, row, rows, cols)])
         total = total + log_bump(nearest, pressed[s], terms)

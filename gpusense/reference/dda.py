@@ -40,12 +40,12 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
         state = map_table[padded(at[1], at[0], cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
-        found[active[hit]] = t[active[hit]]
+        ranges[active[hit]] = t[active[hit]]
         active = active[state == 0]
         t_x, t_y = (k[:, active] + r.a[:, active]) * r.inv[:, active]
         by_x = t_x <= t_y
@@ -53,4 +53,4 @@ def cast_ray(
         k[0, active] += by_x
         k[1, active] += ~by_x
         active = active[t[active] < limit]
-    return found
+    return ranges

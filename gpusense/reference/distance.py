@@ -85,8 +85,8 @@ def distance_bits(
 ) -> None:
     """First pass: cells to the nearest occupied cell of the same row, FAR_CELLS if it is over reach."""
     cells = unpacked(bits, rows, cols, words)
-    found = np.minimum(cells_left(cells), cells_right(cells))
-    nearest[: rows * cols] = np.where(found > reach, FAR_CELLS, found).ravel()
+    nearest_cells = np.minimum(cells_left(cells), cells_right(cells))
+    nearest[: rows * cols] = np.where(nearest_cells > reach, FAR_CELLS, nearest_cells).ravel()
 
 
 def distance_blocks(

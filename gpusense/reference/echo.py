@@ -23,9 +23,9 @@ def normal_at(
 ) -> np.ndarray:
     """(M, 2) normals of cells."""
     beyond = off_grid(np.stack([col + 1, row + 1]), rows + 2, cols + 2)
-    found = normals[np.where(beyond, 0, (row + 1) * (cols + 2) + col + 1)]
-    found[beyond] = np.nan if "OUTSIDE_OCCUPIED" in flags else 0
-    return found
+    normal = normals[np.where(beyond, 0, (row + 1) * (cols + 2) + col + 1)]
+    normal[beyond] = np.nan if "OUTSIDE_OCCUPIED" in flags else 0
+    return normal
 
 
 def hit_normal(
@@ -41,9 +41,11 @@ def hit_normal(
     before, until = (
         y + r.step[1] * crossed(t, r.speed[1], r.a[1], r.inv[1], upto).astype(np.int64) for upto in (False, True)
     )
-    own, first, second = (normal_at(flags, normals, rows, cols, *at) for at in ((x, y), (col, before), (col, until)))
+    start_normal, first, second = (
+        normal_at(flags, normals, rows, cols, *at) for at in ((x, y), (col, before), (col, until))
+    )
     later = np.where(is_wall(first)[:, None], first, second)
-    return np.where(((t == 0) & is_wall(own))[:, None], own, later)
+    return np.where(((t == 0) & is_wall(start_normal))[:, None], start_normal, later)
 
 
 def incidence_terms(terms: np.ndarray, edges: np.ndarray, kinds: int, cosine: np.ndarray) -> np.ndarray:
@@ -135,15 +137,15 @@ def cast_echoes(
     """Expected ranges of all particles' cones, and the angles of incidence there, NaN where nothing returns."""
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
-        some = slice(first, min(first + block, particles))
-        own = slice(some.start * rays, some.stop * rays)
+        part = slice(first, min(first + block, particles))
+        entries = slice(part.start * rays, part.stop * rays)
         t, cosine, sine = echoes(
-            flags, map_table, normals, rows, cols, pose_cell[some], pose[some], ray, rays, cone_rays, critical, limit,
+            flags, map_table, normals, rows, cols, pose_cell[part], pose[part], ray, rays, cone_rays, critical, limit,
             bins, slack, tolerance,
         )  # fmt: skip
-        ranges[own] = expected_range(t, limit, resolution, range_max)
+        ranges[entries] = expected_range(t, limit, resolution, range_max)
         if "INCIDENCE" in flags:
-            incidence[own] = np.where(t < limit, np.arctan2(sine, cosine), np.nan)
+            incidence[entries] = np.where(t < limit, np.arctan2(sine, cosine), np.nan)
 
 
 def echoes(

@@ -77,9 +77,9 @@ def end_point(
     if "CAREFUL" in flags:
         c, s = (cos, pose_low[..., 2]), (sin, pose_low[..., 3])
         u, v = (p, point_low[..., 0]), (q, point_low[..., 1])
-        (frac_x, lost_x), (frac_y, lost_y) = two_sum(pose[..., 0], -shift), two_sum(pose[..., 1], -shift)
-        x = careful_offset((frac_x, lost_x + pose_low[..., 0]), c, u, s, v, -1)
-        y = careful_offset((frac_y, lost_y + pose_low[..., 1]), s, u, c, v, 1)
+        (frac_x, low_x), (frac_y, low_y) = two_sum(pose[..., 0], -shift), two_sum(pose[..., 1], -shift)
+        x = careful_offset((frac_x, low_x + pose_low[..., 0]), c, u, s, v, -1)
+        y = careful_offset((frac_y, low_y + pose_low[..., 1]), s, u, c, v, 1)
     else:
         x_plain = (pose[..., 0] - shift) + (cos * p - sin * q)
         y_plain = (pose[..., 1] - shift) + (sin * p + cos * q)

@@ -139,26 +139,26 @@ def score_field(
 ) -> None:
     """The table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
-        for scan, own in particles_of_scans(particles, per_scan, ahead):
+        for scan, part in particles_of_scans(particles, per_scan, ahead):
             first, last = start[scan], start[scan + 1]
             score_field(
-                flags - {"SCANS"}, table, pose_cell[own], pose[own], pose_low[own], point[first:last],
-                point_low[first:last], terms, start, fixed_of, log_p[own], parts, rows, cols, own.stop - own.start,
+                flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
+                point_low[first:last], terms, start, fixed_of, log_p[part], parts, rows, cols, part.stop - part.start,
                 int(last - first), guard, fixed_of[scan], temperature, per_scan, 0,
             )  # fmt: skip
         return
     block = max(BLOCK // max(readings, 1), 1)
     points = point[None, :readings]
     for begin in range(0, particles, block):
-        some = slice(begin, min(begin + block, particles))
-        low = pose_low[some, None] if "CAREFUL" in flags else pose_low[None, :1]
+        part = slice(begin, min(begin + block, particles))
+        low = pose_low[part, None] if "CAREFUL" in flags else pose_low[None, :1]
         term = reading_value(
-            flags, table, pose_cell[some, None], pose[some, None], low, points, point_low[None, :readings], terms, rows,
+            flags, table, pose_cell[part, None], pose[part, None], low, points, point_low[None, :readings], terms, rows,
             cols,
         )  # fmt: skip
         if "PER_BEAM" in flags:
-            parts[begin * readings : some.stop * readings] = term.ravel()
-        log_p[some] = sum_terms(flags, term, fixed, temperature, block_sums)
+            parts[begin * readings : part.stop * readings] = term.ravel()
+        log_p[part] = sum_terms(flags, term, fixed, temperature, block_sums)
 
 
 def field_blocks(
@@ -184,12 +184,12 @@ def field_blocks(
 ) -> None:
     """Sums of blocks of readings, at parts[n * across + block * along], which GPUs find one by one."""
     if "SCANS" in flags:
-        for scan, own in particles_of_scans(particles, per_scan):
+        for scan, part in particles_of_scans(particles, per_scan):
             first, last = start[scan], start[scan + 1]
             field_blocks(
-                flags - {"SCANS"}, table, pose_cell[own], pose[own], pose_low[own], point[first:last],
-                point_low[first:last], terms, guard, start, parts[own.start * across :], rows, cols,
-                own.stop - own.start, int(last - first), across, along, spread, per_scan,
+                flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
+                point_low[first:last], terms, guard, start, parts[part.start * across :], rows, cols,
+                part.stop - part.start, int(last - first), across, along, spread, per_scan,
             )  # fmt: skip
         return
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)

@@ -72,17 +72,17 @@ def search(
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)
     if feature[RADIUS] < 0:
         return best, best, chosen
-    found = best.copy()
+    log_p = best.copy()
     first, last = candidates(start, place, turned, feature, rows, cols, size)
-    own = (last - first).sum(axis=1)
-    ends = np.cumsum(own)
+    counts = (last - first).sum(axis=1)
+    ends = np.cumsum(counts)
     begin = 0
     while begin < particles:
         # As many particles as have BLOCK_PAIRS candidates, one at least.
         base = ends[begin - 1] if begin else 0
         end = max(int(np.searchsorted(ends, base + BLOCK_PAIRS, side="right")), begin + 1)
         runs_first, runs = first[begin:end].ravel(), (last - first)[begin:end].ravel()
-        n = np.repeat(np.arange(begin, end), own[begin:end])
+        n = np.repeat(np.arange(begin, end), counts[begin:end])
         j = np.arange(runs.sum()) + np.repeat(runs_first - (np.cumsum(runs) - runs), runs)
         placed, rotated = at_places(place, n), at_places(turned, n)
         off = offset(landmark[j], placed)
@@ -92,15 +92,15 @@ def search(
             off, rotated = at_places(off, kept), at_places(rotated, kept)
             value = log_detection(flags, off, rotated, feature, signature[j], terms, arcs)
             heads = np.flatnonzero(np.append(True, n[1:] != n[:-1]))
-            who, sizes = n[heads], np.diff(np.append(heads, len(n)))
+            holder, sizes = n[heads], np.diff(np.append(heads, len(n)))
             most = np.maximum.reduceat(value, heads)
-            best[who] = found[who] = most
+            best[holder] = log_p[holder] = most
             # The first of equals.
             at_most = np.where(value == np.repeat(most, sizes), np.arange(len(n)), len(n))
-            chosen[who] = j[np.minimum.reduceat(at_most, heads)]
+            chosen[holder] = j[np.minimum.reduceat(at_most, heads)]
             if "MARGINAL" in flags:
                 relative = np.where(np.isneginf(most), 0, most)
-                summed = np.add.reduceat(np.exp(value - np.repeat(relative, sizes)), heads, dtype=np.float64)
-                found[who] = np.where(np.isneginf(most), most, relative + np.log(np.maximum(summed, 1))).astype(real)
+                total = np.add.reduceat(np.exp(value - np.repeat(relative, sizes)), heads, dtype=np.float64)
+                log_p[holder] = np.where(np.isneginf(most), most, relative + np.log(np.maximum(total, 1))).astype(real)
         begin = end
-    return found, best, np.where(np.isneginf(best), -1, chosen)
+    return log_p, best, np.where(np.isneginf(best), -1, chosen)

@@ -52,19 +52,19 @@ def joint_features(
     place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], size)
     turned = [direction(pose[:particles], pose_low[:particles], one) for one in numbers[:features]]
     sums = best[: particles * sets].reshape(particles, sets)
-    who = choice[: particles * sets * features].reshape(particles, sets, features)
+    partners = choice[: particles * sets * features].reshape(particles, sets, features)
     each = value[: particles * sets * features].reshape(particles, sets, features)
-    sums[:], who[:], each[:] = -np.inf, -1, -np.inf
+    sums[:], partners[:], each[:] = -np.inf, -1, -np.inf
     sums[:, 0] = 0
     for j in range(landmarks):
         off = offset(landmark[j : j + 1], place)
-        own = signature[np.full(particles, j)]
+        signatures = signature[np.full(particles, j)]
         log_each = np.full((features, particles), -np.inf, real)
         for k in range(features):
             if numbers[k, RADIUS] >= 0:
-                found = log_detection(flags, off, turned[k], numbers[k], own, terms, arcs)
-                found = either(found, numbers[k, FALSE_POSITIVE])
-                log_each[k] = np.where(near(off, turned[k], numbers[k]), found, -np.inf)
+                detected = log_detection(flags, off, turned[k], numbers[k], signatures, terms, arcs)
+                detected = either(detected, numbers[k, FALSE_POSITIVE])
+                log_each[k] = np.where(near(off, turned[k], numbers[k]), detected, -np.inf)
         # From the full set down: the smaller sets do not have this landmark yet.
         for s in range(sets - 1, 0, -1):
             for k in range(features):
@@ -73,8 +73,8 @@ def joint_features(
                     joined = sums[:, less] + log_each[k]
                     better = joined > sums[:, s]
                     sums[better, s] = joined[better]
-                    who[better, s], each[better, s] = who[better, less], each[better, less]
-                    who[better, s, k], each[better, s, k] = j, log_each[k, better]
+                    partners[better, s], each[better, s] = partners[better, less], each[better, less]
+                    partners[better, s, k], each[better, s, k] = j, log_each[k, better]
     most, chosen = np.full(particles, -np.inf, real), np.zeros(particles, np.int64)
     for s in range(sets):
         total = sums[:, s].copy()
@@ -86,7 +86,7 @@ def joint_features(
     log_p[:particles] = np.where(np.isneginf(most), most, temperature * (fixed + most))
     if "PER_BEAM" in flags:
         n = np.arange(particles)
-        found, values = who[n, chosen], each[n, chosen]
-        which[: particles * features] = found.ravel()
+        detected, values = partners[n, chosen], each[n, chosen]
+        which[: particles * features] = detected.ravel()
         false = numbers[:features, FALSE_POSITIVE]
-        parts[: particles * features] = np.where(found >= 0, values, false).ravel()
+        parts[: particles * features] = np.where(detected >= 0, values, false).ravel()

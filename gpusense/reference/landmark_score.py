@@ -56,25 +56,25 @@ def score_features(
         place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)
         count = len(place[0])
         total = (np.full(count, fixed, pose.dtype), np.zeros(count, pose.dtype))
-        lost = np.zeros(count, bool)
+        impossible = np.zeros(count, bool)
         for k in range(0, features, BLOCK_TERMS):
             block = np.zeros(count, pose.dtype)
             for i in range(k, min(k + BLOCK_TERMS, features)):
                 one, turned = numbers[i], direction(pose[part], pose_low[part], numbers[i])
                 if "KNOWN" in flags:
                     j = np.full(count, partner[i])
-                    found = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
-                    best, chosen = found, j
+                    detected = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
+                    best, chosen = detected, j
                 else:
-                    found, best, chosen = search(
+                    detected, best, chosen = search(
                         flags, landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size
                     )
-                value = either(found + share, one[FALSE_POSITIVE])
-                lost |= np.isneginf(value)
+                value = either(detected + share, one[FALSE_POSITIVE])
+                impossible |= np.isneginf(value)
                 block += np.where(np.isneginf(value), 0, value)
                 if "PER_BEAM" in flags:
                     at = np.arange(part.start, part.stop) * features + i
                     parts[at] = value
                     which[at] = np.where(best + share >= one[FALSE_POSITIVE], chosen, -1)
             total = add_term(total, block)
-        log_p[part] = np.where(lost, -np.inf, temperature * (total[0] + total[1]))
+        log_p[part] = np.where(impossible, -np.inf, temperature * (total[0] + total[1]))

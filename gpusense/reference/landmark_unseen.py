@@ -45,8 +45,8 @@ def count_unseen(
         low, high = bucket_at(place[2] - range_max, size, rows), bucket_at(place[2] + range_max, size, rows)
         first, last = int(start[low.min() * cols]), int(start[(high.max() + 1) * cols])
         for n in range(len(low)):
-            own = at_places(place, slice(n, n + 1))
-            seen = in_view(offset(landmark[first:last], own), cosine[n], sine[n], range_max, least)
+            sensor = at_places(place, slice(n, n + 1))
+            seen = in_view(offset(landmark[first:last], sensor), cosine[n], sine[n], range_max, least)
             at = (begin + n) * features
             taken = np.unique(which[at : at + features])
             taken = taken[(taken >= first) & (taken < last)] - first

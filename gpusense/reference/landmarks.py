@@ -189,12 +189,12 @@ def log_detection(
         angle = angle_pair(across(off, turned), along(off, turned), arcs)
         squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
         # At zero range the density is 1 / field, which is the peak over that.
-        there = d[0] > real.type(ZERO_RANGE)
-        exponent = where_pair(there, squared, exponent)
-        own = real.type(1)
+        has_bearing = d[0] > real.type(ZERO_RANGE)
+        exponent = where_pair(has_bearing, squared, exponent)
+        mass_in_field = real.type(1)
         if "FIELD" in flags:
-            own = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
-        mass = mass * np.where(there, own, terms[3] * feature[BEARING_SCALE])
+            mass_in_field = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
+        mass = mass * np.where(has_bearing, mass_in_field, terms[3] * feature[BEARING_SCALE])
     if "SIGNATURE" in flags and feature[SIGNATURE_SCALE] > 0:
         s = two_sum(feature[SIGNATURE_AT], -signature[:, 0])
         s = two_sum(s[0], s[1] + (feature[SIGNATURE_LOW] - signature[:, 1]))

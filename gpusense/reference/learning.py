@@ -134,5 +134,5 @@ def pair_causes(
     starts = np.arange(blocks) * across
     for k in range(readings):
         pairs = starts + k * along
-        found = np.stack(responsibilities(flags, reading[pairs], expected[pairs], terms), axis=-1)
-        causes[pairs] = np.where(np.isnan(reading[pairs])[:, None], np.nan, found)
+        stacked = np.stack(responsibilities(flags, reading[pairs], expected[pairs], terms), axis=-1)
+        causes[pairs] = np.where(np.isnan(reading[pairs])[:, None], np.nan, stacked)

@@ -39,9 +39,9 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
     part = map_table[(at[1] * cols + at[0]) * bins + angle_bin(r.direction[:, active], bins)]
     far = t[active] + part.astype(pose.dtype) * (limit / pose.dtype.type(65535))
-    found[active] = np.where(part == 65535, limit, np.minimum(far, limit))
-    return found
+    ranges[active] = np.where(part == 65535, limit, np.minimum(far, limit))
+    return ranges

@@ -46,10 +46,10 @@ def cast_ray(
     real = pose.dtype.type
     r = make_ray(pose, ray)
     origin = cell.T.astype(np.int64)
-    found = np.full(len(cell), limit, pose.dtype)
+    ranges = np.full(len(cell), limit, pose.dtype)
     outside = off_grid(origin, rows, cols)
     if "OUTSIDE_OCCUPIED" in flags:
-        found[outside] = 0
+        ranges[outside] = 0
         t = np.where(outside, limit, real(0))
     else:
         t = start_walk(flags, r, cell, rows, cols, limit)[1]
@@ -60,12 +60,12 @@ def cast_ray(
         at = origin[:, active] + np.floor(place).astype(np.int64)
         off = off_grid(at, rows, cols)
         if "OUTSIDE_OCCUPIED" in flags:
-            found[active[off]] = t[active[off]]
+            ranges[active[off]] = t[active[off]]
         active, at = active[~off], at[:, ~off]
         distance = map_table[at[1] * cols + at[0]].astype(pose.dtype)
         hit = distance == 0
-        found[active[hit]] = t[active[hit]]
+        ranges[active[hit]] = t[active[hit]]
         active, distance = active[~hit], distance[~hit]
         t[active] += np.maximum(distance - slack, tolerance + t[active] * real(LEAST_STEP))
         active = active[t[active] < limit]
-    return found
+    return ranges

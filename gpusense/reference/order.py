@@ -30,9 +30,9 @@ def order_bounds(
 ) -> None:
     """Empty the bins; bounds become the largest of minus the smallest and the largest row, column and heading."""
     bins[:ALL_BINS] = 0
-    some = np.arange(SAMPLES) * particles // SAMPLES
-    turn = relative_turn(pose[some], pose[0])
-    for i, value in enumerate((pose_cell[some, 1], pose_cell[some, 0], turn)):
+    sample = np.arange(SAMPLES) * particles // SAMPLES
+    turn = relative_turn(pose[sample], pose[0])
+    for i, value in enumerate((pose_cell[sample, 1], pose_cell[sample, 0], turn)):
         bounds[2 * i] = max(bounds[2 * i], -value.min())
         bounds[2 * i + 1] = max(bounds[2 * i + 1], value.max())
     bounds[6] = 0

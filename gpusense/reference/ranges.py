@@ -40,12 +40,12 @@ def cast_ranges(
     cast_ray = caster_of(flags).cast_ray
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
-        some = slice(first, min(first + block, particles))
-        count = some.stop - first
-        lanes = (np.repeat(pose_cell[some], rays, axis=0), np.repeat(pose[some], rays, axis=0))
+        part = slice(first, min(first + block, particles))
+        count = part.stop - first
+        lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
         beams = np.tile(ray[:rays], (count, 1))
         t = cast_ray(flags, map_table, rows, cols, *lanes, beams, limit, bins, slack, tolerance)
-        ranges[first * rays : some.stop * rays] = expected_range(t, limit, resolution, range_max)
+        ranges[first * rays : part.stop * rays] = expected_range(t, limit, resolution, range_max)
 
 
 def cast_tiles(

@@ -103,12 +103,12 @@ def start_casts(
     """
     origin = cell.T.astype(np.int64)
     k, t = start_walk(flags, r, cell, rows, cols, limit)
-    found = np.full(len(cell), limit, t.dtype)
+    ranges = np.full(len(cell), limit, t.dtype)
     if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
         outside = off_grid(origin, rows, cols)
-        found[outside] = 0
-        return origin, k, t, found, np.flatnonzero(~outside)
-    return origin, k, t, found, np.flatnonzero(t < limit)
+        ranges[outside] = 0
+        return origin, k, t, ranges, np.flatnonzero(~outside)
+    return origin, k, t, ranges, np.flatnonzero(t < limit)
 
 
 def turn_of(direction: np.ndarray) -> np.ndarray:
@@ -127,8 +127,8 @@ def turn_of(direction: np.ndarray) -> np.ndarray:
 def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
     """Angle bins whose centres are nearest; centres are at 0, 1 / bins, ... of a turn."""
     real = direction.dtype.type
-    found = (turn_of(direction) * real(bins) + real(0.5)).astype(np.int64)
-    return np.where(found >= bins, found - bins, found)
+    index = (turn_of(direction) * real(bins) + real(0.5)).astype(np.int64)
+    return np.where(index >= bins, index - bins, index)
 
 
 def expected_range(t: np.ndarray, limit: np.floating, resolution: np.floating, range_max: np.floating) -> np.ndarray:

@@ -52,7 +52,7 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
     sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
     plane = quadrant * sectors + sector_of(sectors, *r.speed)
@@ -63,7 +63,7 @@ def cast_ray(
         stopped = sides <= OCCUPIED
         if stopped.any():
             hit = stopped if "OUTSIDE_OCCUPIED" in flags else sides == OCCUPIED
-            found[active[hit]] = t[active[hit]]
+            ranges[active[hit]] = t[active[hit]]
             active, sides = active[~stopped], sides[~stopped]
         speed, a, inv = r.speed[:, active], r.a[:, active], r.inv[:, active]
         far = k[:, active] + (np.stack([sides & 255, sides >> 8]).astype(pose.dtype) - 1)
@@ -71,11 +71,11 @@ def cast_ray(
         by_x = t_x <= t_y
         now = np.where(by_x, t_x, t_y)
         other = by_x.astype(np.intp)
-        own, lane = 1 - other, np.arange(len(active))
-        aside = crossed(now, speed[other, lane], a[other, lane], inv[other, lane], ~by_x)
-        far[own, lane] += 1
-        far[other, lane] = aside
+        axis, index = 1 - other, np.arange(len(active))
+        aside = crossed(now, speed[other, index], a[other, index], inv[other, index], ~by_x)
+        far[axis, index] += 1
+        far[other, index] = aside
         k[:, active] = far
         t[active] = now
         active = active[now < limit]
-    return found
+    return ranges

@@ -51,13 +51,13 @@ def place_relative(
 
     ``verdict``, which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
     """
-    given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
-    finite: np.ndarray = np.asarray(np.isfinite(given).all(axis=1))
+    all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
+    finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():
         verdict[0] = 1
-    x_y = two_sum(given[:, :2], -np.array([origin_x, origin_y]))
+    x_y = two_sum(all_poses[:, :2], -np.array([origin_x, origin_y]))
     if (mount_x, mount_y) != (0.0, 0.0):
-        cos, sin = cos_sin(np.ascontiguousarray(given[:, 2]))
+        cos, sin = cos_sin(np.ascontiguousarray(all_poses[:, 2]))
         arm = np.stack([cos * mount_x - sin * mount_y, sin * mount_x + cos * mount_y], axis=1)
         moved = two_sum(x_y[0], arm)
         near = (np.abs(x_y[0]) <= FARTHEST).all(axis=1, keepdims=True)
@@ -76,10 +76,10 @@ def wrap_headings(
     particles: int,
 ) -> None:
     """Headings minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict as for places."""
-    given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
-    finite: np.ndarray = np.asarray(np.isfinite(given).all(axis=1))
+    all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
+    finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():
         verdict[0] = 1
-    high, low = wrapped_difference(np.where(finite, given[:, 2], 0.0), (target, target_low))
+    high, low = wrapped_difference(np.where(finite, all_poses[:, 2], 0.0), (target, target_low))
     residual[:particles, 0] = high
     residual[:particles, 1] = (high - residual[:particles, 0].astype(np.float64)) + low

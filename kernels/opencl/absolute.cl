@@ -77,30 +77,30 @@ kernel void score_position(global const real4 *place, global const real *terms, 
     const real2 first = bounded_square(pair_product(x, a));
     const real2 second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)));
     const real2 exponent = pair_sum(first, second);
-    real found = (terms[6] - exponent.x) + (terms[7] - exponent.y);
+    real log_density = (terms[6] - exponent.x) + (terms[7] - exponent.y);
 #if RAND
-    found = either(found, terms[8]);
+    log_density = either(log_density, terms[8]);
 #endif
-    log_p[n] = temperature * found;
+    log_p[n] = temperature * log_density;
 }
 
 // One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
-kernel void score_heading(global const real2 *residual, global const real *terms, global real *log_p, const int particles,
-                          const int kind, const real temperature) {
+kernel void score_heading(global const real2 *residual, global const real *terms, global real *log_p,
+                          const int particles, const int kind, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 r = residual[n];
-    real found;
+    real log_density;
     if (kind == SERIES) {
-        found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms));
+        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms));
     } else {
         const real2 root = kind == VON_MISES ? half_sine(r) : r;
         const real2 exponent = bounded_square(pair_product(root, (real2)(terms[SCALE], terms[SCALE_LOW])));
-        found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y);
-        if (kind == NEARBY) found += log_other_turns(r, terms[DECAY]);
+        log_density = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y);
+        if (kind == NEARBY) log_density += log_other_turns(r, terms[DECAY]);
     }
 #if RAND
-    found = either(found, terms[RANDOM]);
+    log_density = either(log_density, terms[RANDOM]);
 #endif
-    log_p[n] = temperature * found;
+    log_p[n] = temperature * log_density;
 }

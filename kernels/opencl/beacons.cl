@@ -40,9 +40,9 @@ real log_normal(const real2 residual, const real near, const real far, global co
                 const int peak) {
     const real scale = terms[first], below = near * scale, above = far * scale;
     const real2 exponent = bounded_square(pair_product(residual, (real2)(scale, terms[first + 1])));
-    const real found = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y);
-    if (below > ERF_ONE && above > ERF_ONE) return found;
-    return found - log((real)0.5 * (erf(below) + erf(above)));
+    const real untruncated = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y);
+    if (below > ERF_ONE && above > ERF_ONE) return untruncated;
+    return untruncated - log((real)0.5 * (erf(below) + erf(above)));
 }
 
 // Mass of a Student t between -t and t, where t >= 0 is in units of its scale and sqrt(nu).
@@ -69,16 +69,16 @@ real log_range(const real2 d, global const real *beacon, global const real *term
                const int count, const int kind) {
     const real2 first = two_sum(d.x, -beacon[4]), r = two_sum(first.x, first.y + (d.y - beacon[5]));
     const real near = clamp(d.x + terms[BIAS], (real)0, terms[RANGE_MAX]), far = terms[RANGE_MAX] - near;
-    real found;
+    real log_p;
     if (kind == STUDENT_T)
-        found = log_student_t(r, near, far, terms, series, count);
+        log_p = log_student_t(r, near, far, terms, series, count);
     else
-        found = log_normal(r, near, far, terms, SCALE, PEAK);
-    if (kind == TWO_NORMALS) found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
+        log_p = log_normal(r, near, far, terms, SCALE, PEAK);
+    if (kind == TWO_NORMALS) log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
 #if RAND
-    return either(found, terms[RANDOM]);
+    return either(log_p, terms[RANDOM]);
 #else
-    return found;
+    return log_p;
 #endif
 }
 
@@ -88,12 +88,12 @@ kernel void score_beacons(global const real4 *place, global const real *beacon, 
                           const int count, const int kind, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = place[n];
+    const real4 sensor = place[n];
     real2 total = 0;
     for (int i = 0; i < beacons; ++i) {
-        global const real *one = beacon + BEACON * i;
-        const real2 d = distance_pair(offset((real4)(one[0], one[2], one[1], one[3]), own));
-        total = add_term(total, log_range(d, one, terms, series, count, kind));
+        global const real *numbers = beacon + BEACON * i;
+        const real2 d = distance_pair(offset((real4)(numbers[0], numbers[2], numbers[1], numbers[3]), sensor));
+        total = add_term(total, log_range(d, numbers, terms, series, count, kind));
     }
     log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
 }

@@ -47,7 +47,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     if (n >= particles) return;
 #if SCANS
     const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real lead = fixed_of[scan];
+    const real constant_term = fixed_of[scan];
     ray += start[scan] * cone_rays;
 #if SHARED_RAYS
     first += start[scan];
@@ -58,9 +58,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     reading += begin;
 #else
     const int size = rays, begin = 0;
-    const real lead = fixed;
+    const real constant_term = fixed;
 #endif
-    real2 total = (real2)(lead, 0);
+    real2 total = (real2)(constant_term, 0);
     real strands[STRANDS] = {0, 0, 0, 0};
 #if !LINEAR
     int impossible = 0;
@@ -75,9 +75,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
         const real expected = expected_range(t, limit, resolution, range_max);
 #if INCIDENCE
-        global const real *own = incidence_terms(terms, edges, kinds, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, kinds, echo.cosine);
 #else
-        global const real *own = terms;
+        global const real *bin_terms = terms;
 #endif
 #if SHARED_RAYS
         for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
@@ -85,7 +85,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, bin_terms, sensor, cells, per_metre, range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -133,7 +133,7 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     const int n = place;
 #endif
     const int2 cell = pose_cell[n];
-    const real4 own_pose = pose[n];
+    const real4 sensor_pose = pose[n];
 #if SCANS
     const int scan = n / per_scan, size = start[scan + 1] - start[scan];
     ray += start[scan] * cone_rays;
@@ -154,17 +154,17 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
 #if ECHO
-        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, own_pose, ray + r * cone_rays,
+        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, sensor_pose, ray + r * cone_rays,
                                        cone_rays, critical, limit, bins, slack, tolerance);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, rows, cols, cell, own_pose, ray[r], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray[r], limit, bins, slack, tolerance);
 #endif
         const real expected = expected_range(t, limit, resolution, range_max);
 #if INCIDENCE
-        global const real *own = incidence_terms(terms, edges, kinds, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, kinds, echo.cosine);
 #else
-        global const real *own = terms;
+        global const real *bin_terms = terms;
 #endif
 #if SHARED_RAYS
         for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
@@ -172,7 +172,7 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, bin_terms, sensor, cells, per_metre, range_max);
 #if STRANDED
             sum += term;
             r += STRANDS;

@@ -34,7 +34,7 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const int line = floor_int(across) - map_table[3 + 3 * bin];
     if (line < 0 || line >= lines) return limit;
     const int from = (int)(along > FARTHEST ? FARTHEST * ENTRY_UNIT : along < -FARTHEST ? -FARTHEST * ENTRY_UNIT
-                                                                                       : along * ENTRY_UNIT);
+                           : along * ENTRY_UNIT);
     int low = first[bin * lines + line], high = first[bin * lines + line + 1];
     const int end = high;
     while (low < high) {

@@ -63,7 +63,7 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
     const int n = get_global_id(0);
     if (n >= particles) return;
     const int2 cell = pose_cell[n];
-    const real4 own = pose[n];
+    const real4 sensor_pose = pose[n];
 #if CAREFUL
     const real4 low = pose_low[n];
 #else
@@ -73,7 +73,7 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
     for (int s = 0; s < segments; ++s) {
         int nearest = NO_OBSTACLE;
         for (int i = start[s]; i < start[s + 1]; ++i) {
-            const int2 at = cell + end_point(own, low, point[i], point_low[i], (real)0, guard).cell;
+            const int2 at = cell + end_point(sensor_pose, low, point[i], point_low[i], (real)0, guard).cell;
             nearest = min(nearest, table[field_cell(at.x, at.y, rows, cols)]);
         }
         total += log_bump(nearest, pressed[s], terms);

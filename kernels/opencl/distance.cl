@@ -130,7 +130,8 @@ kernel void distance_search(global const ushort *nearest, global const ushort *b
                 const uint least = block[(long)b * cols];
                 if (pass == 0) best = min(best, squares_sum(far, least) + 1);
                 if (pass == 0 || squares_sum(near, least) >= best) continue;
-                for (int j = near; j <= far; ++j) best = min(best, squares_sum(j, column[(long)(row + way * j) * cols]));
+                for (int j = near; j <= far; ++j) best = min(best,
+                                                             squares_sum(j, column[(long)(row + way * j) * cols]));
             }
         }
     }

@@ -28,15 +28,16 @@ real2 normal_at(global const real2 *normals, const int rows, const int cols, con
 
 // Normal of the cell in which a ray ends at a distance t, which tells where the exact walk was: across all boundaries in
 // x up to t and those in y before t, or, after a step in y, up to t as well. A corner is passed in x first.
-real2 hit_normal(global const real2 *normals, const int rows, const int cols, const int2 cell, const Ray r, const real t) {
+real2 hit_normal(global const real2 *normals, const int rows, const int cols, const int2 cell, const Ray r,
+                 const real t) {
     if (t == 0) {
-        const real2 own = normal_at(normals, rows, cols, cell.x, cell.y);
-        if (is_wall(own)) return own;
+        const real2 start_normal = normal_at(normals, rows, cols, cell.x, cell.y);
+        if (is_wall(start_normal)) return start_normal;
     }
     const int col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
     const int before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
-    const real2 found = normal_at(normals, rows, cols, col, before);
-    if (is_wall(found)) return found;
+    const real2 normal = normal_at(normals, rows, cols, col, before);
+    if (is_wall(normal)) return normal;
     return normal_at(normals, rows, cols, col, cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 1)));
 }
 
@@ -88,8 +89,8 @@ kernel void cast_echoes(global const entry *map_table, global const real2 *norma
                         const real resolution, const real range_max) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
-    const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + k * cone_rays, cone_rays,
-                                   critical, limit, bins, slack, tolerance);
+    const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + k * cone_rays,
+                                   cone_rays, critical, limit, bins, slack, tolerance);
     ranges[(long)n * rays + k] = expected_range(echo.t, limit, resolution, range_max);
 #if INCIDENCE
     incidence[(long)n * rays + k] = echo.t < limit ? atan2(echo.sine, echo.cosine) : NAN;

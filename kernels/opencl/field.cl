@@ -133,12 +133,12 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     if (n >= particles) return;
 #if SCANS
     const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real lead = fixed_of[scan];
+    const real constant_term = fixed_of[scan];
     point += start[scan];
     point_low += start[scan];
 #else
     const int size = readings;
-    const real lead = fixed;
+    const real constant_term = fixed;
 #endif
     const int2 origin = pose_cell[n];
 #if CAREFUL
@@ -146,7 +146,7 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 #else
     const real4 low = (real4)(0);
 #endif
-    real2 total = (real2)(lead, 0);
+    real2 total = (real2)(constant_term, 0);
     real block = 0;
     for (int k = 0; k < size; ++k) {
         const real term =
@@ -186,7 +186,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
     const int size = readings;
 #endif
     const int2 origin = pose_cell[n];
-    const real4 own = pose[n];
+    const real4 sensor_pose = pose[n];
 #if CAREFUL
     const real4 low = pose_low[n];
 #else
@@ -194,7 +194,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
 #endif
 #if QUICK
     const int2 from = table_origin(origin, cols);
-    const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
+    const real4 lowered = sensor_pose - (real4)(0.5f, 0.5f, 0, 0);
     const real far = terms[3];
 #endif
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
@@ -213,9 +213,9 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
             global const real4 *two = (global const real4 *)(point + begin);
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS / 2; ++i) {
-                const real4 both = two[i];
-                sum += quick_value(table, from, lowered, both.xy, far, rows, cols, &worst);
-                sum += quick_value(table, from, lowered, both.zw, far, rows, cols, &worst);
+                const real4 pair = two[i];
+                sum += quick_value(table, from, lowered, pair.xy, far, rows, cols, &worst);
+                sum += quick_value(table, from, lowered, pair.zw, far, rows, cols, &worst);
             }
 #endif
         } else {
@@ -225,12 +225,13 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         if (worst > sure) {
             sum = 0;
             for (int k = begin; k < end; ++k)
-                sum += careful_value(table, origin, lowered, own, low, point[k], point_low[k], far, rows, cols,
+                sum += careful_value(table, origin, lowered, sensor_pose, low, point[k], point_low[k], far, rows, cols,
                                      guard[block], sure);
         }
 #else
         for (int k = begin; k < end; ++k)
-            sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard[block]);
+            sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, rows, cols,
+                                 guard[block]);
 #endif
         parts[(long)n * across + (long)block * along] = sum;
     }

@@ -92,11 +92,11 @@ Turn reduce_huge(const double theta) {
     // turns = mantissa * window modulo 2^192, of which the upper four words stay.
     ulong turn_1 = 0, turn_2 = 0, turn_3 = 0, turn_4 = 0, carry_1 = 0, carry_2 = 0, below = 0;
     for (int k = 5; k >= 0; k--) {
-        const ulong both = (ulong)WORDS[word + k] << 32 | WORDS[word + k + 1];
-        const ulong here = both << shift >> 32;
-        const ulong sum_1 = low_half * here + carry_1;
+        const ulong words = (ulong)WORDS[word + k] << 32 | WORDS[word + k + 1];
+        const ulong digit = words << shift >> 32;
+        const ulong sum_1 = low_half * digit + carry_1;
         const ulong sum_2 = high_half * below + (sum_1 & 0xFFFFFFFFUL) + carry_2;
-        carry_1 = sum_1 >> 32, carry_2 = sum_2 >> 32, below = here;
+        carry_1 = sum_1 >> 32, carry_2 = sum_2 >> 32, below = digit;
         turn_4 = turn_3, turn_3 = turn_2, turn_2 = turn_1, turn_1 = sum_2 & 0xFFFFFFFFUL;
     }
     // To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.

@@ -8,7 +8,7 @@
 
 // What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place.
 typedef struct {
-    real found, best;
+    real log_p, best;
     int chosen;
 } Match;
 
@@ -42,14 +42,14 @@ real squared_reach(const real exponent, global const real *feature) {
 // A match and one more landmark; sum is that of densities relative to found.
 Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
 #if MARGINAL
-    if (isinf(match.found)) {
-        match.found = log_p;
+    if (isinf(match.log_p)) {
+        match.log_p = log_p;
         *sum = (real2)(isinf(log_p) ? 0 : 1, 0);
-    } else if (log_p > match.found + RELATIVE) {
-        *sum = *sum * exp(match.found - log_p) + (real2)(1, 0);
-        match.found = log_p;
+    } else if (log_p > match.log_p + RELATIVE) {
+        *sum = *sum * exp(match.log_p - log_p) + (real2)(1, 0);
+        match.log_p = log_p;
     } else {
-        *sum = add_term(*sum, exp(log_p - match.found));
+        *sum = add_term(*sum, exp(log_p - match.log_p));
     }
 #endif
     if (log_p > match.best) {
@@ -83,9 +83,9 @@ Match search(global const real4 *landmark, global const real4 *signature, global
         }
     }
 #if MARGINAL
-    if (!isinf(match.found)) match.found += log(sum.x + sum.y);
+    if (!isinf(match.log_p)) match.log_p += log(sum.x + sum.y);
 #else
-    match.found = match.best;
+    match.log_p = match.best;
 #endif
     return match;
 }

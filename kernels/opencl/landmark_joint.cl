@@ -16,7 +16,7 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
                            const real size, const real fixed, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], own, low, size);
+    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
     global real *sums = best + (long)n * sets, *each = value + (long)n * sets * features;
     global int *who = choice + (long)n * sets * features;
     for (int s = 0; s < sets; ++s) sums[s] = s == 0 ? (real)0 : -INFINITY;
@@ -25,11 +25,12 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
         const real4 off = offset(landmark[j], place);
         real log_each[MOST_FEATURES];
         for (int k = 0; k < features; ++k) {
-            global const real *one = feature + FEATURE * k;
-            const real4 turned = direction(own, low, one);
+            global const real *numbers = feature + FEATURE * k;
+            const real4 turned = direction(high, low, numbers);
             log_each[k] = -INFINITY;
-            if (one[RADIUS] >= 0 && near(off, turned, one, INFINITY))
-                log_each[k] = either(log_detection(off, turned, one, signature[j], terms, arcs), one[FALSE_POSITIVE]);
+            if (numbers[RADIUS] >= 0 && near(off, turned, numbers, INFINITY))
+                log_each[k] = either(log_detection(off, turned, numbers, signature[j], terms, arcs),
+                                     numbers[FALSE_POSITIVE]);
         }
         // From the full set down: the smaller sets do not have this landmark yet.
         for (int s = sets - 1; s > 0; --s) {

@@ -13,35 +13,36 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
                            const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], own, low, size);
+    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
     real2 total = (real2)(fixed, 0);
-    int lost = 0;
+    int impossible = 0;
     for (int first = 0; first < features; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, features);
         real block = 0;
         for (int k = first; k < last; ++k) {
-            global const real *one = feature + FEATURE * k;
-            const real4 turned = direction(own, low, one);
+            global const real *numbers = feature + FEATURE * k;
+            const real4 turned = direction(high, low, numbers);
 #if KNOWN
             const int j = partner[k];
-            const real found = log_detection(offset(landmark[j], place), turned, one, signature[j], terms, arcs);
-            const Match match = {found, found, j};
+            const real detected = log_detection(offset(landmark[j], place), turned, numbers, signature[j], terms, arcs);
+            const Match match = {detected, detected, j};
 #else
-            const Match match = search(landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size);
+            const Match match = search(landmark, signature, start, place, turned, numbers, terms, arcs, rows, cols,
+                                       size);
 #endif
-            const real value = either(match.found + share, one[FALSE_POSITIVE]);
-            lost |= isinf(value);
+            const real value = either(match.log_p + share, numbers[FALSE_POSITIVE]);
+            impossible |= isinf(value);
             block += isinf(value) ? (real)0 : value;
 #if PER_BEAM
             parts[(long)n * features + k] = value;
 #if KNOWN
             which[(long)n * features + k] = j;
 #else
-            which[(long)n * features + k] = match.best + share >= one[FALSE_POSITIVE] ? match.chosen : -1;
+            which[(long)n * features + k] = match.best + share >= numbers[FALSE_POSITIVE] ? match.chosen : -1;
 #endif
 #endif
         }
         total = add_term(total, block);
     }
-    log_p[n] = lost ? -INFINITY : temperature * (total.x + total.y);
+    log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
 }

@@ -15,8 +15,9 @@ kernel void count_unseen(global const real4 *landmark, global const int *start, 
                          const real least, const real log_missed) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = pose[n], place = sensor_place(pose_cell[n], own, pose_low[n], size);
-    const real cosine = own.z * axis_cosine - own.w * axis_sine, sine = own.w * axis_cosine + own.z * axis_sine;
+    const real4 sensor_pose = pose[n], place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], size);
+    const real cosine = sensor_pose.z * axis_cosine - sensor_pose.w * axis_sine;
+    const real sine = sensor_pose.w * axis_cosine + sensor_pose.z * axis_sine;
     const int left = bucket_at(place.x - range_max, size, cols), right = bucket_at(place.x + range_max, size, cols);
     const int high = bucket_at(place.z + range_max, size, rows);
     int unseen = 0;

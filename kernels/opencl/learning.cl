@@ -101,8 +101,8 @@ kernel void e_step(global const real *reading, global const real *expected, glob
                    const int width) {
     const int block = get_global_id(0);
     if (block >= blocks) return;
-    real total[SUMS], lost[SUMS], part[SUMS];
-    for (int j = 0; j < SUMS; ++j) total[j] = lost[j] = 0;
+    real total[SUMS], total_low[SUMS], part[SUMS];
+    for (int j = 0; j < SUMS; ++j) total[j] = total_low[j] = 0;
     for (int first = 0; first < readings; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, readings);
         for (int j = 0; j < SUMS; ++j) part[j] = 0;
@@ -111,12 +111,12 @@ kernel void e_step(global const real *reading, global const real *expected, glob
             if (!isnan(reading[n])) add_pair(reading[n], expected[n], terms, part);
         }
         for (int j = 0; j < SUMS; ++j) {
-            const real2 sum = add_term((real2)(total[j], lost[j]), part[j]);
+            const real2 sum = add_term((real2)(total[j], total_low[j]), part[j]);
             total[j] = sum.x;
-            lost[j] = sum.y;
+            total_low[j] = sum.y;
         }
     }
-    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + lost[j];
+    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + total_low[j];
 }
 
 // One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.

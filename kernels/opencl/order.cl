@@ -59,17 +59,17 @@ kernel void order_count(global const int2 *pose_cell, global const real4 *pose, 
 kernel void order_starts(global int *bounds, global int *bins) {
     const int stretch = get_global_id(0);
     if (stretch >= ALL_BINS / STRETCH) return;
-    global int *own = bins + stretch * STRETCH;
+    global int *counted = bins + stretch * STRETCH;
     // All are read before any is added, so that a work-item waits once for them.
     int counts[STRETCH], sum = 0;
 #pragma unroll
-    for (int i = 0; i < STRETCH; ++i) counts[i] = own[i];
+    for (int i = 0; i < STRETCH; ++i) counts[i] = counted[i];
 #pragma unroll
     for (int i = 0; i < STRETCH; ++i) sum += counts[i];
     int start = atomic_add(&bounds[6], sum);
 #pragma unroll
     for (int i = 0; i < STRETCH; ++i) {
-        own[i] = start;
+        counted[i] = start;
         start += counts[i];
     }
 }

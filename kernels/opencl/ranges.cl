@@ -28,9 +28,9 @@ kernel void cast_tiles(global const entry *restrict map_table, global const int2
     const int n = place;
 #endif
     const int2 cell = pose_cell[n];
-    const real4 own = pose[n];
+    const real4 sensor_pose = pose[n];
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
-        const real t = cast_ray(map_table, rows, cols, cell, own, ray[k], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray[k], limit, bins, slack, tolerance);
         ranges[n * rays + k] = expected_range(t, limit, resolution, range_max);
     }
 }

@@ -53,7 +53,8 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
         const real t_x = ((end_x - (COUNT + 1)) + r.a_x) * r.inv_x, t_y = ((end_y - (COUNT + 1)) + r.a_y) * r.inv_y;
         const int by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
-        const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x, !by_x);
+        const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x,
+                                   !by_x);
         k_x = by_x ? end_x : aside;
         k_y = by_x ? aside : end_y;
         sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];

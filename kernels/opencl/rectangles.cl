@@ -82,8 +82,8 @@ kernel void rectangles_rows(global const uchar *runs, global int *stack, global 
             const int lower = known ? min(height, (int)run[other]) : 0;
             const int wider = lower * middle.y > width * middle.x;
             if (col < begin || col >= end) continue;
-            const int found = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : OCCUPIED;
-            out[padded(row, col, cols)] = (ushort)found;
+            const int sides = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : OCCUPIED;
+            out[padded(row, col, cols)] = (ushort)sides;
         }
     }
 }
@@ -130,8 +130,8 @@ kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles,
         const int narrower = height > room ? 0 : min(width, (int)run[(height - 1) * step]);
         while (sector < sectors && narrower * middle.x < height * middle.y) {
             const int higher = narrower * middle.x > (height - 1) * middle.y;
-            const int found = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
-            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)found;
+            const int sides = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
+            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)sides;
             middle = slope(sectors, ++sector);
         }
         width = narrower;

@@ -47,13 +47,13 @@ kernel void place_relative(global const coordinate *poses, global real4 *place, 
     const int n = get_global_id(0);
     if (n >= particles) return;
     const long first = 3 * (long)n;
-    const double given_x = poses[first], given_y = poses[first + 1], theta = poses[first + 2];
-    if (!((given_x - given_x) + (given_y - given_y) + (theta - theta) == 0)) {
+    const double pose_x = poses[first], pose_y = poses[first + 1], theta = poses[first + 2];
+    if (!((pose_x - pose_x) + (pose_y - pose_y) + (theta - theta) == 0)) {
         atomic_or(&verdict[0], 1);
         place[n] = (real4)(0, 0, 0, 0);
         return;
     }
-    double2 x = two_sum_float64(given_x, -origin_x), y = two_sum_float64(given_y, -origin_y);
+    double2 x = two_sum_float64(pose_x, -origin_x), y = two_sum_float64(pose_y, -origin_y);
     const int near = fabs(x.x) <= FARTHEST && fabs(y.x) <= FARTHEST;
     if (near && (mount_x != 0 || mount_y != 0)) {
         const double2 heading = cos_sin(theta);

@@ -19,24 +19,24 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
 #endif
 #if SCANS
 #if STRANDED
-    const int terms = counts[n / per_scan], own = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
+    const int terms = counts[n / per_scan], size = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
 #else
-    const int own = counts[n / per_scan];
+    const int size = counts[n / per_scan];
 #endif
-    const real lead = fixed_of[n / per_scan];
+    const real constant_term = fixed_of[n / per_scan];
 #else
-    const int own = count;
-    const real lead = fixed;
+    const int size = count;
+    const real constant_term = fixed;
 #endif
     const int begin = place * across;
-    real2 total = (real2)(lead, 0);
-    for (int first = 0; first < own; first += BLOCK_TERMS) {
+    real2 total = (real2)(constant_term, 0);
+    for (int first = 0; first < size; first += BLOCK_TERMS) {
         real term[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[begin + min(first + i, own - 1) * along];
-        if (first + BLOCK_TERMS > own) {
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[begin + min(first + i, size - 1) * along];
+        if (first + BLOCK_TERMS > size) {
 #pragma unroll
-            for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? term[i] : 0;
+            for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < size ? term[i] : 0;
         }
         if (block == 1) {
 #pragma unroll

@@ -102,16 +102,16 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = place[n]
-        x = vec2(own.x, own.y)
-        y = vec2(own.z, own.w)
+        sensor = place[n]
+        x = vec2(sensor.x, sensor.y)
+        y = vec2(sensor.z, sensor.w)
         first = bounded_square(pair_product(x, vec2(terms[0], terms[1])))
         mixed = pair_sum(pair_product(x, vec2(terms[2], terms[3])), pair_product(y, vec2(terms[4], terms[5])))
         exponent = pair_sum(first, bounded_square(mixed))
-        found = (terms[6] - exponent.x) + (terms[7] - exponent.y)
+        log_density = (terms[6] - exponent.x) + (terms[7] - exponent.y)
         if RAND:
-            found = either(found, terms[8])
-        log_p[n] = temperature * found
+            log_density = either(log_density, terms[8])
+        log_p[n] = temperature * log_density
 
     # One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
     @kernel
@@ -127,19 +127,19 @@ def make(name, flags):
         if n >= particles:
             return
         r = residual[n]
-        found = real(0.0)
+        log_density = real(0.0)
         if kind == SERIES:
-            found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+            log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
         else:
             root = r
             if kind == VON_MISES:
                 root = half_sine(r)
             exponent = bounded_square(pair_product(root, vec2(terms[SCALE], terms[SCALE_LOW])))
-            found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
+            log_density = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
             if kind == NEARBY:
-                found += log_other_turns(r, terms[DECAY])
+                log_density += log_other_turns(r, terms[DECAY])
         if RAND:
-            found = either(found, terms[RANDOM])
-        log_p[n] = temperature * found
+            log_density = either(log_density, terms[RANDOM])
+        log_p[n] = temperature * log_density
 
     return {"score_position": score_position, "score_heading": score_heading}[name]

@@ -52,10 +52,10 @@ def make(name, flags):
         below = near * scale
         above = far * scale
         exponent = bounded_square(pair_product(residual, vec2(scale, terms[first + 1])))
-        found = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y)
+        untruncated = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y)
         if wp.min(below, above) <= ERF_ONE:
-            found = found - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
-        return found
+            untruncated = untruncated - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
+        return untruncated
 
     # Mass of a Student t between -t and t, where t >= 0 is in units of its scale and sqrt(nu).
     @wp.func
@@ -94,26 +94,26 @@ def make(name, flags):
     def log_range(
         d: vec2,
         beacon: wp.array(dtype=real),
-        one: wp.int32,
+        base: wp.int32,
         terms: wp.array(dtype=real),
         series: wp.array(dtype=real),
         count: wp.int32,
         kind: wp.int32,
     ):
-        first = two_sum(d.x, -beacon[one + 4])
-        r = two_sum(first.x, first.y + (d.y - beacon[one + 5]))
+        first = two_sum(d.x, -beacon[base + 4])
+        r = two_sum(first.x, first.y + (d.y - beacon[base + 5]))
         near = wp.clamp(d.x + terms[BIAS], ZERO, terms[RANGE_MAX])
         far = terms[RANGE_MAX] - near
-        found = real(0.0)
+        log_p = real(0.0)
         if kind == STUDENT_T:
-            found = log_student_t(r, near, far, terms, series, count)
+            log_p = log_student_t(r, near, far, terms, series, count)
         else:
-            found = log_normal(r, near, far, terms, SCALE, PEAK)
+            log_p = log_normal(r, near, far, terms, SCALE, PEAK)
         if kind == TWO_NORMALS:
-            found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
+            log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
         if RAND:
-            found = either(found, terms[RANDOM])
-        return found
+            log_p = either(log_p, terms[RANDOM])
+        return log_p
 
     # One work-item a particle: the sum over beacons of log p of their ranges; the first count numbers of the series are
     # a t's.
@@ -133,14 +133,14 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = place[n]
+        sensor = place[n]
         total = vec2(ZERO, ZERO)
         i = int(0)
         while i < beacons:
-            one = BEACON * i
-            at = vec4(beacon[one], beacon[one + 2], beacon[one + 1], beacon[one + 3])
-            d = distance_pair(offset(at, own))
-            total = add_term(total, log_range(d, beacon, one, terms, series, count, kind))
+            base = BEACON * i
+            at = vec4(beacon[base], beacon[base + 2], beacon[base + 1], beacon[base + 3])
+            d = distance_pair(offset(at, sensor))
+            total = add_term(total, log_range(d, beacon, base, terms, series, count, kind))
             i += 1
         log_p[n] = wp.where(wp.isinf(total.x), total.x, temperature * (total.x + total.y))
 

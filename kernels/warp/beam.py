@@ -123,11 +123,11 @@ def make(name, flags):
         if n >= particles:
             return
         cell = cell_at(pose_cell, n)
-        from_pose = pose_at(pose, n)
+        sensor_pose = pose_at(pose, n)
         before = int(0)
         size = rays
         readings_before = int(0)
-        lead = fixed
+        constant_term = fixed
         if SCANS:
             scan = (n + ahead) // per_scan
             before = start[scan]
@@ -135,23 +135,23 @@ def make(name, flags):
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-            lead = fixed_of[scan]
-        total = vec2(lead, ZERO)
+            constant_term = fixed_of[scan]
+        total = vec2(constant_term, ZERO)
         strands = vec4()
         impossible = bool(False)
         for r in range(size):
-            own = terms
+            bin_terms = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, from_pose, ray, (before + r) * cone_rays, cone_rays, critical,
-                    limit, bins, slack, tolerance,
+                    map_table, normals, rows, cols, cell, sensor_pose, ray, (before + r) * cone_rays, cone_rays,
+                    critical, limit, bins, slack, tolerance,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
-                    own = incidence_terms(terms, edges, kinds, heard.cosine)
+                    bin_terms = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
                 t = cast_ray(
-                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                    map_table, rows, cols, cell, sensor_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
                 )
             expected = expected_range(t, limit, resolution, range_max)
             begin = r
@@ -161,7 +161,7 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             for k in range(begin, end):
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
+                term = reading_term(z, expected, bin_terms, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -226,7 +226,7 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         cell = cell_at(pose_cell, n)
-        from_pose = pose_at(pose, n)
+        sensor_pose = pose_at(pose, n)
         before = int(0)
         size = rays
         readings_before = int(0)
@@ -237,24 +237,24 @@ def make(name, flags):
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-        summed = real(0.0)
+        strand_sum = real(0.0)
         if STRANDED:
             r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS
         else:
             r = tile_ray(item, spread)
         while r < size:
-            own = terms
+            bin_terms = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, from_pose, ray, (before + r) * cone_rays, cone_rays, critical,
-                    limit, bins, slack, tolerance,
+                    map_table, normals, rows, cols, cell, sensor_pose, ray, (before + r) * cone_rays, cone_rays,
+                    critical, limit, bins, slack, tolerance,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
-                    own = incidence_terms(terms, edges, kinds, heard.cosine)
+                    bin_terms = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
                 t = cast_ray(
-                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                    map_table, rows, cols, cell, sensor_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
                 )
             expected = expected_range(t, limit, resolution, range_max)
             k = r
@@ -264,9 +264,9 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             while k < end:
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
+                term = reading_term(z, expected, bin_terms, sensor, cells, per_metre, range_max)
                 if STRANDED:
-                    summed += term
+                    strand_sum += term
                 else:
                     put(parts, place * across + k * along, term)
                 k += 1
@@ -275,8 +275,8 @@ def make(name, flags):
                 # Past a block's or the scan's end.
                 if r >= size or (r & (BLOCK_TERMS - STRANDS)) == 0:
                     q = (r - STRANDS) // BLOCK_TERMS * STRANDS + (r & (STRANDS - 1))
-                    put(parts, place * across + q * along, summed)
-                    summed = ZERO
+                    put(parts, place * across + q * along, strand_sum)
+                    strand_sum = ZERO
                     r += ((1 << spread) - 1) * BLOCK_TERMS
             else:
                 r += tile_step(spread)

@@ -57,7 +57,7 @@ def make(name, flags):
     # log(erfc(x) / 2), by an asymptotic series where erfc is about to vanish.
     @wp.func
     def log_above(x: vec2):
-        found = real(0.0)
+        log_half = real(0.0)
         if x.x > LARGE:
             t = HALF / (x.x * x.x)
             series = real(1.0)
@@ -66,10 +66,10 @@ def make(name, flags):
                 series = ONE - real(2 * n - 1) * t * series
                 n -= 1
             square = bounded_square(x)
-            found = -square.x - (wp.log(x.x) + LOG_TWO_ROOT_PI - wp.log(series) + square.y)
+            log_half = -square.x - (wp.log(x.x) + LOG_TWO_ROOT_PI - wp.log(series) + square.y)
         else:
-            found = wp.log(HALF * wp.erfc(x.x))
-        return found
+            log_half = wp.log(HALF * wp.erfc(x.x))
+        return log_half
 
     # Log probability that a segment is pressed, or that it is not.
     @wp.func
@@ -106,7 +106,7 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
+        sensor_pose = pose[n]
         low = vec4()
         if CAREFUL:
             low = pose_low[n]
@@ -116,7 +116,7 @@ def make(name, flags):
             nearest = NO_OBSTACLE
             i = start[s]
             while i < start[s + 1]:
-                end = find_end_point(own, low, point[i], point_low[i], ZERO, guard)
+                end = find_end_point(sensor_pose, low, point[i], point_low[i], ZERO, guard)
                 at = pose_cell[n] + end.cell
                 nearest = wp.min(nearest, table[field_cell(at.x, at.y, rows, cols)])
                 i += 1

@@ -63,14 +63,14 @@ def functions(flags):
     @wp.func
     def hit_normal(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, cell: wp.vec2i, r: Ray, t: real):
         if t == ZERO:
-            own = normal_at(normals, rows, cols, cell.x, cell.y)
-            if is_wall(own):
-                return own
+            start_normal = normal_at(normals, rows, cols, cell.x, cell.y)
+            if is_wall(start_normal):
+                return start_normal
         col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
         before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
-        found = normal_at(normals, rows, cols, col, before)
-        if is_wall(found):
-            return found
+        normal = normal_at(normals, rows, cols, col, before)
+        if is_wall(normal):
+            return normal
         until = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
         return normal_at(normals, rows, cols, col, until)
 

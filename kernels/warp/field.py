@@ -176,8 +176,8 @@ def make(name, flags):
         table: wp.array(dtype=real),
         origin: wp.vec2i,
         lowered: vec4,
-        from_pose: vec4,
-        from_low: vec4,
+        sensor_pose: vec4,
+        sensor_low: vec4,
         to: vec2,
         to_low: vec2,
         far: real,
@@ -194,7 +194,7 @@ def make(name, flags):
         near, off = rounded_cell(lowered, to)
         cell = wp.vec2i(near.x - ROUNDING_BITS, near.y - ROUNDING_BITS)
         if off > sure:
-            exact = end_point(from_pose, from_low, to, to_low, ZERO, guard)
+            exact = end_point(sensor_pose, sensor_low, to, to_low, ZERO, guard)
             cell = exact.cell
         return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
 
@@ -255,26 +255,26 @@ def make(name, flags):
         if n >= particles:
             return
         origin = pose_cell[n]
-        from_pose = pose[n]
-        from_low = vec4()
+        sensor_pose = pose[n]
+        sensor_low = vec4()
         if CAREFUL:
-            from_low = pose_low[n]
+            sensor_low = pose_low[n]
         begin = int(0)
         size = readings
-        lead = fixed
+        constant_term = fixed
         if SCANS:
             scan = (n + ahead) // per_scan
             begin = start[scan]
             size = start[scan + 1] - begin
-            lead = fixed_of[scan]
-        total = vec2(lead, ZERO)
+            constant_term = fixed_of[scan]
+        total = vec2(constant_term, ZERO)
         block = real(0.0)
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
         k = int(0)
         if QUICK:
             # A block's cells, then its look-ups. On processors the first loop becomes vectors, which takes a third of
             # the time; with points read as vec2, or a maximum in place of a count, it would not.
-            lowered = from_pose - vec4(HALF, HALF, ZERO, ZERO)
+            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, cols)
             sure = rounding_margin(guard)
             cells = block_cells()
@@ -291,7 +291,7 @@ def make(name, flags):
                 if doubtful > 0:
                     i = int(0)
                     while i < width:
-                        exact = end_point(from_pose, from_low, point[first + i], point_low[first + i], ZERO, guard)
+                        exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
                         cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, rows, cols)
                         i += 1
                 block = ZERO
@@ -310,7 +310,7 @@ def make(name, flags):
                 to_low = vec2()
                 if CAREFUL:
                     to_low = point_low[begin + k]
-                term = reading_value(table, origin, from_pose, from_low, to, to_low, terms, rows, cols, guard)
+                term = reading_value(table, origin, sensor_pose, sensor_low, to, to_low, terms, rows, cols, guard)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 block += term
@@ -355,12 +355,12 @@ def make(name, flags):
         if n >= particles:
             return
         origin = cell_at(pose_cell, n)
-        own = pose_at(pose, n)
-        low = vec4()
+        sensor_pose = pose_at(pose, n)
+        sensor_low = vec4()
         if CAREFUL:
-            low = pose_at(pose_low, n)
+            sensor_low = pose_at(pose_low, n)
         if QUICK:
-            lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, cols)
             far = number_at(terms, 3)
         before = int(0)
@@ -376,9 +376,9 @@ def make(name, flags):
             begin = before + block * BLOCK_TERMS
             end = wp.min(begin + BLOCK_TERMS, before + size)
             total = real(0.0)
-            own_guard = number_at(guard, guards + block)
+            block_guard = number_at(guard, guards + block)
             if QUICK:
-                sure = rounding_margin(own_guard)
+                sure = rounding_margin(block_guard)
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
                     if SCANS:
@@ -390,11 +390,11 @@ def make(name, flags):
                     else:
                         # Points of one scan begin where two of them can be read at once.
                         for i in range(HALF_BLOCK):
-                            both = two_at(point, begin + 2 * i)
-                            value, off = quick_value(table, start_cell, lowered, vec2(both.x, both.y), far, rows, cols)
+                            pair = two_at(point, begin + 2 * i)
+                            value, off = quick_value(table, start_cell, lowered, vec2(pair.x, pair.y), far, rows, cols)
                             worst = wp.max(worst, off)
                             total += value
-                            value, off = quick_value(table, start_cell, lowered, vec2(both.z, both.w), far, rows, cols)
+                            value, off = quick_value(table, start_cell, lowered, vec2(pair.z, pair.w), far, rows, cols)
                             worst = wp.max(worst, off)
                             total += value
                 else:
@@ -411,8 +411,9 @@ def make(name, flags):
                     while k < end:
                         to, to_low = point_at(point, k), point_at(point_low, k)
                         total += careful_value(
-                            table, origin, lowered, own, low, to, to_low, far, rows, cols, own_guard, sure
-                        )
+                            table, origin, lowered, sensor_pose, sensor_low, to, to_low, far, rows, cols, block_guard,
+                            sure,
+                        )  # fmt: skip
                         k += 1
             else:
                 k = begin
@@ -421,7 +422,9 @@ def make(name, flags):
                     if CAREFUL:
                         to_low = point_at(point_low, k)
                     to = point_at(point, k)
-                    total += reading_value(table, origin, own, low, to, to_low, terms, rows, cols, own_guard)
+                    total += reading_value(
+                        table, origin, sensor_pose, sensor_low, to, to_low, terms, rows, cols, block_guard
+                    )
                     k += 1
             parts[n * across + block * along] = total
             block += 1 << spread

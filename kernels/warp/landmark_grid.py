@@ -45,7 +45,7 @@ def functions(flags):
     # and the sum of densities relative to found.
     @wp.struct
     class Match:
-        found: real
+        log_p: real
         best: real
         chosen: wp.int32
         total: vec2
@@ -58,10 +58,10 @@ def functions(flags):
     # Whether a landmark lies in a feature's disc, no farther than what may still matter (squared), and within the
     # limits of the sensor that it does not measure.
     @wp.func
-    def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), one: wp.int32, most: real):
-        reach = feature[one + REACH]
-        radius = feature[one + RADIUS]
-        hole = feature[one + HOLE]
+    def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, most: real):
+        reach = feature[base + REACH]
+        radius = feature[base + RADIUS]
+        hole = feature[base + HOLE]
         x = off[0] - reach * turned[0]
         y = off[2] - reach * turned[2]
         squared = off[0] * off[0] + off[2] * off[2]
@@ -69,36 +69,36 @@ def functions(flags):
         if apart > radius * radius or squared < hole * hole:
             return False
         # That bound is for the end point itself.
-        if reach > ZERO and reach == feature[one + RANGE_AT] and apart > most:
+        if reach > ZERO and reach == feature[base + RANGE_AT] and apart > most:
             return False
         d = wp.sqrt(squared)
-        return d <= feature[one + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[one + AXIS] * d
+        return d <= feature[base + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[base + AXIS] * d
 
     # Square of the radius around a feature's end point outside which exponents are larger than some: with r the error
     # of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b)
     # is at most b^2. A little is added for what rounding takes from such distances.
     @wp.func
-    def squared_reach(exponent: real, feature: wp.array(dtype=real), one: wp.int32):
-        found = real(0.0)
+    def squared_reach(exponent: real, feature: wp.array(dtype=real), base: wp.int32):
+        squared = real(0.0)
         if exponent > ZERO:
-            r = wp.sqrt(exponent) * feature[one + RANGE_SPREAD]
-            b = wp.sqrt(exponent) * feature[one + BEARING_SPREAD]
-            z = feature[one + RANGE_AT]
-            found = WIDER * (r * r + z * (z + r) * (b * b)) + feature[one + SLACK]
-        return found
+            r = wp.sqrt(exponent) * feature[base + RANGE_SPREAD]
+            b = wp.sqrt(exponent) * feature[base + BEARING_SPREAD]
+            z = feature[base + RANGE_AT]
+            squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + SLACK]
+        return squared
 
     # A match and one more landmark.
     @wp.func
     def with_landmark(match: Match, log_p: real, j: wp.int32):
         if MARGINAL:
-            if wp.isinf(match.found):
-                match.found = log_p
+            if wp.isinf(match.log_p):
+                match.log_p = log_p
                 match.total = vec2(wp.where(wp.isinf(log_p), ZERO, ONE), ZERO)
-            elif log_p > match.found + RELATIVE:
-                match.total = match.total * wp.exp(match.found - log_p) + vec2(ONE, ZERO)
-                match.found = log_p
+            elif log_p > match.log_p + RELATIVE:
+                match.total = match.total * wp.exp(match.log_p - log_p) + vec2(ONE, ZERO)
+                match.log_p = log_p
             else:
-                match.total = add_term(match.total, wp.exp(log_p - match.found))
+                match.total = add_term(match.total, wp.exp(log_p - match.log_p))
         if log_p > match.best:
             match.best = log_p
             match.chosen = j
@@ -112,7 +112,7 @@ def functions(flags):
         place: vec4,
         turned: vec4,
         feature: wp.array(dtype=real),
-        one: wp.int32,
+        base: wp.int32,
         terms: wp.array(dtype=real),
         arcs: wp.array(dtype=vec2),
         rows: wp.int32,
@@ -120,12 +120,12 @@ def functions(flags):
         size: real,
     ):
         match = Match()
-        match.found = NEVER
+        match.log_p = NEVER
         match.best = NEVER
         match.chosen = -1
         match.total = vec2(ZERO, ZERO)
-        reach = feature[one + REACH]
-        radius = feature[one + RADIUS]
+        reach = feature[base + REACH]
+        radius = feature[base + RADIUS]
         if radius < ZERO:
             return match
         # What cannot be likelier than the best so far is not evaluated.
@@ -141,17 +141,19 @@ def functions(flags):
             last = start[row * cols + right + 1]
             while j < last:
                 off = offset(landmark[j], place)
-                if near(off, turned, feature, one, most):
-                    match = with_landmark(match, log_detection(off, turned, feature, one, signature[j], terms, arcs), j)
+                if near(off, turned, feature, base, most):
+                    match = with_landmark(
+                        match, log_detection(off, turned, feature, base, signature[j], terms, arcs), j
+                    )
                     if not MARGINAL:
-                        most = squared_reach(feature[one + MOST] - match.best, feature, one)
+                        most = squared_reach(feature[base + MOST] - match.best, feature, base)
                 j += 1
             row += 1
         if MARGINAL:
-            if not wp.isinf(match.found):
-                match.found = match.found + wp.log(match.total[0] + match.total[1])
+            if not wp.isinf(match.log_p):
+                match.log_p = match.log_p + wp.log(match.total[0] + match.total[1])
         else:
-            match.found = match.best
+            match.log_p = match.best
         return match
 
     return SimpleNamespace(bucket_at=bucket_at, near=near, search=search)

@@ -59,19 +59,19 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
+        high = pose[n]
         low = pose_low[n]
-        place = sensor_place(pose_cell[n], own, low, size)
+        place = sensor_place(pose_cell[n], high, low, size)
         sums = n * sets
-        who = n * sets * features
+        begin = n * sets * features
         i = int(0)
         while i < sets:
             best[sums + i] = wp.where(i == 0, ZERO, NEVER)
             i += 1
         i = int(0)
         while i < sets * features:
-            choice[who + i] = -1
-            value[who + i] = NEVER
+            choice[begin + i] = -1
+            value[begin + i] = NEVER
             i += 1
         log_each = LogEach()
         j = int(0)
@@ -79,13 +79,13 @@ def make(name, flags):
             off = offset(landmark[j], place)
             k = int(0)
             while k < features:
-                one = FEATURE * k
-                turned = direction(own, low, feature, one)
+                base = FEATURE * k
+                turned = direction(high, low, feature, base)
                 log_each[k] = NEVER
-                if feature[one + RADIUS] >= ZERO:
-                    if near(off, turned, feature, one, EVERYWHERE):
-                        found = log_detection(off, turned, feature, one, signature[j], terms, arcs)
-                        log_each[k] = either(found, feature[one + FALSE_POSITIVE])
+                if feature[base + RADIUS] >= ZERO:
+                    if near(off, turned, feature, base, EVERYWHERE):
+                        detected = log_detection(off, turned, feature, base, signature[j], terms, arcs)
+                        log_each[k] = either(detected, feature[base + FALSE_POSITIVE])
                 k += 1
             # From the full set down: the smaller sets do not have this landmark yet.
             s = sets - 1
@@ -100,11 +100,11 @@ def make(name, flags):
                             i = int(0)
                             while i < features:
                                 if i == k:
-                                    choice[who + s * features + i] = j
-                                    value[who + s * features + i] = log_each[k]
+                                    choice[begin + s * features + i] = j
+                                    value[begin + s * features + i] = log_each[k]
                                 else:
-                                    choice[who + s * features + i] = choice[who + less * features + i]
-                                    value[who + s * features + i] = value[who + less * features + i]
+                                    choice[begin + s * features + i] = choice[begin + less * features + i]
+                                    value[begin + s * features + i] = value[begin + less * features + i]
                                 i += 1
                     k += 1
                 s -= 1
@@ -127,10 +127,10 @@ def make(name, flags):
         if PER_BEAM:
             k = int(0)
             while k < features:
-                j = choice[who + chosen * features + k]
+                j = choice[begin + chosen * features + k]
                 which[n * features + k] = j
                 parts[n * features + k] = wp.where(
-                    j >= 0, value[who + chosen * features + k], feature[FEATURE * k + FALSE_POSITIVE]
+                    j >= 0, value[begin + chosen * features + k], feature[FEATURE * k + FALSE_POSITIVE]
                 )
                 k += 1
 

@@ -56,37 +56,37 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
+        high = pose[n]
         low = pose_low[n]
-        place = sensor_place(pose_cell[n], own, low, size)
+        place = sensor_place(pose_cell[n], high, low, size)
         total = vec2(fixed, ZERO)
-        lost = bool(False)
+        impossible = bool(False)
         first = int(0)
         while first < features:
             last = wp.min(first + error_free.BLOCK_TERMS, features)
             block = real(0.0)
             k = first
             while k < last:
-                one = FEATURE * k
-                turned = direction(own, low, feature, one)
-                found = real(0.0)
+                base = FEATURE * k
+                turned = direction(high, low, feature, base)
+                detected = real(0.0)
                 best = real(0.0)
                 chosen = int(0)
                 if KNOWN:
                     chosen = partner[k]
-                    found = log_detection(
-                        offset(landmark[chosen], place), turned, feature, one, signature[chosen], terms, arcs
+                    detected = log_detection(
+                        offset(landmark[chosen], place), turned, feature, base, signature[chosen], terms, arcs
                     )
                 else:
                     match = search(
-                        landmark, signature, start, place, turned, feature, one, terms, arcs, rows, cols, size
+                        landmark, signature, start, place, turned, feature, base, terms, arcs, rows, cols, size
                     )
-                    found = match.found
+                    detected = match.log_p
                     best = match.best
                     chosen = match.chosen
-                value = either(found + share, feature[one + FALSE_POSITIVE])
+                value = either(detected + share, feature[base + FALSE_POSITIVE])
                 if wp.isinf(value):
-                    lost = True
+                    impossible = True
                 else:
                     block += value
                 if PER_BEAM:
@@ -94,10 +94,10 @@ def make(name, flags):
                     if KNOWN:
                         which[n * features + k] = chosen
                     else:
-                        which[n * features + k] = wp.where(best + share >= feature[one + FALSE_POSITIVE], chosen, -1)
+                        which[n * features + k] = wp.where(best + share >= feature[base + FALSE_POSITIVE], chosen, -1)
                 k += 1
             total = add_term(total, block)
             first = last
-        log_p[n] = wp.where(lost, NEVER, temperature * (total[0] + total[1]))
+        log_p[n] = wp.where(impossible, NEVER, temperature * (total[0] + total[1]))
 
     return {"score_features": score_features}[name]

@@ -47,10 +47,10 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
-        place = sensor_place(pose_cell[n], own, pose_low[n], size)
-        cosine = own[2] * axis_cosine - own[3] * axis_sine
-        sine = own[3] * axis_cosine + own[2] * axis_sine
+        sensor_pose = pose[n]
+        place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], size)
+        cosine = sensor_pose[2] * axis_cosine - sensor_pose[3] * axis_sine
+        sine = sensor_pose[3] * axis_cosine + sensor_pose[2] * axis_sine
         left = bucket_at(place[0] - range_max, size, cols)
         right = bucket_at(place[0] + range_max, size, cols)
         high = bucket_at(place[2] + range_max, size, rows)

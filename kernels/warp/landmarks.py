@@ -75,11 +75,11 @@ def functions(flags):
 
     # Direction in the world in which a feature was seen: the heading, turned by the bearing.
     @wp.func
-    def direction(pose: vec4, pose_low: vec4, feature: wp.array(dtype=real), one: wp.int32):
-        c = feature[one + COSINE]
-        s = feature[one + SINE]
-        c_low = feature[one + COSINE_LOW]
-        s_low = feature[one + SINE_LOW]
+    def direction(pose: vec4, pose_low: vec4, feature: wp.array(dtype=real), base: wp.int32):
+        c = feature[base + COSINE]
+        s = feature[base + SINE]
+        c_low = feature[base + COSINE_LOW]
+        s_low = feature[base + SINE_LOW]
         cc = two_product(pose[2], c)
         ss = two_product(pose[3], s)
         cs = two_product(pose[2], s)
@@ -199,7 +199,7 @@ def functions(flags):
         off: vec4,
         turned: vec4,
         feature: wp.array(dtype=real),
-        one: wp.int32,
+        base: wp.int32,
         signature: vec4,
         terms: wp.array(dtype=real),
         arcs: wp.array(dtype=vec2),
@@ -209,37 +209,37 @@ def functions(flags):
         norm = real(0.0)
         d = distance_pair(off)
         if RANGE:
-            if feature[one + RANGE_SCALE] > ZERO:
-                first = two_sum(d[0], -feature[one + RANGE_AT])
-                r = two_sum(first[0], first[1] + (d[1] - feature[one + RANGE_LOW]))
-                exponent = add_square(exponent, r, feature[one + RANGE_SCALE], feature[one + RANGE_SCALE_LOW])
-                mass = range_mass(d, feature[one + RANGE_SCALE], terms)
+            if feature[base + RANGE_SCALE] > ZERO:
+                first = two_sum(d[0], -feature[base + RANGE_AT])
+                r = two_sum(first[0], first[1] + (d[1] - feature[base + RANGE_LOW]))
+                exponent = add_square(exponent, r, feature[base + RANGE_SCALE], feature[base + RANGE_SCALE_LOW])
+                mass = range_mass(d, feature[base + RANGE_SCALE], terms)
         if BEARING:
-            if feature[one + BEARING_SCALE] > ZERO:
+            if feature[base + BEARING_SCALE] > ZERO:
                 if d[0] > ZERO_RANGE:
                     angle = angle_pair(across(off, turned), along(off, turned), arcs)
                     exponent = add_square(
-                        exponent, angle, feature[one + BEARING_SCALE], feature[one + BEARING_SCALE_LOW]
+                        exponent, angle, feature[base + BEARING_SCALE], feature[base + BEARING_SCALE_LOW]
                     )
                     if FIELD:
                         mass = mass * field_mass(
                             angle,
-                            feature[one + UPPER],
-                            feature[one + UPPER_LOW],
-                            feature[one + BEARING_SCALE],
+                            feature[base + UPPER],
+                            feature[base + UPPER_LOW],
+                            feature[base + BEARING_SCALE],
                             terms,
                             arcs,
                         )
                 else:
                     # The density is 1 / field, which is the peak over that.
-                    mass = mass * (terms[3] * feature[one + BEARING_SCALE])
+                    mass = mass * (terms[3] * feature[base + BEARING_SCALE])
         if SIGNATURE:
-            if feature[one + SIGNATURE_SCALE] > ZERO:
-                away = two_sum(feature[one + SIGNATURE_AT], -signature[0])
-                s = two_sum(away[0], away[1] + (feature[one + SIGNATURE_LOW] - signature[1]))
-                exponent = add_square(exponent, s, feature[one + SIGNATURE_SCALE], feature[one + SIGNATURE_SCALE_LOW])
+            if feature[base + SIGNATURE_SCALE] > ZERO:
+                away = two_sum(feature[base + SIGNATURE_AT], -signature[0])
+                s = two_sum(away[0], away[1] + (feature[base + SIGNATURE_LOW] - signature[1]))
+                exponent = add_square(exponent, s, feature[base + SIGNATURE_SCALE], feature[base + SIGNATURE_SCALE_LOW])
                 norm = signature[2]
-        log_p = (feature[one + PEAK] - exponent[0]) + ((feature[one + PEAK_LOW] - exponent[1]) + norm)
+        log_p = (feature[base + PEAK] - exponent[0]) + ((feature[base + PEAK_LOW] - exponent[1]) + norm)
         if mass != ONE:
             log_p = log_p - wp.log(mass)
         return log_p

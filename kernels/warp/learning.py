@@ -163,7 +163,7 @@ def make(name, flags):
         if block >= blocks:
             return
         total = sums_type()
-        lost = sums_type()
+        total_low = sums_type()
         first = int(0)
         while first < readings:
             last = wp.min(first + BLOCK_TERMS, readings)
@@ -177,12 +177,12 @@ def make(name, flags):
             # add_term of all sums at once.
             head = total + part
             shift = head - total
-            lost += (total - (head - shift)) + (part - shift)
+            total_low += (total - (head - shift)) + (part - shift)
             total = head
             first += BLOCK_TERMS
         j = int(0)
         while j < SUMS:
-            sums[block * width + j] = total[j] + lost[j]
+            sums[block * width + j] = total[j] + total_low[j]
             j += 1
 
     # One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.

@@ -40,9 +40,9 @@ def functions(flags):
     def either(a: real, b: real):
         high = wp.max(a, b)
         low = wp.min(a, b)
-        found = high
+        log_sum = high
         if not wp.isinf(high):
-            found = high + log_one_plus(wp.exp(low - high))
-        return found
+            log_sum = high + log_one_plus(wp.exp(low - high))
+        return log_sum
 
     return SimpleNamespace(bounded_square=bounded_square, log_one_plus=log_one_plus, either=either)

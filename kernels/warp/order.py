@@ -100,17 +100,17 @@ def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32
     stretch = work_item(wp.tid())
     if stretch >= ALL_BINS // STRETCH:
         return
-    own = stretch * STRETCH
+    begin = stretch * STRETCH
     # All are read before any is added, so that a work-item waits once for them.
     counts = stretch_counts()
     for i in range(EACH):
-        counts[i] = bins[own + i]
+        counts[i] = bins[begin + i]
     total = int(0)
     for i in range(EACH):
         total += counts[i]
     start = int(wp.atomic_add(bounds, 6, total))
     for i in range(EACH):
-        bins[own + i] = start
+        bins[begin + i] = start
         start += counts[i]
 
 

@@ -109,8 +109,8 @@ def functions(flags):
 @functools.cache
 def make(name, flags):
     """The kernel place_poses specialised by the flags."""
-    vec4, own = precision(flags).vec4, functions(flags)
-    place_pose, coordinate = own.place_pose, own.coordinate
+    vec4, placing = precision(flags).vec4, functions(flags)
+    place_pose, coordinate = placing.place_pose, placing.coordinate
 
     # One work-item a particle.
     @kernel

@@ -53,9 +53,9 @@ def reader(dtype, count=1):
     vectors are loaded whole; on processors they are not, whose compilers make no vectors of loops that load vectors.
     With a count so many neighbours are read as one vector; i must be a multiple of it.
     """
-    own = getattr(dtype, "_length_", 1)
+    per_element = getattr(dtype, "_length_", 1)
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
-    one, length = _C_TYPES[scalar], own * count
+    one, length = _C_TYPES[scalar], per_element * count
     if length == 1:
         loads, whole, single = [], "__ldg(values.data + i)", "values.data[i]"
     else:
@@ -67,13 +67,13 @@ def reader(dtype, count=1):
         ]
         numbers = ", ".join(f"part{k}.{name}" for k in range(length // width) for name in "xyzw"[:width])
         whole = f"wp::vec_t<{length}, {one}>({numbers})"
-        numbers = ", ".join(f"values.data[i + {k // own}].c[{k % own}]" for k in range(length))
+        numbers = ", ".join(f"values.data[i + {k // per_element}].c[{k % per_element}]" for k in range(length))
         single = f"wp::vec_t<{length}, {one}>({numbers})"
     lines = ["#if defined(__CUDA_ARCH__)", *loads, f"return {whole};", "#else", f"return {single};", "#endif", ""]
-    found = dtype if count == 1 else wp.types.vector(length=length, dtype=scalar)
+    result = dtype if count == 1 else wp.types.vector(length=length, dtype=scalar)
 
     @wp.func_native("\n".join(lines))
-    def read(values: wp.array(dtype=dtype), i: wp.int32) -> found: ...
+    def read(values: wp.array(dtype=dtype), i: wp.int32) -> result: ...
 
     return read
 

@@ -94,10 +94,10 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         cell = cell_at(pose_cell, n)
-        own = pose_at(pose, n)
+        sensor_pose = pose_at(pose, n)
         k = tile_ray(item, spread)
         while k < rays:
-            t = cast_ray(map_table, rows, cols, cell, own, ray_at(ray, k), limit, bins, slack, tolerance)
+            t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray_at(ray, k), limit, bins, slack, tolerance)
             put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
             k += tile_step(spread)
 

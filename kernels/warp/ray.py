@@ -145,8 +145,8 @@ def functions(flags):
     # Angle bin whose centre is nearest; centres are at 0, 1 / bins, ... of a turn.
     @wp.func
     def angle_bin(direction: vec2, bins: wp.int32):
-        found = int(turn_of(direction) * real(bins) + HALF)
-        return wp.where(found >= bins, found - bins, found)
+        index = int(turn_of(direction) * real(bins) + HALF)
+        return wp.where(index >= bins, index - bins, index)
 
     # Metres from cells: exactly range_max where nothing is nearer.
     @wp.func

@@ -148,10 +148,10 @@ def rectangles_rows(
                 lower = int(0)
                 if width < LONGEST and other >= 0 and other < cols:
                     lower = wp.min(height, int(runs[run + other]))
-                found = wp.where(width > 0, width + 256 * height, OCCUPIED)
+                sides = wp.where(width > 0, width + 256 * height, OCCUPIED)
                 if lower * middle[1] > width * middle[0]:
-                    found = width + 1 + 256 * lower
-                rectangles[out + padded(row, col, cols)] = wp.uint16(found)
+                    sides = width + 1 + 256 * lower
+                rectangles[out + padded(row, col, cols)] = wp.uint16(sides)
 
 
 # For parallel devices, one work-item a cell from begin to before end: free cells of the row, to the right (direction 0)
@@ -224,10 +224,10 @@ def rectangles_scan(
         if height <= room:
             narrower = wp.min(width, int(runs[run + (height - 1) * step]))
         while sector < sectors and narrower * middle[0] < height * middle[1]:
-            found = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
+            sides = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
             if narrower * middle[0] > (height - 1) * middle[1]:
-                found = narrower + 256 * height
-            rectangles[out + sector * plane] = wp.uint16(found)
+                sides = narrower + 256 * height
+            rectangles[out + sector * plane] = wp.uint16(sides)
             sector += 1
             middle = slope(sectors, sector)
         width = narrower

@@ -74,15 +74,15 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        given_x = wp.float64(poses[3 * n])
-        given_y = wp.float64(poses[3 * n + 1])
+        pose_x = wp.float64(poses[3 * n])
+        pose_y = wp.float64(poses[3 * n + 1])
         theta = wp.float64(poses[3 * n + 2])
-        if not ((given_x - given_x) + (given_y - given_y) + (theta - theta) == ZERO):
+        if not ((pose_x - pose_x) + (pose_y - pose_y) + (theta - theta) == ZERO):
             wp.atomic_max(verdict, 0, 1)
             place[n] = vec4()
             return
-        x = two_sum(given_x, -origin_x)
-        y = two_sum(given_y, -origin_y)
+        x = two_sum(pose_x, -origin_x)
+        y = two_sum(pose_y, -origin_y)
         near = wp.abs(x.x) <= FARTHEST and wp.abs(y.x) <= FARTHEST
         if near and (mount_x != ZERO or mount_y != ZERO):
             turned = cos_sin(theta)

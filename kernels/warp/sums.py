@@ -52,19 +52,19 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         part = place * across
-        own = count
-        lead = fixed
+        size = count
+        constant_term = fixed
         if SCANS:
-            own = counts[n // per_scan]
+            size = counts[n // per_scan]
             if STRANDED:
-                own = own // BLOCK_TERMS * STRANDS + wp.min(own % BLOCK_TERMS, STRANDS)
-            lead = fixed_of[n // per_scan]
-        total = vec2(lead, ZERO)
+                size = size // BLOCK_TERMS * STRANDS + wp.min(size % BLOCK_TERMS, STRANDS)
+            constant_term = fixed_of[n // per_scan]
+        total = vec2(constant_term, ZERO)
         first = int(0)
-        while first < own:
+        while first < size:
             term = block_terms()
             for i in range(BLOCK_TERMS):
-                if first + i < own:
+                if first + i < size:
                     term[i] = number_at(parts, part + (first + i) * along)
             if block == 1:
                 for i in range(BLOCK_TERMS):

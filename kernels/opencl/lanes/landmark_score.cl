@@ -27,14 +27,15 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
         const int last = min(first + BLOCK_TERMS, features);
         lanes block = 0;
         for (int k = first; k < last; ++k) {
-            global const real *seen = feature + FEATURE * k;
-            const LanePlace turned = direction_lanes(heading, seen);
+            global const real *numbers = feature + FEATURE * k;
+            const LanePlace turned = direction_lanes(heading, numbers);
 #if KNOWN
-            const lanes detected = log_detection_lanes(offset_lanes(landmark[partner[k]], place), turned, seen, terms);
+            const lanes detected = log_detection_lanes(offset_lanes(landmark[partner[k]], place), turned, numbers,
+                                                       terms);
 #else
-            const lanes detected = search_lanes(landmark, start, place, turned, seen, terms, rows, cols, size);
+            const lanes detected = search_lanes(landmark, start, place, turned, numbers, terms, rows, cols, size);
 #endif
-            const lanes value = either_lanes(detected, seen[FALSE_POSITIVE]);
+            const lanes value = either_lanes(detected, numbers[FALSE_POSITIVE]);
             const ilanes zero = !(value > -INFINITY);
             impossible |= zero;
             block += zero ? (lanes)0 : value;

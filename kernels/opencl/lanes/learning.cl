@@ -102,6 +102,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     sums[39] += r_short * s_l * s_l;
 #endif
 }
+
 // One work-item takes a block of pairs, which are contiguous (along is 1) and fill all lanes.
 kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
                    global real *sums, const int blocks, const int readings, const int across, const int along,
@@ -109,19 +110,19 @@ kernel void e_step(global const real *reading, global const real *expected, glob
     const int block = get_global_id(0);
     if (block >= blocks) return;
     global const real *z = reading + (long)block * across, *z_star = expected + (long)block * across;
-    real total[SUMS], lost[SUMS];
+    real total[SUMS], total_low[SUMS];
     lanes part[SUMS];
-    for (int j = 0; j < SUMS; ++j) total[j] = lost[j] = 0;
+    for (int j = 0; j < SUMS; ++j) total[j] = total_low[j] = 0;
     for (int first = 0; first < readings; first += BLOCK_TERMS * LANES) {
         const int last = min(first + BLOCK_TERMS * LANES, readings);
         for (int j = 0; j < SUMS; ++j) part[j] = 0;
-        for (int k = first; k < last; k += LANES) add_pair_lanes(load_lanes(0, z + k), load_lanes(0, z_star + k),
-                                                                 terms, part);
+        for (int k = first; k < last; k += LANES)
+            add_pair_lanes(load_lanes(0, z + k), load_lanes(0, z_star + k), terms, part);
         for (int j = 0; j < SUMS; ++j) {
-            const real2 sum = add_term((real2)(total[j], lost[j]), sum_lanes(part[j]));
+            const real2 sum = add_term((real2)(total[j], total_low[j]), sum_lanes(part[j]));
             total[j] = sum.x;
-            lost[j] = sum.y;
+            total_low[j] = sum.y;
         }
     }
-    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + lost[j];
+    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + total_low[j];
 }

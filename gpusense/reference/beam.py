@@ -81,9 +81,9 @@ def score_beams(
     per_scan: int,
     ahead: int,
 ) -> None:
-    """Readings of ray r are first[r] to first[r + 1] - 1; what does not depend on the pose is fixed.
+    """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and fixed is the constant term.
 
-    Of several scans each has its rays from start on, and first counts the readings of all where rays are shared.
+    With SCANS, the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
     """
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, per_scan, ahead):
@@ -159,9 +159,9 @@ def beam_tiles(
     spread: int,
     per_scan: int,
 ) -> None:
-    """What each reading adds, at parts[place * across + k * along], which GPUs find in tiles of particles and rays.
+    """Write the term of reading k to parts[place * across + k * along]; GPUs do so in tiles of particles and rays.
 
-    With STRANDED it is the sum of each strand, in place of that of reading k.
+    With STRANDED the number there is the sum of strand k.
     """
     places = np.arange(particles)
     if "ORDERED" in flags:
@@ -195,7 +195,7 @@ def beam_tiles(
 def readings_of_scan(
     flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
 ) -> tuple[int, int, np.ndarray, np.ndarray]:
-    """One of several scans: its first ray, how many it has, where their readings begin, and these."""
+    """Return one of several scans: its first ray, the number of its rays, the first reading of each, and the readings."""
     begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
     if "SHARED_RAYS" not in flags:
         return begin, rays, np.arange(rays + 1), reading[begin:]
@@ -210,9 +210,9 @@ def sum_terms(
     temperature: np.floating,
     plainly: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Sum of (M, K) terms and a fixed one, in the order of the beams, or its logarithm; -inf where one term is.
+    """Sum (M, K) terms and a constant one in the order of the beams; -inf where one of them is -inf.
 
-    What is added plainly is block_sums or strand_sums; these go to a compensated total.
+    ``plainly`` is block_sums or strand_sums, whose results are added to a compensated total.
     """
     finite = np.where(np.isneginf(term), 0, term).astype(term.dtype)
     total = (np.full(len(term), fixed, term.dtype), np.zeros(len(term), term.dtype))

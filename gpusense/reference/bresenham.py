@@ -1,7 +1,7 @@
 """Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end.
 
-So cast nav2_amcl and Beluga: distances are from cell centre to cell centre, and a line may pass between two cells that
-touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+nav2_amcl and Beluga cast in this manner. Distances are from cell centre to cell centre, and a line may pass between two
+cells that touch at a corner. The table holds 1 for occupied cells in a ring of twos.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+    """Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
 
     Args:
         flags: Flags of the signature table.

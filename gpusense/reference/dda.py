@@ -1,6 +1,6 @@
 """Expected range by the plain walk of Amanatides and Woo (1987), cell by cell.
 
-Exact, and the same bits as the exact caster's. The table holds 1 for occupied cells in a ring of twos.
+It is exact, with the same bits as the exact caster. The table holds 1 for occupied cells in a ring of twos.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to the first occupied cell, or limit where there is none nearer.
+    """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.

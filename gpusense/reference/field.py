@@ -1,6 +1,6 @@
 """Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 
-The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
+The table is padded by a ring of two cells for everything outside the grid, so no look-up needs a bounds test.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ BLOCK = 1 << 18
 
 
 def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
-    """a and b weighed by numbers of two parts; the terms are not negative, so small values keep their digits."""
+    """Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits."""
     if "SHARP" in flags:
         return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
     return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
@@ -25,7 +25,7 @@ def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: P
 def bilinear(
     flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, rows: int, cols: int
 ) -> Pair:
-    """Smooth distance between the four cell centres around an end point, in two parts."""
+    """Interpolate the distance between the four cell centres around an end point, in two parts."""
     zero = np.zeros_like(end.rest_x[0])
     a = table[field_cell(col, row, rows, cols)], zero
     b = table[field_cell(col + 1, row, rows, cols)], zero
@@ -37,10 +37,10 @@ def bilinear(
 
 
 def field_exponent(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
-    """terms = (hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1).
+    """Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
 
-    hit and rand are z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, or logs. Where the peak is high, exponent and
-    log peak nearly cancel.
+    ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1). hit is z_hit / (sigma
+    sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
     """
     if "SHARP" in flags:
         return pair_product(pair_product(distance, distance), (terms[1], terms[5]))
@@ -100,10 +100,10 @@ def fill_field(
     begin: int,
     stride: int,
 ) -> None:
-    """Values of cells of the table, from squared distances by a table of all squared distances up to the cap.
+    """Fill cells of the table from squared distances; density has a value for each squared distance up to the cap.
 
-    They are height x width cells, the first of them at begin, for squared distances from (from_row, from_col) on; what
-    lies beyond these is beyond.
+    They are height x width cells, the first of them at begin. The first cell is (from_row, from_col) of the grid; cells
+    outside the grid get beyond.
     """
     size = table.itemsize
     out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
@@ -137,7 +137,7 @@ def score_field(
     per_scan: int,
     ahead: int,
 ) -> None:
-    """The table holds log densities, or capped distances in metres where it is interpolated."""
+    """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, per_scan, ahead):
             first, last = start[scan], start[scan + 1]
@@ -182,7 +182,7 @@ def field_blocks(
     spread: int,
     per_scan: int,
 ) -> None:
-    """Sums of blocks of readings, at parts[n * across + block * along], which GPUs find one by one."""
+    """Write the sums of blocks of readings to parts[n * across + block * along]; GPUs compute them one by one."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, per_scan):
             first, last = start[scan], start[scan + 1]

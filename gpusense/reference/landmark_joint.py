@@ -1,8 +1,8 @@
-"""The likeliest joint association of a few features, in which no two of them are the same landmark.
+"""The likeliest joint association of a few features, in which no two features have the same landmark.
 
-Features without a landmark are false positives. Landmarks are taken one after the other; ``best[s]`` is the largest sum
-of log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may
-join one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+Features without a landmark are false positives. Landmarks are processed one after the other. A set s of features is a
+bit mask; ``best[s]`` is the largest sum of log p over the features of s when all of them have landmarks that were
+processed. A landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ def joint_features(
     fixed: np.floating,
     temperature: np.floating,
 ) -> None:
-    """``choice[s]`` has the landmark of each feature of a set, and its log p at ``value``; ``sets`` is 2^features."""
+    """Find the best joint associations; ``choice[s]`` and ``value[s]`` have landmark and log p of each feature of set
+    s.
+    """
     real = pose.dtype
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], size)
@@ -65,7 +67,7 @@ def joint_features(
                 detected = log_detection(flags, off, turned[k], numbers[k], signatures, terms, arcs)
                 detected = either(detected, numbers[k, FALSE_POSITIVE])
                 log_each[k] = np.where(near(off, turned[k], numbers[k]), detected, -np.inf)
-        # From the full set down: the smaller sets do not have this landmark yet.
+        # From the full set down, since smaller sets must not yet contain this landmark.
         for s in range(sets - 1, 0, -1):
             for k in range(features):
                 if s >> k & 1:

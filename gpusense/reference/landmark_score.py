@@ -16,7 +16,7 @@ from gpusense.reference.landmarks import (
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
 
-# Particles that are scored at once.
+# Particles per block.
 BLOCK = 1 << 14
 
 
@@ -45,10 +45,10 @@ def score_features(
     fixed: np.floating,
     temperature: np.floating,
 ) -> None:
-    """Sum of log p over features: with the partner that is KNOWN, of all (MARGINAL), or of the likeliest landmark.
+    """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
 
-    With PER_BEAM also what each feature adds, and its likeliest landmark's place in the buckets, -1 where a false
-    positive is likelier. ``share`` is log(1 / landmarks), the prior of each one with MARGINAL and else 0.
+    With PER_BEAM, ``parts`` has the term of each feature, and ``which`` the index of its likeliest landmark, -1 where a
+    false positive is likelier. With MARGINAL ``share`` is log(1 / landmarks), the prior of a landmark, else 0.
     """
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     for begin in range(0, particles, BLOCK):

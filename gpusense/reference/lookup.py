@@ -1,6 +1,7 @@
 """Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed").
 
-For each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+The table has, for each cell and bin, the range from the cell's centre in the bin's direction, in units of limit / 65
+535.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells as the table has it, or limit where there is no obstacle nearer.
+    """Return the distance in cells from the table, limit where no obstacle is nearer.
 
     Args:
         flags: Flags of the signature table.

@@ -1,9 +1,9 @@
 """Expected range by marching through the distance field (sphere tracing).
 
-At each place the ray steps by the distance from the cell's centre to the nearest obstacle's centre, less slack, and by
-tolerance at least. With slack sqrt(2) no step passes an obstacle but the least one, so a range is too long by at most
-tolerance, and an obstacle is missed only where the ray's way through it is shorter than that. With slack 0 (what other
-programs do) a step may pass obstacles.
+Each step is the distance from the current cell's centre to the nearest obstacle's centre less slack, and at least
+tolerance. With slack sqrt(2) only steps of length tolerance may pass an obstacle: a range is too long by at most
+tolerance, and an obstacle is missed only where the ray's path through it is shorter than that. With slack 0, as in
+other programs, any step may pass obstacles.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to a place in an occupied cell, or limit where none is found nearer.
+    """Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.

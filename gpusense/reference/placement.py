@@ -1,6 +1,6 @@
-"""Poses on their way into a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
+"""Places poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
 
-Only +, -, *, /, floor and comparisons are used, so that every device places a pose alike to the last bit.
+Only +, -, *, /, floor and comparisons are used, so that every device gives the same bits.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense.reference.heading import cos_sin
 
-# Cells farther off than this are as good as here: no range reaches them, and sums of two stay within int32.
+# Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
 FARTHEST = float(1 << 30)
 BLOCK = 1 << 12
 
@@ -40,9 +40,9 @@ def place_pose(
 ) -> None:
     """Place sensors: (M, 3) poses times the scanner's mount, without its yaw, which belongs to the bearings.
 
-    ``pose_low`` takes what rounding to the model's precision took from ``pose``. ``verdict``, which the caller clears,
-    becomes 1 where (0) a pose is not finite, (1) a sensor is outside the window. A pose that is not finite becomes the
-    farthest cell, fraction 0 and heading (1, 0): it sees nothing, and no index made of it is out of bounds.
+    ``pose_low`` gets the rounding errors (low parts) of ``pose``. ``verdict``, which the caller clears, becomes 1 at
+    (0) if a pose is not finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the
+    farthest cell, fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     """
     real = pose.dtype.type
     first, size = np.array([[first_col], [first_row]], np.int32), np.array([[cols], [rows]], np.int32)
@@ -70,7 +70,7 @@ def place_pose(
     rounded = exact.astype(real)
     # A fraction just below 1 may round to 1, which would be the next cell.
     rounded[:2] = np.minimum(rounded[:2], np.nextafter(real(1), real(0)))
-    # Column by column, which is faster than the transpose at once.
+    # Column by column: faster than a transpose at once.
     for axis in range(2):
         pose_cell[:, axis] = cell[axis]
     for column in range(4):

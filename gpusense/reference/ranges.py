@@ -14,7 +14,7 @@ CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LO
 
 
 def caster_of(flags: frozenset[str]) -> ModuleType:
-    """The module whose ``cast_ray`` a set of flags means."""
+    """Return the module of the caster of a set of flags."""
     return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
 
 
@@ -36,7 +36,7 @@ def cast_ranges(
     resolution: np.floating,
     range_max: np.floating,
 ) -> None:
-    """The expected ranges of all particles and rays."""
+    """Cast all rays of all particles."""
     cast_ray = caster_of(flags).cast_ray
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
@@ -68,7 +68,7 @@ def cast_tiles(
     range_max: np.floating,
     spread: int,
 ) -> None:
-    """The same, which GPUs do in tiles of particles and rays."""
+    """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
     cast_ranges(
         flags, map_table, pose_cell, pose, ray, ranges, rows, cols, particles, rays, bins, slack, tolerance, limit,
         resolution, range_max,

@@ -1,7 +1,7 @@
 """A ray on the grid and the walk along it, which all casters share.
 
-Crossing distances are ``(k + a) * inv`` with an integer count k of boundaries, never accumulated. Every operation is
-rounded as on the devices, so float32 ranges are theirs to the bit.
+Distances of boundaries are ``(k + a) * inv`` with an integer count k of boundaries; they are never accumulated. Every
+operation is rounded as on devices, so float32 ranges have the same bits.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Ray:
 
 
 def off_grid(at: np.ndarray, rows: int, cols: int) -> np.ndarray:
-    """Whether cells, (2, M) columns and rows, are none of the grid's."""
+    """Return whether cells, (2, M) columns and rows, lie outside the grid."""
     col, row = at
     return (col < 0) | (col >= cols) | (row < 0) | (row >= rows)
 
 
 def ray_direction(pose: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit direction in the grid's frame: pose (..., 4) = (frac x, frac y, cos, sin) turned by ray (..., 2)."""
+    """Return unit directions in the grid's frame: pose (..., 4) = (frac x, frac y, cos, sin) turned by ray (..., 2)."""
     cos, sin = pose[..., 2], pose[..., 3]
     dx = cos * ray[..., 0] - sin * ray[..., 1]
     dy = sin * ray[..., 0] + cos * ray[..., 1]
@@ -45,7 +45,7 @@ def ray_direction(pose: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def make_ray(pose: np.ndarray, ray: np.ndarray) -> Ray:
-    """Rays of (M, 4) poses and (M, 2) beams."""
+    """Make the rays of (M, 4) poses and (M, 2) beams."""
     direction = np.stack(ray_direction(pose, ray))
     ahead = direction >= 0
     speed = np.abs(direction)
@@ -54,9 +54,9 @@ def make_ray(pose: np.ndarray, ray: np.ndarray) -> Ray:
 
 
 def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, until: np.ndarray | bool) -> np.ndarray:
-    """Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
+    """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t.
 
-    Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
+    The coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
     """
     k = np.maximum(np.rint(t * speed - a), 0)
     here = (k + a) * inv
@@ -66,9 +66,9 @@ def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, un
 def start_walk(
     flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
+    """Return boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
 
-    The distance is limit where a ray from outside meets the grid no nearer.
+    The distance is limit where a ray from outside does not meet the grid before limit.
     """
     real = r.direction.dtype
     k, t = np.zeros(r.direction.shape, real), np.zeros(len(cell), real)
@@ -94,7 +94,7 @@ def start_walk(
 def start_casts(
     flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where all rays' walks start, and what is known of their ranges before a cell is read.
+    """Return the start of all walks, and the ranges that are known before any cell is read.
 
     Returns:
         Cells of the origins (2, M); boundaries crossed (2, M) and distances (M,) as of ``start_walk``; ranges found so
@@ -112,7 +112,7 @@ def start_casts(
 
 
 def turn_of(direction: np.ndarray) -> np.ndarray:
-    """(2, M) directions as parts of a full turn in [0, 1], to 2e-6."""
+    """Return (2, M) directions as parts of a full turn in [0, 1], within 2e-6."""
     real = direction.dtype.type
     x, y = np.abs(direction)
     a = np.where(x > y, y / x, x / y)
@@ -125,12 +125,12 @@ def turn_of(direction: np.ndarray) -> np.ndarray:
 
 
 def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
-    """Angle bins whose centres are nearest; centres are at 0, 1 / bins, ... of a turn."""
+    """Return the angle bins with the nearest centres; centres are at 0, 1 / bins, ... of a turn."""
     real = direction.dtype.type
     index = (turn_of(direction) * real(bins) + real(0.5)).astype(np.int64)
     return np.where(index >= bins, index - bins, index)
 
 
 def expected_range(t: np.ndarray, limit: np.floating, resolution: np.floating, range_max: np.floating) -> np.ndarray:
-    """Metres from cells: exactly range_max where nothing is nearer."""
+    """Convert a distance in cells to metres, exactly range_max where nothing is nearer."""
     return np.where(t >= limit, range_max, np.minimum(t * resolution, range_max))

@@ -1,7 +1,7 @@
-"""Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
+"""Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3).
 
-An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step in
-x first.
+It is an Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it
+steps in x first.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from gpusense.reference.rectangles import OCCUPIED, padded
 
 
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
-    """Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps."""
+    """Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not
+    change the result.
+    """
     if sectors == 1:
         return np.zeros(len(speed_x), np.intp)
     steep = speed_y > speed_x
@@ -36,7 +38,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to the first occupied cell, or limit where there is none nearer.
+    """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.

@@ -1,6 +1,6 @@
 """Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded.
 
-What is left of a large coordinate or of many turns is small, and small numbers keep their digits in any precision.
+The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any precision.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ import numpy as np
 from gpusense.reference.error_free import Pair, pair_sum, two_sum, where_pair
 from gpusense.reference.heading import LIMIT, QUARTER, QUARTER_LOW, cos_sin, reduce_huge, reduce_ordinary
 
-# Farther off than this is as good as here; squares of it are finite in float32.
+# Coordinates are clamped to this; its square is finite in float32.
 FARTHEST = float(1 << 60)
 
 
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:
-    """``theta - target`` in [-pi, pi]; the target is in there already."""
+    """Return ``theta - target`` in [-pi, pi]; the target is in that interval."""
     huge = np.abs(theta) > LIMIT
     quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
     if huge.any():
         quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
-    # Up to three quarters are exact: the last bits of one are 0.
+    # Up to three quarters are exact: the last bits of QUARTER are 0.
     quarters = quadrant.astype(np.float64)
     angle = pair_sum((quarters * QUARTER, quarters * QUARTER_LOW), rest)
     angle = pair_sum(angle, (-np.asarray(target[0]), -np.asarray(target[1])))
@@ -47,9 +47,9 @@ def place_relative(
     mount_y: float,
     particles: int,
 ) -> None:
-    """Places of sensors relative to an origin: x, its low part, y, its low part.
+    """Place sensors relative to an origin: x, its low part, y, its low part.
 
-    ``verdict``, which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
+    ``verdict``, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
     """
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
@@ -75,7 +75,7 @@ def wrap_headings(
     target_low: float,
     particles: int,
 ) -> None:
-    """Headings minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict as for places."""
+    """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers; verdict as for places."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():

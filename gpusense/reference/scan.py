@@ -1,8 +1,8 @@
-"""Poses and readings that are on the device.
+"""Places poses and readings that lie on the device.
 
-Which readings count and where they go is as ``gpusense.scan`` finds it on the host.
-Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
-is left at the end are missing readings (nan), which add nothing.
+Which readings count and where they go is as ``gpusense.scan`` finds it on the host. Readings that say nothing are left
+out and the others move up, so that sums over blocks of them have the same bits; what is left at the end are missing
+readings (nan), which add nothing.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.placement import place_poses
 
-# What max readings are: left out, in the constant, or evaluated like others.
+# Max readings are left out, part of the constant term, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
 
 

@@ -1,4 +1,4 @@
-"""Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings."""
+"""Sums of the terms of readings, or of blocks of readings, in the order of the readings."""
 
 from __future__ import annotations
 

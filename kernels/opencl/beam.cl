@@ -1,8 +1,8 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
-// Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
+// Readings whose density does not depend on the pose are not passed in: their sum is the constant term fixed.
 // requires: error_free caster echo tiles mixture sensor_table compat
 
-// What one reading adds to the sum.
+// Return the term of one reading in the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const int cells, const real per_metre, const real range_max) {
 #if ALL_READINGS
@@ -23,7 +23,7 @@ real reading_term(const real z, const real expected, global const real *terms, g
 #endif
 }
 
-// The scan's logarithm from its sum.
+// Return the logarithm of a scan from its sum.
 real scan_log(const real sum) {
 #if CUBES
     return log(sum);
@@ -32,8 +32,8 @@ real scan_log(const real sum) {
 #endif
 }
 
-// One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several scans
-// each has its rays from start on, and first counts the readings of all.
+// Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r + 1] -
+// 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
@@ -111,9 +111,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
 }
 
-// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], or with the flag
-// STRANDED the sum of each strand in place of that of reading k; fewer than 2^31 numbers. A work-item then takes whole
-// strands. What is told not to overlap need not be read again after each of them is written.
+// Write the term of reading k to parts[place * across + k * along], in tiles of particles and rays, for GPUs. With
+// STRANDED the number there is the sum of strand k, and a work-item takes whole strands. There are fewer than 2^31
+// numbers. With restrict the compiler need not read arguments again after a write.
 kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
                        global const int2 *restrict pose_cell, global const real4 *restrict pose,
                        global const int *restrict order, global const real2 *restrict ray,
@@ -177,7 +177,7 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
             sum += term;
             r += STRANDS;
             if (r >= size || (r & (BLOCK_TERMS - STRANDS)) == 0) {
-                // Past a block's or the scan's end.
+                // The end of a block or of the scan.
                 const int block = (r - STRANDS) / BLOCK_TERMS;
                 parts[place * across + (block * STRANDS + (r & (STRANDS - 1))) * along] = sum;
                 sum = 0;

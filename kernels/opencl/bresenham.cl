@@ -1,11 +1,11 @@
-// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as nav2_amcl and Beluga
-// cast: distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
+// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as in nav2_amcl and
+// Beluga. Distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
 // The table holds 1 for occupied cells in a ring of twos.
 // requires: rectangles ray
 
 typedef uchar entry;
 
-// Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+// Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const Ray r = make_ray(pose, ray);

@@ -1,18 +1,18 @@
-// Expected range by a compressed directional distance transform (Walsh and Karaman 2018): for each angle bin the map is
-// cut into lines of one cell's width along the bin's direction, and each line keeps in order where its obstacles begin.
-// A ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins.
-// Table of integers: number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from place
-// 1 + 3 bins where each line's obstacles begin in the table (bins * lines + 1 numbers); then a bit for each cell, set
-// where it is occupied; then the obstacles in 2^-10 cells.
+// Expected range by a compressed directional distance transform (Walsh and Karaman 2018). For each angle bin the map is
+// cut into lines of one cell's width along the bin's direction. Each line has the sorted positions at which obstacles
+// begin. A ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins. Table of integers:
+// number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from index 1 + 3 bins on, the
+// index of the first obstacle of each line (bins * lines + 1 numbers); then a bit for each cell, set where it is
+// occupied; then the obstacles in 2^-10 cells.
 // requires: ray
 
 typedef int entry;
 
 #define ENTRY_UNIT ((real)1024)
-// Beyond this many cells, more than any map has, one place is like another and counts still fit.
+// Coordinates are clamped to this many cells: no map has as many, and indices still fit.
 #define FARTHEST ((real)1048576)
 
-// Distance in cells to the first obstacle of the line, or limit where there is none nearer.
+// Return the distance in cells to the first obstacle of the line, limit where none is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const int lines = map_table[0];

@@ -1,12 +1,12 @@
-// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
-// The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
+// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point. The table is padded by a
+// ring of two cells for everything outside the grid, so no look-up needs a bounds test.
 // requires: end_point
 
-// Particles of a work-group of field_blocks.
+// Particles per work-group of field_blocks.
 #define GROUP 64
 
 #if BILINEAR
-// a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their digits.
+// Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
 real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const real2 b) {
 #if SHARP
     return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b));
@@ -15,7 +15,7 @@ real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const r
 #endif
 }
 
-// Smooth distance between the four cell centres around an end point, in two parts.
+// Interpolate the distance between the four cell centres around an end point, in two parts.
 real2 bilinear(global const real *table, const int2 cell, const EndPoint end, const int rows, const int cols) {
     const real2 a = (real2)(table[field_cell(cell.x, cell.y, rows, cols)], 0);
     const real2 b = (real2)(table[field_cell(cell.x + 1, cell.y, rows, cols)], 0);
@@ -27,8 +27,9 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 #endif
 
 #if !LOG_TABLE
-// terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1}: z_hit / (sigma sqrt(2 pi))
-// and z_rand / range_max, logarithms in the log domain. Where the peak is high, exponent and log peak nearly cancel.
+// Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel. terms[6]
+// = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma sqrt(2 pi)) and
+// rand is z_rand / range_max, or their logarithms in the log domain.
 real2 field_exponent(const real2 distance, global const real *terms) {
 #if SHARP
     return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
@@ -37,7 +38,7 @@ real2 field_exponent(const real2 distance, global const real *terms) {
 #endif
 }
 
-// log p of a distance from an end point to the nearest obstacle.
+// Return log p of the distance from an end point to the nearest obstacle.
 real log_field(const real2 distance, global const real *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
@@ -54,8 +55,8 @@ real log_field(const real2 distance, global const real *terms) {
 }
 #endif
 
-// What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or capped
-// distances in metres where it is interpolated.
+// Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
+// interpolated, capped distances in metres.
 real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
                    const real2 point_low, global const real *terms, const int rows, const int cols, const real guard) {
 #if ALL_READINGS
@@ -77,9 +78,9 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 }
 
 #if QUICK
-// What one reading adds whose cell is found by rounding alone; worst becomes how far a place is off its cell's centre, if
-// that is farther. A reading that is no range has no cell: the sensor's own is looked up in its place, and what a max
-// reading adds is far.
+// Return the term of a reading by rounding alone. worst becomes the distance of the end point from the cell's centre,
+// if that is larger. A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max
+// reading is far.
 real quick_value(global const real *table, const int2 from, const real4 lowered, const real2 point, const real far,
                  const int rows, const int cols, real *worst) {
     real off;
@@ -96,7 +97,7 @@ real quick_value(global const real *table, const int2 from, const real4 lowered,
 #endif
 }
 
-// The same where that is in doubt: the cell is found with more digits.
+// Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
 real careful_value(global const real *table, const int2 origin, const real4 lowered, const real4 pose, const real4 low,
                    const real2 point, const real2 point_low, const real far, const int rows, const int cols,
                    const real guard, const real sure) {
@@ -111,8 +112,9 @@ real careful_value(global const real *table, const int2 origin, const real4 lowe
 }
 #endif
 
-// Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
-// squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is beyond.
+// Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value for
+// each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the grid get
+// beyond.
 kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
                        const int cols, const int cap, const real beyond, const int from_col, const int from_row,
                        const int width, const int height, const int begin, const int stride) {
@@ -122,7 +124,8 @@ kernel void fill_field(global const int *squared, global const real *density, gl
     table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
 }
 
-// One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
+// Score scans: one work-item takes a particle. QUICK changes this kernel in Warp alone, on processors, whose compiler
+// makes vector code of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                         global const real *terms, global const int *start, global const real *fixed_of,
@@ -168,8 +171,9 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 #endif
 }
 
-// For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-// parts[n * across + block * along]. Each block has its own guard; of several scans each has as many as the longest.
+// Write the sums of blocks of readings to parts[n * across + block * along], for GPUs. One work-item takes a particle
+// and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards as the
+// longest one.
 kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                          global const real *terms, global const real *guard, global const int *start,
@@ -209,7 +213,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
             for (int i = 0; i < BLOCK_TERMS; ++i)
                 sum += quick_value(table, from, lowered, point[begin + i], far, rows, cols, &worst);
 #else
-            // Points of one scan begin where two of them can be read at once.
+            // The points of one scan are aligned, so that two of them can be read at once.
             global const real4 *two = (global const real4 *)(point + begin);
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS / 2; ++i) {

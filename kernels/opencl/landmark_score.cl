@@ -1,9 +1,9 @@
 // Likelihood of a set of features for each particle, log p(f | x, m): the sum over features, book tables 6.4 and 6.5.
 // requires: error_free landmarks landmark_grid
 
-// One work-item a particle: the sum of log p over features, with the partner that is KNOWN, of all landmarks (MARGINAL), or
-// of the likeliest one. With PER_BEAM also what each feature adds, and its likeliest landmark's place in the buckets, -1
-// where a false positive is likelier. share is log(1 / landmarks), the prior of each one with MARGINAL and else 0.
+// Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item takes a
+// particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest landmark, -1 where
+// a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a landmark, else 0.
 kernel void score_features(global const real4 *landmark, global const real4 *signature, global const int *start,
                            global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
                            global const real *feature, global const int *partner, global const real *terms,

@@ -1,13 +1,13 @@
-// Negative information: landmarks that the sensor should see from a pose, and that no feature is.
+// Negative information: landmarks that the sensor should see from a pose, but that belong to no feature.
 // requires: error_free landmarks landmark_grid
 
-// Whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
+// Return whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
 int in_view(const real4 off, const real cosine, const real sine, const real range_max, const real least) {
     const real d = sqrt(off.x * off.x + off.z * off.z);
     return d <= range_max && cosine * off.x + sine * off.z >= least * d;
 }
 
-// One work-item a particle: add log_missed to log_p for every landmark in view that none of its features is.
+// Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
 kernel void count_unseen(global const real4 *landmark, global const int *start, global const int2 *pose_cell,
                          global const real4 *pose, global const real4 *pose_low, global const int *which,
                          global real *log_p, const int rows, const int cols, const int particles, const int features,

@@ -1,8 +1,8 @@
 // Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
-// terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN only fills up a
-// block. p_hit has its mean at z* + range_bias, held within [0, range_max]; p_short's obstacles lie before z*.
-// r are the responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances
-// x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+// terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is padding.
+// The mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
+// responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
+// and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
 //     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
 //     Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
 // log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
@@ -18,13 +18,13 @@
 #define SUMS 14
 #endif
 
-// Where p_hit has its mean.
+// Return the mean of p_hit.
 real hit_mean(const real expected, global const real *terms) {
     const real mean = expected + terms[10];
     return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
 }
 
-// log p(z | z*) and the responsibilities of hit, short and rand for it: 0 where the density is 0.
+// Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
 real4 responsibilities(const real z, const real expected, global const real *terms) {
     const real hit = log_hit(z, hit_mean(expected, terms), terms), shorter = log_short(z, expected, terms);
     const real largest = fmax(fmax(hit, shorter), terms[5]);
@@ -34,10 +34,10 @@ real4 responsibilities(const real z, const real expected, global const real *ter
     return (real4)(largest + log(p), p_hit / p, p_short / p, p_rand / p);
 }
 
-// What a pair adds to the sums: log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm,
-// r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
-// triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
-// r_hit h_m^2, r_short s_l^2.
+// Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
+// r_hit h_mm, r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest
+// cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2,
+// r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
 void add_pair(const real z, const real expected, global const real *terms, real *sums) {
     const real4 r = responsibilities(z, expected, terms);
     real h_s = 0, h_m = 0, h_ss = 0, h_sm = 0, h_mm = 0, s_l = 0, s_ll = 0;
@@ -59,7 +59,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
         h_ss = -2 * u * u - t + w + t * t;
         h_sm = -2 * u - p + q;
         h_mm = -1 + t + p * p;
-        // A mean that is held does not move with the bias.
+        // A mean that is clamped does not move with the bias.
         if (mean != expected + terms[10]) h_m = h_sm = h_mm = 0;
     }
     if (r.z > 0) {
@@ -95,7 +95,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
 #endif
 }
 
-// One work-item a block of pairs, each along farther than the last, from number block * across on.
+// Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
 kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
                    global real *sums, const int blocks, const int readings, const int across, const int along,
                    const int width) {
@@ -119,7 +119,7 @@ kernel void e_step(global const real *reading, global const real *expected, glob
     for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + total_low[j];
 }
 
-// One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.
+// Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
 kernel void pair_causes(global const real *reading, global const real *expected, global const real *terms,
                         global real4 *causes, const int blocks, const int readings, const int across,
                         const int along) {

@@ -1,18 +1,18 @@
-// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding
-// took from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
-// z_rand / range_max; in the log domain their logarithms.
+// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom. terms[10]
+// = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of terms 0
+// and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in
+// the log domain they are the logarithms of these.
 // requires: error_free
 
-// Above this the error function is 1 to the last bit.
+// From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
 #define TINY_DECAY ((real)1e-30)
 #define SMALLEST_RANGE ((real)1e-37)
 
 #if HIT
-// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels. Most
-// ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
+// Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing cancels.
+// Most ranges are far from both ends and most others far from one of them; rays without an obstacle are at one end.
 real hit_mass(const real expected, const real erf_scale, const real range_max) {
     const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
     const real nearer = below < above ? below : above, farther = below < above ? above : below;
@@ -21,8 +21,8 @@ real hit_mass(const real expected, const real erf_scale, const real range_max) {
     return (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
 }
 
-// (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large and
-// nearly cancel, and the second part keeps the digits that are left.
+// Return (z - z*)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
+// large and nearly cancel; the second part keeps the digits that remain.
 real2 hit_exponent(const real z, const real expected, global const real *terms) {
     const real off = z - expected;
 #if SHARP
@@ -34,7 +34,7 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
 #endif
 }
 
-// Terms of the log domain: log of z_hit p_hit(z | z*).
+// Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
 real log_hit(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
     const real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
@@ -43,19 +43,19 @@ real log_hit(const real z, const real expected, global const real *terms) {
 #endif
 
 #if SHORT
-// x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
+// Return x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
 real short_factor(const real x) {
     const real h = (real)0.5 * x;
     return h > TINY_DECAY ? h / tanh(h) + h : (real)1;
 }
 
-// Terms of the log domain: log of z_short p_short(z | z*).
+// Return log(z_short p_short(z | z*)); terms are those of the log domain.
 real log_short(const real z, const real expected, global const real *terms) {
     if (!(z <= expected && expected > 0)) return -INFINITY;
     return terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
 }
 
-// short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
+// Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
 real short_peak(const real lambda, const real expected) {
     const real h = (real)0.5 * (lambda * expected), t = tanh(h);
     const real shortest = expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE;
@@ -64,7 +64,8 @@ real short_peak(const real lambda, const real expected) {
 #endif
 
 #if LINEAR
-// p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+// Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is
+// enough.
 real log_density(const real z, const real expected, global const real *terms) {
     real p = 0;
 #if HIT
@@ -78,7 +79,8 @@ real log_density(const real z, const real expected, global const real *terms) {
     return log(p + terms[5]);
 }
 #else
-// Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
+// Return log p(z | z*). Without a sufficient p_rand every component stays a logarithm; -inf only where the mixture is
+// 0.
 real log_density(const real z, const real expected, global const real *terms) {
     real largest = -INFINITY;
 #if HIT

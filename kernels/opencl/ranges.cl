@@ -1,7 +1,7 @@
 // Expected ranges of poses and bearings by any caster.
 // requires: caster tiles
 
-// One work-item a particle and ray.
+// Cast rays: one work-item takes a particle and ray.
 kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
                         global const real2 *ray, global real *ranges, const int rows, const int cols,
                         const int particles, const int rays, const int bins, const real slack, const real tolerance,
@@ -12,8 +12,8 @@ kernel void cast_ranges(global const entry *map_table, global const int2 *pose_c
     ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
 }
 
-// For GPUs, tiles of particles and rays: fewer than 2^31 ranges. What is told not to overlap need not be read again
-// after each of them is written.
+// Cast rays in tiles of particles and rays, for GPUs. There are fewer than 2^31 ranges. With restrict the compiler need
+// not read arguments again after a write.
 kernel void cast_tiles(global const entry *restrict map_table, global const int2 *restrict pose_cell,
                        global const real4 *restrict pose, global const int *restrict order,
                        global const real2 *restrict ray, global real *restrict ranges, const int rows,

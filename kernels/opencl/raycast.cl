@@ -1,5 +1,5 @@
-// Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
-// An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step
+// Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3). It is an
+// Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it steps
 // in x first.
 // requires: rectangles ray
 
@@ -15,7 +15,8 @@ typedef ushort entry;
 #endif
 #endif
 
-// Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
+// Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not change
+// the result.
 int sector_of(const real speed_x, const real speed_y) {
 #if SECTORS_4
     const int steep = speed_y > speed_x;
@@ -29,7 +30,7 @@ int sector_of(const real speed_x, const real speed_y) {
 #endif
 }
 
-// Distance in cells to the first occupied cell, or limit where there is none nearer.
+// Return the distance in cells to the first occupied cell, limit where none is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const Ray r = make_ray(pose, ray);
@@ -47,7 +48,7 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const uint origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols) - (step_x + step_y) * FIRST;
     real k_x = COUNT + (real)start.k_x, k_y = COUNT + (real)start.k_y, t = start.t;
     uint sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
-    // A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
+    // A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.
     while (sides > OCCUPIED && t < limit) {
         const real end_x = as_real(as_bits(k_x) + (sides & 255)), end_y = as_real(as_bits(k_y) + (sides >> 8));
         const real t_x = ((end_x - (COUNT + 1)) + r.a_x) * r.inv_x, t_y = ((end_y - (COUNT + 1)) + r.a_y) * r.inv_y;

@@ -1,7 +1,6 @@
-// Poses and readings that are on the device. Which readings count and where they go is as gpusense/scan.py finds it on the
-// host.
-// Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits;
-// what is left at the end are missing readings (nan), which add nothing.
+// Places poses and readings that lie on the device. Readings are selected and placed as in gpusense/scan.py on the
+// host. Uninformative readings are left out and the others move up, so that sums over blocks of readings have the same
+// bits. The places that remain at the end get missing readings (nan), which add nothing.
 // requires: error_free placement
 
 #if RANGES_FLOAT32
@@ -10,12 +9,13 @@ typedef float measured;
 typedef double measured;
 #endif
 
-// What max readings are: left out, in the constant, or evaluated like others.
+// Max readings are left out, part of the constant term, or evaluated like others.
 #define MAX_LEFT_OUT 0
 #define MAX_FIXED 1
 #define MAX_PLACED 2
 
-// Whether an even choice of so many informative readings has that of a rank: some i * informative / chosen is it.
+// Return whether an even choice of informative readings includes one of this rank: some i * informative / chosen is the
+// rank.
 int is_chosen(const int rank, const int informative, const int chosen) {
     if (chosen >= informative) return 1;
     if (chosen == 0) return 0;
@@ -23,7 +23,7 @@ int is_chosen(const int rank, const int informative, const int chosen) {
     return nearest * informative / chosen == rank;
 }
 
-// The reading with a number among so many, of some beams; nan beyond the last.
+// Return reading k of the chosen beams, nan beyond the last.
 double reading_of(const int k, global const measured *ranges, global const int *beam, const int beams) {
     if (k >= beams) return NAN;
 #if SOME_BEAMS
@@ -33,17 +33,17 @@ double reading_of(const int k, global const measured *ranges, global const int *
 #endif
 }
 
-// A reading's and a place's own part: it looks at all readings, of which 16 are read before any is looked at, finds the
-// place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam, each of
-// them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A max reading is
-// inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings add that have no
-// place; -inf where a range is there and none is possible.
+// Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a place
+// at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points the vectors
+// of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and point_low its
+// rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2 cells). fixed is the
+// constant term of max readings that have no place, -inf if there is a range where none is possible.
 void place_reading(const int item, global const measured *ranges, global const int *beam, global const double *vector,
                    global real2 *point, global real2 *point_low, global real *reading, global real *guard,
                    global real *fixed, const double resolution, const int beams, const int each, const int places,
                    const int chosen, const int max_readings, const int possible, const double nearest,
                    const double farthest, const double log_max, const double top, const double guard_scale) {
-    // What is needed last is read first, so that nothing waits for it.
+    // Values that are needed last are read first, so that nothing waits for them.
     const long from = 2 * (long)min(item, beams - 1) * each;
     const double item_reading = reading_of(item, ranges, beam, beams);
     const double vector_x = item < beams ? vector[from] : 1, vector_y = item < beams ? vector[from + 1] : 0;
@@ -56,7 +56,7 @@ void place_reading(const int item, global const measured *ranges, global const i
         }
     }
     int rank = 0, place = 0, item_place = places, far_count = 0, impossible = 0;
-    // Of the readings in the block of places that begins with the own one, if one does.
+    // The longest reading in the block of places that begins with this item's place, if a block begins there.
     double item_value = NAN, longest = 0;
     for (int first = 0; first < beams; first += BLOCK_TERMS) {
         double several[BLOCK_TERMS];
@@ -138,7 +138,7 @@ void place_reading(const int item, global const measured *ranges, global const i
     }
 }
 
-// One work-item a beam and place, in whole groups, and after these one a particle.
+// Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a particle.
 kernel void place_inputs(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
                          global real4 *pose_low, global int *verdict, global const measured *ranges,
                          global const int *beam, global const double *vector, global real2 *point,

@@ -1,6 +1,6 @@
 """Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 
-Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
+Readings whose density does not depend on the pose are not passed in: their sum is the constant term fixed.
 """
 
 import functools
@@ -18,7 +18,7 @@ from .tiles import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_beams or beam_tiles specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
@@ -47,7 +47,7 @@ def make(name, flags):
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
-    # What one reading adds to the sum.
+    # Return the term of one reading in the sum.
     @wp.func
     def reading_term(
         z: real,
@@ -72,7 +72,7 @@ def make(name, flags):
         else:
             return log_density(z, expected, terms)
 
-    # The scan's logarithm from its sum.
+    # Return the logarithm of a scan from its sum.
     @wp.func
     def scan_log(total: real):
         if CUBES:
@@ -80,8 +80,9 @@ def make(name, flags):
         else:
             return total
 
-    # One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several
-    # scans each has its rays from start on, and first counts the readings of all. A launch has fewer than 2^31 parts.
+    # Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r +
+    # 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch
+    # has fewer than 2^31 parts.
     @kernel
     def score_beams(
         map_table: wp.array(dtype=ENTRY),
@@ -180,8 +181,8 @@ def make(name, flags):
         else:
             log_p[n] = temperature * scan_log(total.x + total.y)
 
-    # For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], or with the
-    # flag STRANDED the sum of each strand in place of that of reading k. A work-item then takes whole strands.
+    # Write the term of reading k to parts[place * across + k * along], in tiles of particles and rays, for GPUs. With
+    # STRANDED the number there is the sum of strand k, and a work-item takes whole strands.
     @kernel
     def beam_tiles(
         map_table: wp.array(dtype=ENTRY),
@@ -272,7 +273,7 @@ def make(name, flags):
                 k += 1
             if STRANDED:
                 r += STRANDS
-                # Past a block's or the scan's end.
+                # The end of a block or of the scan.
                 if r >= size or (r & (BLOCK_TERMS - STRANDS)) == 0:
                     q = (r - STRANDS) // BLOCK_TERMS * STRANDS + (r & (STRANDS - 1))
                     put(parts, place * across + q * along, strand_sum)

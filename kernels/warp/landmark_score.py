@@ -12,7 +12,7 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_features specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
@@ -24,10 +24,10 @@ def make(name, flags):
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER = real(0.0), real(-math.inf)
 
-    # One work-item a particle: the sum of log p over features, with the partner that is KNOWN, of all landmarks
-    # (MARGINAL), or of the likeliest one. With PER_BEAM also what each feature adds, and its likeliest landmark's place
-    # in the buckets, -1 where a false positive is likelier. share is log(1 / landmarks), the prior of each one with
-    # MARGINAL and else 0.
+    # Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item
+    # takes a particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest
+    # landmark, -1 where a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a
+    # landmark, else 0.
     @kernel
     def score_features(
         landmark: wp.array(dtype=vec4),

@@ -1,8 +1,8 @@
-"""Poses and readings that are on the device.
+"""Places poses and readings that lie on the device.
 
-Which readings count and where they go is as gpusense/scan.py finds it on the host.
-Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
-is left at the end are missing readings (nan), which add nothing.
+Readings are selected and placed as in gpusense/scan.py on the host. Uninformative readings are left out and the others
+move up, so that sums over blocks of readings have the same bits. The places that remain at the end get missing readings
+(nan), which add nothing.
 """
 
 import functools
@@ -14,13 +14,14 @@ from . import placement
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, popcount, precision, work_item
 
-# What max readings are: left out, in the constant, or evaluated like others.
+# Max readings are left out, part of the constant term, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = wp.constant(0), wp.constant(1), wp.constant(2)
 ZERO = wp.constant(wp.float64(0.0))
 MISSING, FAR = wp.constant(wp.float64(math.nan)), wp.constant(wp.float64(math.inf))
 
 
-# Whether an even choice of so many informative readings has that of a rank: some i * informative / chosen is it.
+# Return whether an even choice of informative readings includes one of this rank: some i * informative / chosen is the
+# rank.
 @wp.func
 def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
     if chosen >= informative:
@@ -35,7 +36,7 @@ def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
 
 @functools.cache
 def make(name, flags):
-    """The kernel place_inputs specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types, place = precision(flags), placement.functions(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     coordinate, place_pose = place.coordinate, place.place_pose
@@ -47,7 +48,7 @@ def make(name, flags):
     NOTHING, NEVER = real(0.0), real(-math.inf)
     NO_READING, AHEAD = real(math.nan), vec2(1.0, 0.0)
 
-    # The reading with a number among so many, of some beams; nan beyond the last.
+    # Return reading k of the chosen beams, nan beyond the last.
     @wp.func
     def reading_of(k: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), beams: wp.int32):
         z = wp.float64(MISSING)
@@ -58,11 +59,12 @@ def make(name, flags):
                 z = wp.float64(ranges[k])
         return z
 
-    # A reading's and a place's own part: it looks at all readings, of which 16 are read before any is looked at, finds
-    # the place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam,
-    # each of them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A
-    # max reading is inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings
-    # add that have no place; -inf where a range is there and none is possible.
+    # Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
+    # place at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points
+    # the vectors of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and
+    # point_low its rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2
+    # cells). fixed is the constant term of max readings that have no place, -inf if there is a range where none is
+    # possible.
     @wp.func
     def place_reading(
         item: wp.int32,
@@ -87,7 +89,7 @@ def make(name, flags):
         top: wp.float64,
         guard_scale: wp.float64,
     ):
-        # What is needed last is read first, so that nothing waits for it.
+        # Values that are needed last are read first, so that nothing waits for them.
         source = 2 * item * each
         item_reading = reading_of(item, ranges, beam, beams)
         vector_x = wp.float64(1.0)
@@ -108,7 +110,7 @@ def make(name, flags):
         far_count = int(0)
         impossible = bool(False)
         item_value = wp.float64(MISSING)
-        # Of the readings in the block of places that begins with the own one, if one does.
+        # The longest reading in the block of places that begins with this item's place, if a block begins there.
         longest = wp.float64(0.0)
         first = int(0)
         while first < beams:
@@ -201,7 +203,8 @@ def make(name, flags):
                 constant = NEVER
             fixed[0] = constant
 
-    # One work-item a beam and place, in whole groups, and after these one a particle.
+    # Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a
+    # particle.
     @kernel
     def place_inputs(
         poses: wp.array(dtype=coordinate),

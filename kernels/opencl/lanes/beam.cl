@@ -1,8 +1,8 @@
-// Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, whose sums have the same order. A vector of rays is
-// a block of the sum.
+// Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, with sums in the same order. A vector of rays
+// is a block of the sum.
 // requires: error_free lanes/raycast lanes/mixture
 
-// One work-item takes a particle, and its rays block by block. Every ray has one reading.
+// Score scans: one work-item takes a particle, and its rays block by block. Every ray has one reading.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,

@@ -6,13 +6,13 @@ typedef struct {
     lanes hi, lo;
 } LanePair;
 
-// a + b = hi + lo exactly.
+// Return a + b = hi + lo exactly.
 LanePair two_sum_lanes(const lanes a, const lanes b) {
     const lanes sum = a + b, shift = sum - a;
     return (LanePair){sum, (a - (sum - shift)) + (b - shift)};
 }
 
-// a * b = hi + lo exactly, short of overflow and underflow.
+// Return a * b = hi + lo exactly, short of overflow and underflow.
 LanePair two_product_lanes(const lanes a, const lanes b) {
     const lanes product = a * b, scaled_a = SPLITTER * a, scaled_b = SPLITTER * b;
     const lanes a_high = scaled_a - (scaled_a - a), b_high = scaled_b - (scaled_b - b);
@@ -20,7 +20,7 @@ LanePair two_product_lanes(const lanes a, const lanes b) {
     return (LanePair){product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low};
 }
 
-// The same by a fused multiply-add.
+// Return a * b = hi + lo by a fused multiply-add.
 LanePair fused_product_lanes(const lanes a, const lanes b) {
     const lanes product = a * b;
     return (LanePair){product, fma(a, b, -product)};

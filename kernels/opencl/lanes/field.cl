@@ -2,8 +2,8 @@
 // interpolation takes exp and log of vectors, which may differ in the last bit.
 // requires: lanes/end_point
 
-// Vectors of particles per work-item. They share each block of beams: while a robot is tracked, its end points lie in few
-// cells of the table. There is a work-item for each vector; the first of VECTORS does the work of all of them.
+// Vectors of particles per work-item. They share each block of beams: while a robot is tracked, its end points lie in
+// few cells of the table. There is a work-item for each vector; the first of VECTORS does the work of all of them.
 #define VECTORS 4
 
 // Adding and subtracting ROUND_INT rounds to nearest; the bits of the sum, less ROUND_BITS, are the integer.
@@ -20,7 +20,8 @@ typedef struct {
 } Particles;
 
 #if BILINEAR
-// Log density of one beam. Both cells of the ring hold the same value, so the four cells are neighbours even beyond an edge.
+// Return log p of one beam. Both cells of the ring hold the same value, so the four cells are neighbours even beyond an
+// edge.
 lanes log_field_lanes(global const real *table, const Particles *particle, const real2 point, const real2 point_low,
                       global const real *terms, const int rows, const int cols) {
     const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
@@ -70,7 +71,7 @@ __attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, c
 }
 #endif
 
-// One work-item takes VECTORS * LANES particles, and the beams block by block.
+// Score scans: one work-item takes VECTORS * LANES particles, and the beams block by block.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                         global const real *terms, global const int *start, global const real *fixed_of,

@@ -4,7 +4,7 @@
 // Particles search together unless that visits more than TOGETHER times the buckets of a single search.
 #define TOGETHER 16
 
-// Smallest and largest of the lanes.
+// Return the smallest and the largest of the lanes.
 real2 ends_of_lanes(const lanes a) {
     real each[LANES];
     store_lanes(a, 0, each);
@@ -37,8 +37,8 @@ void with_landmark_lanes(const real4 landmark, const LanePlace place, const Lane
     }
 }
 
-// Search the landmarks of some buckets. The landmark nearest to (x, y), the middle of the end points, comes first: after it
-// most others are too far to be likelier.
+// Search the landmarks of some buckets. The landmark nearest to (x, y), the middle of the end points, comes first:
+// after it most others are too far to be likelier.
 void search_buckets_lanes(global const real4 *landmark, global const int *start, const int4 buckets, const int cols,
                           const float x, const float y, const LanePlace place, const LanePlace turned,
                           const lanes end_x, const lanes end_y, global const real *feature, global const real *terms,
@@ -63,15 +63,16 @@ void search_buckets_lanes(global const real4 *landmark, global const int *start,
     }
 }
 
-// First and last column, and first and last row, of the buckets that discs touch.
+// Return the first and last column, and the first and last row, of the buckets that discs touch.
 int4 touched_buckets(const real2 x, const real2 y, const float radius, const int rows, const int cols,
                      const float size) {
     return (int4)(bucket_at(x.x - radius, size, cols), bucket_at(x.y + radius, size, cols),
                   bucket_at(y.x - radius, size, rows), bucket_at(y.y + radius, size, rows));
 }
 
-// Log densities of the likeliest landmarks. Where the discs of all particles touch few more buckets together than each disc
-// alone, the particles search together, else one after the other. A lane has the same bits in both cases.
+// Return the log densities of the likeliest landmarks. Where the discs of all particles touch few more buckets together
+// than each disc alone, the particles search together, else one after the other. A lane has the same bits in both
+// cases.
 lanes search_lanes(global const real4 *landmark, global const int *start, const LanePlace place, const LanePlace turned,
                    global const real *feature, global const real *terms, const int rows, const int cols,
                    const real size) {

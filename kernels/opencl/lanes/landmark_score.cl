@@ -1,8 +1,8 @@
-// Likelihood of a set of features for LANES particles at once: score_features of landmark_score.cl, for a partner that is
-// KNOWN or the likeliest one. Sums have the order of the scalar kernel.
+// Likelihood of a set of features for LANES particles at once: score_features of landmark_score.cl, for a partner that
+// is KNOWN or the likeliest one. Sums have the order of the scalar kernel.
 // requires: lanes/landmark_grid
 
-// One work-item takes LANES particles. The last particle of all stands in for those that are missing.
+// Sum log p over features: one work-item takes LANES particles. The last particle of all stands in for missing ones.
 kernel void score_features(global const real4 *landmark, global const real4 *signature, global const int *start,
                            global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
                            global const real *feature, global const int *partner, global const real *terms,

@@ -1,7 +1,7 @@
-// Density of one feature at one landmark for LANES particles at once: landmarks.cl, offsets.cl and log_terms.cl in lanes, for
-// features that have ranges and bearings and are seen all around. Every lane has the arithmetic of the scalar kernel, except
-// that exp, log and erf are those of lanes/math, that the arc tangent has two arcs only, 0 and pi/4, and that a fused
-// multiply-add gives the rounding error of a product.
+// Density of one feature at one landmark for LANES particles at once: landmarks.cl, offsets.cl and log_terms.cl in
+// lanes, for features that have ranges and bearings and are seen all around. Every lane has the arithmetic of the
+// scalar kernel, except that exp, log and erf are those of lanes/math, that the arc tangent has two arcs only, 0 and
+// pi/4, and that a fused multiply-add gives the rounding error of a product.
 // requires: landmarks lanes/error_free lanes/math
 
 // A place, an offset or a direction in each lane.
@@ -18,13 +18,13 @@ typedef struct {
 #define HALF_TURN 3.14159274f
 #define HALF_TURN_LOW -8.74227766e-08f
 
-// c - a for a positive c.
+// Return c - a for a positive c.
 LanePair difference_lanes(const float c, const float c_low, const LanePair a) {
     const LanePair sum = two_sum_lanes((lanes)c, -a.hi);
     return two_sum_lanes(sum.hi, sum.lo + (c_low - a.lo));
 }
 
-// Direction in the world in which a feature was seen: the heading, turned by the bearing.
+// Return the direction of a feature in the world: the heading, turned by the bearing.
 LanePlace direction_lanes(const LanePlace heading, global const real *feature) {
     const float c = feature[COSINE], s = feature[SINE], c_low = feature[COSINE_LOW], s_low = feature[SINE_LOW];
     const LanePair cc = fused_product_lanes(heading.x.hi, (lanes)c), ss = fused_product_lanes(heading.y.hi, (lanes)s);
@@ -37,14 +37,14 @@ LanePlace direction_lanes(const LanePlace heading, global const real *feature) {
     return turned;
 }
 
-// Offset from the sensors to a landmark.
+// Return the offset from the sensors to a landmark.
 LanePlace offset_lanes(const real4 landmark, const LanePlace place) {
     const LanePair x = two_sum_lanes((lanes)landmark.x, -place.x.hi), y = two_sum_lanes((lanes)landmark.y, -place.y.hi);
     return (LanePlace){two_sum_lanes(x.hi, x.lo + (landmark.z - place.x.lo)),
                        two_sum_lanes(y.hi, y.lo + (landmark.w - place.y.lo))};
 }
 
-// Length of an offset.
+// Return the length of an offset.
 LanePair distance_pair_lanes(const LanePlace off) {
     const LanePair xx = fused_product_lanes(off.x.hi, off.x.hi), yy = fused_product_lanes(off.y.hi, off.y.hi);
     const LanePair sum = two_sum_lanes(xx.hi, yy.hi);
@@ -55,7 +55,7 @@ LanePair distance_pair_lanes(const LanePlace off) {
     return (LanePair){d, d > 0 ? rest / (2.0f * d) : (lanes)0};
 }
 
-// Absolute value of the angle between an offset and a direction, in [0, pi].
+// Return the absolute value of the angle between an offset and a direction, in [0, pi].
 LanePair angle_pair_lanes(const LanePlace off, const LanePlace turned) {
     const LanePair right = fused_product_lanes(turned.x.hi, off.y.hi);
     const LanePair left = fused_product_lanes(turned.y.hi, off.x.hi);
@@ -104,7 +104,7 @@ LanePair add_square_lanes(const LanePair total, const LanePair residual, const f
     return (LanePair){sum.hi, low - low == 0 ? low : (lanes)0};
 }
 
-// log(z_detect p(f | j)) of a feature at an offset.
+// Return log(z_detect p(f | j)) of a feature at an offset.
 lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global const real *feature,
                           global const real *terms) {
     LanePair exponent = {0, 0};
@@ -137,7 +137,7 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
     return any_lane(mass != 1) ? (mass == 1 ? log_p : log_p - log_lanes(mass)) : log_p;
 }
 
-// Logarithm of the sum of two probabilities given as logarithms; -inf only where both are 0.
+// Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
 lanes either_lanes(const lanes detected, const float false_positive) {
     const ilanes larger = detected > false_positive;
     const lanes high = larger ? detected : (lanes)false_positive, low = larger ? (lanes)false_positive : detected;

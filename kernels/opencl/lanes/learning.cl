@@ -1,6 +1,6 @@
-// Sums over pairs of reading and expected range, LANES pairs at once: learning.cl with a pair in every lane. Its header has
-// the formulas. exp, log, tanh and erf are PoCL's own functions of vectors, which cost far less per number than its scalar
-// ones.
+// Sums over pairs of reading and expected range, LANES pairs at once: learning.cl with a pair in every lane. Its header
+// has the formulas. exp, log, tanh and erf are PoCL's own functions of vectors, which cost far less per number than its
+// scalar ones.
 // requires: mixture error_free lanes/types
 
 #define ROOT_2PI ((real)2.5066282746310002)
@@ -10,13 +10,13 @@
 #define SUMS 14
 #endif
 
-// Mean of p_hit.
+// Return the mean of p_hit.
 lanes hit_mean_lanes(const lanes expected, global const real *terms) {
     const lanes mean = expected + terms[10], lower = mean > terms[6] ? (lanes)terms[6] : mean;
     return lower < 0 ? (lanes)0 : lower;
 }
 
-// Mass of the normal around the mean on [0, range_max].
+// Return the mass of the normal around the mean on [0, range_max].
 lanes hit_mass_lanes(const lanes mean, const real erf_scale, const real range_max) {
     const lanes below = mean * erf_scale, above = (range_max - mean) * erf_scale;
     const lanes nearer = below < above ? below : above, farther = below < above ? above : below;
@@ -25,7 +25,7 @@ lanes hit_mass_lanes(const lanes mean, const real erf_scale, const real range_ma
     return nearer > ERF_ONE ? (lanes)1 : (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
 }
 
-// x / (1 - exp(-x)) for x >= 0.
+// Return x / (1 - exp(-x)) for x >= 0.
 lanes short_factor_lanes(const lanes x) {
     const lanes h = (real)0.5 * x;
     return h > TINY_DECAY ? h / tanh(h) + h : (lanes)1;
@@ -103,7 +103,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
 #endif
 }
 
-// One work-item takes a block of pairs, which are contiguous (along is 1) and fill all lanes.
+// Sum over blocks of pairs: one work-item takes a block, whose pairs are contiguous (along is 1) and fill all lanes.
 kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
                    global real *sums, const int blocks, const int readings, const int across, const int along,
                    const int width) {

@@ -1,9 +1,9 @@
-// Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors through
-// memory. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
+// Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors
+// through memory. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
 //     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
 //     erf(x) = 1 - exp(-x W(x));   arctan t = t + t^3 A(t^2).
-// bench/lane_constants.py derives the constants; tests/test_lane_math.py measures the worst errors that stand below, in ulps
-// of float32.
+// bench/lane_constants.py derives the constants; tests/test_lane_math.py measures the worst errors that stand below, in
+// ulps of float32.
 // requires: lanes/types
 
 // log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
@@ -48,7 +48,7 @@
 #define W7 0.000117640826f
 #define W8 -9.25621225e-06f
 
-// e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
+// Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
 lanes reduced_exp_lanes(const lanes a, ilanes *count) {
     const lanes shifted = a * ONE_OVER_LOG2 + LANE_ROUNDER, k = shifted - LANE_ROUNDER;
     const lanes r = (a - k * LOG2_HIGH) - k * LOG2_LOW, square = r * r;
@@ -56,21 +56,21 @@ lanes reduced_exp_lanes(const lanes a, ilanes *count) {
     return r + square * ((E0 + E1 * r) + square * ((E2 + E3 * r) + square * E4));
 }
 
-// e^a for a <= 0, within 1.1 ulp. Denormal results become 0: processors compute slowly with them.
+// Return e^a for a <= 0, within 1.1 ulp. Denormal results become 0: processors compute slowly with them.
 lanes exp_lanes(const lanes a) {
     ilanes k;
     const lanes rest = reduced_exp_lanes(a, &k), power = (1.0f + rest) * as_lanes((k + 127) << 23);
     return a < EXP_ZERO ? (lanes)0 : power;
 }
 
-// 1 - e^a for a <= 0, within 1.1 ulp. Nothing cancels: where the count is 0, so is the first term.
+// Return 1 - e^a for a <= 0, within 1.1 ulp. Nothing cancels: where the count is 0, so is the first term.
 lanes one_minus_exp_lanes(const lanes a) {
     ilanes k;
     const lanes rest = reduced_exp_lanes(a < EXP_LOST ? (lanes)EXP_LOST : a, &k), scale = as_lanes((k + 127) << 23);
     return (1.0f - scale) - scale * rest;
 }
 
-// log(p) of a finite normal number p > 0, within 0.9 ulp.
+// Return log(p) of a finite normal number p > 0, within 0.9 ulp.
 lanes log_lanes(const lanes p) {
     const ilanes above = as_ilanes(p) - ROOT_HALF;
     const lanes k = to_lanes(above >> 23), f = as_lanes((above & 0x7fffff) + ROOT_HALF) - 1.0f, square = f * f;
@@ -79,13 +79,13 @@ lanes log_lanes(const lanes p) {
     return (f + ((cubic + k * LOG2_LOW) - 0.5f * square)) + k * LOG2_HIGH;
 }
 
-// arctan t - t for |t| <= tan(pi/8).
+// Return arctan t - t for |t| <= tan(pi/8).
 lanes arc_rest_lanes(const lanes t) {
     const lanes z = t * t;
     return t * z * ((A0 + A1 * z) + z * z * ((A2 + A3 * z) + z * z * A4));
 }
 
-// erf(x) for x >= 0, within 3.8 ulp; exactly 1 from 4 on.
+// Return erf(x) for x >= 0, within 3.8 ulp; exactly 1 from 4 on.
 lanes erf_lanes(const lanes x) {
     if (!any_lane(x < LANE_ERF_ONE)) return (lanes)1.0f;
     const lanes b = x < LANE_ERF_ONE ? x : (lanes)LANE_ERF_ONE;

@@ -4,8 +4,8 @@
 // Up to this 1 - exp(-x) is x within a quarter of the last bit of float32.
 #define SMALL_DECAY 2.98023224e-08f
 
-// log p(z | z*). p_rand is at least 1e-30 times the larger of 1 and the peak. So each component may underflow, which begins
-// at 2e-38, and one logarithm is enough.
+// Return log p(z | z*). p_rand is at least 1e-30 times the larger of 1 and the peak. So each component may underflow,
+// which begins at 2e-38, and one logarithm is enough.
 lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms) {
     lanes p = terms[5];
 #if HIT

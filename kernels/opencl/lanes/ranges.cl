@@ -1,7 +1,7 @@
 // Expected ranges of poses and bearings by the exact caster, LANES rays at once: cast_ranges of ranges.cl.
 // requires: lanes/raycast
 
-// One work-item takes a particle and LANES rays.
+// Cast rays: one work-item takes a particle and LANES rays.
 kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
                         global const real2 *ray, global real *ranges, const int rows, const int cols,
                         const int particles, const int rays, const int bins, const real slack, const real tolerance,

@@ -1,8 +1,8 @@
 // Expected range z* of LANES rays of one pose at once: the walk of raycast.cl in every lane, with the same bits.
 // requires: raycast lanes/types
 
-// Distance in cells to the first occupied cell along LANES rays of one pose inside the grid. A lane that has ended reads the
-// first cell of the table's ring, which is 0.
+// Return the distances in cells to the first occupied cell along LANES rays of one pose inside the grid. A lane that
+// has ended reads the first cell of the table's ring, which is 0.
 lanes cast_ray_lanes(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
                      const lanes ray_x, const lanes ray_y, const real limit) {
     lanes dx = pose.z * ray_x - pose.w * ray_y, dy = pose.w * ray_x + pose.z * ray_y;
@@ -55,7 +55,7 @@ lanes cast_ray_lanes(global const entry *map_table, const int rows, const int co
     }
 }
 
-// Cosines and sines of the LANES rays from index first on. The last ray stands in for those beyond it.
+// Load cosines and sines of the LANES rays from index first on. The last ray stands in for those beyond it.
 void load_ray_lanes(global const real2 *ray, const int first, const int rays, lanes *x, lanes *y) {
     if (first + LANES <= rays) {
         const lanes low = load_lanes(0, (global const real *)(ray + first));
@@ -73,7 +73,7 @@ void load_ray_lanes(global const real2 *ray, const int first, const int rays, la
     *y = load_lanes(0, these_y);
 }
 
-// Expected ranges of LANES rays in metres, of origins outside the grid as well.
+// Return the expected ranges of LANES rays in metres, of origins outside the grid as well.
 lanes expected_range_lanes(global const entry *map_table, const int rows, const int cols, const int2 cell,
                            const real4 pose, const lanes ray_x, const lanes ray_y, const real limit,
                            const real resolution, const real range_max) {

@@ -1,9 +1,9 @@
-// Vector types of the kernels in this folder: one work-item computes LANES particles, beams or pairs at once. They are for
-// processors whose compilers make no vector code of scalar kernels. Where a processor's vectors are shorter than LANES, the
-// loads of several vectors wait for memory side by side. A function in lanes has the name of its scalar one and the ending
-// _lanes. There are 16 lanes of float32; the sums for learning alone have lanes of float64, 8 of them.
-// PoCL compiles any, fabs, fmax, min and max as calls, which are too slow for an inner loop: comparisons and masks stand
-// in their place.
+// Vector types of the kernels in this folder: one work-item computes LANES particles, beams or pairs at once. They are
+// for processors whose compilers make no vector code of scalar kernels. Where a processor's vectors are shorter than
+// LANES, the loads of several vectors wait for memory side by side. A function in lanes has the name of its scalar one
+// and the ending _lanes. There are 16 lanes of float32; the sums for learning alone have lanes of float64, 8 of them.
+// PoCL compiles any, fabs, fmax, min and max as calls, which are too slow for an inner loop: comparisons and masks
+// stand in their place.
 
 #if FLOAT64
 typedef double8 lanes;
@@ -11,7 +11,7 @@ typedef long8 ilanes;
 #define LANES 8
 #define load_lanes vload8
 
-// Whether a comparison holds in any lane.
+// Return whether a comparison holds in any lane.
 int any_lane(const ilanes holds) {
     const long4 four = holds.lo | holds.hi;
     const long2 two = four.lo | four.hi;
@@ -41,7 +41,7 @@ typedef int16 ilanes;
     ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]],      \
             table[i[8]], table[i[9]], table[i[10]], table[i[11]], table[i[12]], table[i[13]], table[i[14]], table[i[15]]))
 
-// Whether a comparison holds in any lane.
+// Return whether a comparison holds in any lane.
 int any_lane(const ilanes holds) {
     const int8 eight = holds.lo | holds.hi;
     const long2 two = as_long2(eight.lo | eight.hi);
@@ -55,6 +55,6 @@ real sum_lanes(const lanes a) {
     return two.x + two.y;
 }
 
-// Bits of the absolute values; as integers they have the order of the values.
+// Return the bits of the absolute values; as integers they have the order of the values.
 ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
 #endif

@@ -195,7 +195,7 @@ def beam_tiles(
 def readings_of_scan(
     flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
 ) -> tuple[int, int, np.ndarray, np.ndarray]:
-    """Return one of several scans: its first ray, the number of its rays, the first reading of each, and the readings."""
+    """Return one of several scans: its first ray, its number of rays, the first reading of each ray, its readings."""
     begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
     if "SHARED_RAYS" not in flags:
         return begin, rays, np.arange(rays + 1), reading[begin:]

@@ -32,9 +32,7 @@ def bucket_at(position: np.ndarray, size: np.floating, count: int) -> np.ndarray
 def candidates(
     start: np.ndarray, place: Quad, turned: Quad, feature: np.ndarray, rows: int, cols: int, size: np.floating
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return runs of landmarks in the buckets that each particle's disc touches: (P, rows of buckets) first and last +
-    1.
-    """
+    """Return runs of landmarks in the buckets that discs touch: (P, rows of buckets) first and last + 1."""
     reach, radius = feature[REACH], feature[RADIUS]
     x, y = place[0] + reach * turned[0], place[2] + reach * turned[2]
     left, right = bucket_at(x - radius, size, cols), bucket_at(x + radius, size, cols)
@@ -47,9 +45,7 @@ def candidates(
 
 
 def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
-    """Return whether landmarks lie in a feature's disc, and within the sensor's limits that the feature does not
-    measure.
-    """
+    """Return whether landmarks lie in a feature's disc, and within the limits of what the feature does not measure."""
     reach, radius, hole = feature[REACH], feature[RADIUS], feature[HOLE]
     x, y = off[0] - reach * turned[0], off[2] - reach * turned[2]
     squared = off[0] * off[0] + off[2] * off[2]
@@ -72,7 +68,10 @@ def search(
     cols: int,
     size: np.floating,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return per particle the log density, the log density of the likeliest landmark, and the index of that landmark."""
+    """Return per particle the log density, that of the likeliest landmark, and the index of that landmark.
+
+    The log density is that of the likeliest landmark, or with MARGINAL of all landmarks.
+    """
     real, particles = terms.dtype, len(place[0])
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)
     if feature[RADIUS] < 0:

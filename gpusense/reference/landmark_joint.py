@@ -46,8 +46,9 @@ def joint_features(
     fixed: np.floating,
     temperature: np.floating,
 ) -> None:
-    """Find the best joint associations; ``choice[s]`` and ``value[s]`` have landmark and log p of each feature of set
-    s.
+    """Find the best joint association of each particle.
+
+    ``choice[s]`` has the landmark of each feature of set s, and ``value[s]`` its log p; ``sets`` is 2^features.
     """
     real = pose.dtype
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)

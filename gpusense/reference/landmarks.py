@@ -69,7 +69,7 @@ def at_places(quad: Quad, places: np.ndarray | slice) -> Quad:
 
 
 def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, size: np.floating) -> Quad:
-    """Return the places of sensors in metres from the origin of the buckets, whose side, a power of two, is ``size``."""
+    """Return the places of sensors in metres from the origin of the buckets; ``size`` is the side of a bucket."""
     x = two_sum(pose_cell[:, 0].astype(pose.dtype), pose[:, 0])
     y = two_sum(pose_cell[:, 1].astype(pose.dtype), pose[:, 1])
     return size * x[0], size * (x[1] + pose_low[:, 0]), size * y[0], size * (y[1] + pose_low[:, 1])
@@ -143,10 +143,9 @@ def range_mass(d: Pair, scale: np.floating, terms: np.ndarray) -> np.ndarray:
 
 def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: np.floating, terms: np.ndarray,
                arcs: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its
-    ends.
+    """Return the mass of the normal around a landmark's bearing on the field of view.
 
-    Parts of the field more than half a turn away from the landmark are nearer in the other direction.
+    The bearing is clamped to the ends of the field. Parts of the field more than half a turn away from the landmark are nearer in the other direction.
     """
     half, whole = arcs[ARC_STEPS + 2, 0], 2 * arcs[ARC_STEPS + 2, 0]
     left = (upper - angle[0]) + (upper_low - angle[1])

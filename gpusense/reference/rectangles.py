@@ -103,7 +103,7 @@ def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
 def _quadrants(
     rectangles: np.ndarray, rows: int, cols: int, sectors: int, top: int, left: int, bottom: int, right: int
 ) -> Iterator[tuple[int, tuple[int, int], tuple[slice, slice], np.ndarray]]:
-    """Yield each quadrant, its directions along x and y, the rows and columns that a change reaches, and their planes."""
+    """Yield quadrants, with directions along x and y, the rows and columns that a change reaches, and planes."""
     planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
     for quadrant in range(4):
         dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)

@@ -81,7 +81,7 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
 #endif
 }
 
-// One work-item a particle.
+// Place poses: one work-item takes a particle.
 kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
                         global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
                         const double resolution, const double mount_x, const double mount_y, const double yaw_cos,

@@ -225,7 +225,7 @@ def make(name, flags):
             value = density[wp.min(squared[row * cols + col], cap)]
         table[begin + j * stride + i] = value
 
-    # One work-item a particle.
+    # Score scans: one work-item takes a particle.
     @kernel
     def score_field(
         table: wp.array(dtype=real),

@@ -112,7 +112,7 @@ def make(name, flags):
     vec4, placing = precision(flags).vec4, functions(flags)
     place_pose, coordinate = placing.place_pose, placing.coordinate
 
-    # One work-item a particle.
+    # Place poses: one work-item takes a particle.
     @kernel
     def place_poses(
         poses: wp.array(dtype=coordinate),

@@ -10,7 +10,7 @@ from gpusense.reference.offsets import Quad, offset
 
 
 def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: np.floating, least: np.floating) -> np.ndarray:
-    """Return whether landmarks are within range, with a cosine of the angle to the sensor's axis of at least ``least``."""
+    """Return whether landmarks are within range, with a cosine of the angle to the sensor's axis >= ``least``."""
     d = np.sqrt(off[0] * off[0] + off[2] * off[2])
     return (d <= range_max) & (cosine * off[0] + sine * off[2] >= least * d)
 

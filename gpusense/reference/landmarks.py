@@ -145,7 +145,8 @@ def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: n
                arcs: np.ndarray) -> np.ndarray:  # fmt: skip
     """Return the mass of the normal around a landmark's bearing on the field of view.
 
-    The bearing is clamped to the ends of the field. Parts of the field more than half a turn away from the landmark are nearer in the other direction.
+    The bearing is clamped to the ends of the field. Parts of the field more than half a turn away from the landmark are
+    nearer in the other direction.
     """
     half, whole = arcs[ARC_STEPS + 2, 0], 2 * arcs[ARC_STEPS + 2, 0]
     left = (upper - angle[0]) + (upper_low - angle[1])

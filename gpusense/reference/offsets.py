@@ -1,6 +1,7 @@
 """Offsets between places in sums of two numbers.
 
-A relative error of eps in 20 m is too much beside a deviation of 1 cm. A place is (x, its low part, y, its low part), and so is an offset.
+A relative error of eps in 20 m is too much beside a deviation of 1 cm. A place is (x, its low part, y, its low part),
+and so is an offset.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Places poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
+"""Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
 
 Only +, -, *, /, floor and comparisons are used, so that every device gives the same bits.
 """

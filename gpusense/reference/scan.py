@@ -1,4 +1,4 @@
-"""Places poses and readings that lie on the device.
+"""Placement of poses and readings that lie on the device.
 
 Which readings count and where they go is as ``gpusense.scan`` finds it on the host. Readings that say nothing are left
 out and the others move up, so that sums over blocks of them have the same bits; what is left at the end are missing

@@ -32,8 +32,8 @@ real scan_log(const real sum) {
 #endif
 }
 
-// Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r + 1] -
-// 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans.
+// Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings from first[r] on, up to
+// first[r + 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,

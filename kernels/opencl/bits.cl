@@ -3,8 +3,10 @@
 
 #define NONE 0x7fffffff
 
-// Return the index of the lowest, or highest, 1 of a word that is not 0.
+// Return the index of the lowest 1 of a word that is not 0.
 int lowest_bit(const uint word) { return 31 - (int)clz(word & (~word + 1)); }
+
+// Return the index of the highest 1 of a word that is not 0.
 int highest_bit(const uint word) { return 31 - (int)clz(word); }
 
 // Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most

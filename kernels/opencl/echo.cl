@@ -15,6 +15,7 @@ typedef struct {
 // Return whether a normal belongs to an obstacle.
 int is_wall(const real2 normal) { return normal.x != 0 || normal.y != 0; }
 
+// Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
 real2 normal_at(global const real2 *normals, const int rows, const int cols, const int col, const int row) {
     if (off_grid(col + 1, row + 1, rows + 2, cols + 2)) {
 #if OUTSIDE_OCCUPIED

@@ -26,11 +26,12 @@ real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2
 }
 #endif
 
+// Offsets this close below an edge count as on it.
+#define EDGE ((real)1.1641532182693481e-10)
+
 // Return the whole cells below an offset of two parts; rest in [0, 1) is the remainder and to_next is 1 minus it. Both
 // are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below an
 // edge counts as on it, so that end points on edges fall into the same cell in every precision.
-#define EDGE ((real)1.1641532182693481e-10)
-
 int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
     const int nearest = floor_int(offset.x + (real)0.5);
 #if SHARP
@@ -109,6 +110,7 @@ int2 table_origin(const int2 origin, const int cols) {
 #endif
 }
 
+// Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
 int table_cell(const int2 near, const int2 from, const int rows, const int cols) {
 #if INSIDE
     return (uint)near.y * (uint)from.y + ((uint)near.x + (uint)from.x);

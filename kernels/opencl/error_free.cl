@@ -23,12 +23,13 @@ real2 two_product(const real a, const real b) {
     return (real2)(product, error);
 }
 
-// Add, or multiply, two numbers of two parts each, to about twice the working precision.
+// Add two numbers of two parts each, to about twice the working precision.
 real2 pair_sum(const real2 a, const real2 b) {
     const real2 sum = two_sum(a.x, b.x);
     return two_sum(sum.x, sum.y + (a.y + b.y));
 }
 
+// Multiply two numbers of two parts each, to about twice the working precision.
 real2 pair_product(const real2 a, const real2 b) {
     const real2 product = two_product(a.x, b.x);
     return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x));

@@ -46,18 +46,20 @@ typedef struct {
     double2 rest;
 } Turn;
 
-// Error-free transformations of error_free.cl in float64, whatever the precision of real.
+// two_sum of error_free.cl in float64, whatever the precision of real.
 double2 two_sum_float64(const double a, const double b) {
     const double sum = a + b;
     const double shift = sum - a;
     return (double2)(sum, (a - (sum - shift)) + (b - shift));
 }
 
+// high_half in float64.
 double high_half_float64(const double a) {
     const double scaled = 134217729.0 * a;
     return scaled - (scaled - a);
 }
 
+// pair_product in float64.
 double2 pair_product_float64(const double2 a, const double2 b) {
     const double product = a.x * b.x;
     const double a_high = high_half_float64(a.x), b_high = high_half_float64(b.x);

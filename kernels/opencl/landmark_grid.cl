@@ -61,6 +61,7 @@ Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
     return match;
 }
 
+// Return the match of a feature among the landmarks within its disc.
 Match search(global const real4 *landmark, global const real4 *signature, global const int *start, const real4 place,
              const real4 turned, global const real *feature, global const real *terms, global const real2 *arcs,
              const int rows, const int cols, const real size) {

@@ -46,6 +46,7 @@ real2 ray_direction(const real4 pose, const real2 ray) {
     return (real2)(fabs(dx) < TINY ? (real)0 : dx, fabs(dy) < TINY ? (real)0 : dy);
 }
 
+// Return the ray of a pose and a beam.
 Ray make_ray(const real4 pose, const real2 ray) {
     Ray r;
     r.direction = ray_direction(pose, ray);

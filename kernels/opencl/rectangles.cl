@@ -19,11 +19,14 @@
 // Capacity of the stack of columns that may bound a rectangle.
 #define STACK 256
 
+// Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
 
-// Return the first cell, or one beyond the last cell, whose rectangle can contain a cell of [low, high) along an axis;
-// rectangles extend to larger (way 1) or smaller (way -1) indices.
+// Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
+// larger (way 1) or smaller (way -1) indices.
 int reach_begin(const int way, const int low) { return way > 0 ? max(low - RECTANGLE_REACH, 0) : low; }
+
+// Return one beyond the last cell whose rectangle can contain a cell before high.
 int reach_end(const int way, const int high, const int size) {
     return way > 0 ? high : min(high + RECTANGLE_REACH, size);
 }

@@ -1,4 +1,4 @@
-// Places poses and readings that lie on the device. Readings are selected and placed as in gpusense/scan.py on the
+// Placement of poses and readings that lie on the device. Readings are selected and placed as in gpusense/scan.py on the
 // host. Uninformative readings are left out and the others move up, so that sums over blocks of readings have the same
 // bits. The places that remain at the end get missing readings (nan), which add nothing.
 // requires: error_free placement

@@ -10,6 +10,7 @@ int range_bin(const real range, const real per_metre, const int cells, const rea
     return bin < cells ? bin : cells - 1;
 }
 
+// Return log p of a reading for an expected range.
 real tabulated_density(const real z, const real expected, global const real *sensor, const int cells,
                        const real per_metre, const real range_max) {
     const int column = range_bin(expected, per_metre, cells, range_max);

@@ -10,7 +10,7 @@ NONE = wp.constant(0x7FFFFFFF)
 ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
 
 
-# Return the index of the lowest, or highest, 1 of a word that is not 0.
+# Return the index of the lowest 1 of a word that is not 0.
 @wp.func
 def lowest_bit(word: wp.uint32):
     rest = word
@@ -32,6 +32,7 @@ def lowest_bit(word: wp.uint32):
     return place
 
 
+# Return the index of the highest 1 of a word that is not 0.
 @wp.func
 def highest_bit(word: wp.uint32):
     rest = word

@@ -48,6 +48,7 @@ def functions(flags):
     def is_wall(normal: vec2):
         return normal.x != ZERO or normal.y != ZERO
 
+    # Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
     @wp.func
     def normal_at(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, col: wp.int32, row: wp.int32):
         if off_grid(col + 1, row + 1, rows + 2, cols + 2):

@@ -154,6 +154,7 @@ def functions(flags):
         else:
             return wp.vec2i(origin.x - ROUNDING_BITS, origin.y - ROUNDING_BITS)
 
+    # Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
     @wp.func
     def table_cell(near: wp.vec2i, start: wp.vec2i, rows: wp.int32, cols: wp.int32):
         if INSIDE:

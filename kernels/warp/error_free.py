@@ -50,12 +50,13 @@ def functions(flags):
         error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
         return vec2(product, error)
 
-    # Add, or multiply, two numbers of two parts each, to about twice the working precision.
+    # Add two numbers of two parts each, to about twice the working precision.
     @wp.func
     def pair_sum(a: vec2, b: vec2):
         total = two_sum(a.x, b.x)
         return two_sum(total.x, total.y + (a.y + b.y))
 
+    # Multiply two numbers of two parts each, to about twice the working precision.
     @wp.func
     def pair_product(a: vec2, b: vec2):
         product = two_product(a.x, b.x)

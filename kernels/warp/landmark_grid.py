@@ -105,6 +105,7 @@ def functions(flags):
             match.chosen = j
         return match
 
+    # Return the match of a feature among the landmarks within its disc.
     @wp.func
     def search(
         landmark: wp.array(dtype=vec4),

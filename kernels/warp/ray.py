@@ -66,6 +66,7 @@ def functions(flags):
         dy = pose.w * ray.x + pose.z * ray.y
         return vec2(wp.where(wp.abs(dx) < TINY, ZERO, dx), wp.where(wp.abs(dy) < TINY, ZERO, dy))
 
+    # Return the ray of a pose and a beam.
     @wp.func
     def make_ray(pose: vec4, ray: vec2):
         r = Ray()

@@ -29,18 +29,20 @@ RECTANGLE_REACH = wp.constant(254)
 STACK = wp.constant(256)
 
 
+# Return the index of a cell in a padded plane.
 @wp.func
 def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
     return (row + 1) * (cols + 2) + col + 1
 
 
-# Return the first cell, or one beyond the last cell, whose rectangle can contain a cell of [low, high) along an axis;
-# rectangles extend to larger (way 1) or smaller (way -1) indices.
+# Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
+# larger (way 1) or smaller (way -1) indices.
 @wp.func
 def reach_begin(way: wp.int32, low: wp.int32):
     return wp.where(way > 0, wp.max(low - RECTANGLE_REACH, 0), low)
 
 
+# Return one beyond the last cell whose rectangle can contain a cell before high.
 @wp.func
 def reach_end(way: wp.int32, high: wp.int32, size: wp.int32):
     return wp.where(way > 0, high, wp.min(high + RECTANGLE_REACH, size))

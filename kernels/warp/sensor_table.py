@@ -24,6 +24,7 @@ def functions(flags):
             return cells
         return wp.min(int(distance * per_metre), cells - 1)
 
+    # Return log p of a reading for an expected range.
     @wp.func
     def tabulated_density(
         z: real, expected: real, sensor: wp.array(dtype=real), cells: wp.int32, per_metre: real, range_max: real

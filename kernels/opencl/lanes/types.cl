@@ -18,6 +18,7 @@ int any_lane(const ilanes holds) {
     return (two.x | two.y) != 0;
 }
 
+// Return the sum of all lanes.
 real sum_lanes(const lanes a) {
     const double4 four = a.lo + a.hi;
     const double2 two = four.lo + four.hi;
@@ -48,6 +49,7 @@ int any_lane(const ilanes holds) {
     return (two.x | two.y) != 0;
 }
 
+// Return the sum of all lanes.
 real sum_lanes(const lanes a) {
     const float8 eight = a.lo + a.hi;
     const float4 four = eight.lo + eight.hi;

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense._kernel_files import opencl_names, opencl_source
 from gpusense.backends import get_backend
 from gpusense.lanes import widened
-from gpusense.signatures import LANES, lanes_of
+from gpusense.signatures import KERNELS, LANES, lanes_of
+from gpusense.sources import assemble, relevant, required_files
 from gpusense.tolerances import beam_tolerance, differing
 
 RANGE = 9.0
@@ -146,6 +148,30 @@ def test_only_scenes_that_have_such_kernels_get_them():
     assert widened(wide, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
     assert widened(wide, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
     assert widened(wide, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
+
+
+def test_programs_in_lanes_begin_in_their_folder():
+    for file in {row.file for row in KERNELS.values()}:
+        scalar, wide = required_files(file), required_files(file, frozenset({"WIDE"}))
+        assert not any(name.startswith("lanes/") for name in scalar)
+        assert scalar[-1] == file
+        if f"lanes/{file}" in opencl_names():
+            assert wide[-1] == f"lanes/{file}"
+            assert "lanes/types" in wide
+            assert file not in wide or "kernel void" not in opencl_source(file)
+            assert "WIDE" in relevant(file, frozenset({"WIDE"}))
+            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"WIDE"}))
+        else:
+            assert wide == scalar
+            assert "WIDE" not in relevant(file, frozenset({"WIDE"}))
+
+
+def test_scalar_files_hold_nothing_of_vectors():
+    for name in opencl_names():
+        text = opencl_source(name)
+        assert "WIDE" not in text.replace("WIDE_", "")
+        if not name.startswith("lanes/"):
+            assert "lanes" not in text.split("// requires:")[-1].splitlines()[0]
 
 
 @pytest.mark.parametrize(

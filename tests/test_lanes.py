@@ -19,7 +19,7 @@ from gpusense.sources import assemble, relevant, required_files
 from gpusense.tolerances import beam_tolerance, differing
 
 RANGE = 9.0
-KERNELS = ("cast_ranges", "score_beams", "score_field")
+KINDS = ("cast_ranges", "score_beams", "score_field")
 
 
 @pytest.fixture
@@ -83,10 +83,10 @@ def compiled(device, monkeypatch):
 @pytest.mark.parametrize(("particles", "beams"), [(1, 1), (15, 15), (16, 16), (17, 33), (63, 40), (130, 200)])
 def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled):
     one = results(device(1), particles, beams, outside)
-    assert all(compiled[kernel] == {1} for kernel in KERNELS)
+    assert all(compiled[kernel] == {1} for kernel in KINDS)
     compiled.clear()
     found = results(device(LANES), particles, beams, outside)
-    assert all(compiled[kernel] == {LANES} for kernel in KERNELS)
+    assert all(compiled[kernel] == {LANES} for kernel in KINDS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
     # Drivers have elementary functions of their own for vectors.

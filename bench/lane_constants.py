@@ -1,4 +1,4 @@
-"""The constants of ``kernels/opencl/lane_math.cl``, derived with mpmath: run it to see them and their errors.
+"""The constants of ``kernels/opencl/lanes/math.cl``, derived with mpmath: run it to see them and their errors.
 
 Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
 |r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);

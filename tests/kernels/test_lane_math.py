@@ -1,4 +1,4 @@
-"""Functions of kernels/opencl/lane_math.cl against float64, in ulps of float32, and where their constants are from."""
+"""Functions of kernels/opencl/lanes/math.cl against float64, in ulps of float32, and where their constants are from."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def spread(low: float, high: float) -> np.ndarray:
 # Arguments, and the function in float64.
 FUNCTIONS = {
     "exp_lanes": (-spread(1e-30, 87.0), np.exp),
-    "one_minus_exp": (-spread(1e-36, 200.0), lambda a: -np.expm1(a)),
+    "one_minus_exp_lanes": (-spread(1e-36, 200.0), lambda a: -np.expm1(a)),
     "log_lanes": (np.concatenate([spread(NORMAL, 3e38), spread(0.5, 2.0)]), np.log),
     "erf_lanes": (spread(1e-36, 6.0), special.erf),
 }
@@ -46,7 +46,7 @@ def evaluate(needs):
     from gpusense.backends import get_backend
 
     backend = get_backend(selection)
-    files = [resolve(opencl_source(name), frozenset({"WIDE", "HIT", "SHORT"}), name) for name in ("lanes", "lane_math")]
+    files = [resolve(opencl_source(name), frozenset(), name) for name in ("lanes/types", "lanes/math")]
     context = backend._context
     queue = cl.CommandQueue(context)
 
@@ -83,8 +83,8 @@ def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
     """The rest that is added to t for arctan t, in ulps of arctan t."""
     t = spread(1e-30, 0.41421356)
     exact = np.arctan(t.astype(np.float64))
-    off = np.abs(evaluate("arc_rest", t) - (exact - t)) / np.spacing(exact.astype(np.float32))
-    print(f"arc_rest: {off.max():.3f} ulp at {t[int(np.argmax(off))]!r}")
+    off = np.abs(evaluate("arc_rest_lanes", t) - (exact - t)) / np.spacing(exact.astype(np.float32))
+    print(f"arc_rest_lanes: {off.max():.3f} ulp at {t[int(np.argmax(off))]!r}")
     assert off.max() <= 0.2
 
 
@@ -99,7 +99,7 @@ def test_ends(evaluate):
         return together
 
     assert at("exp_lanes", 0.0, -0.0, -88.0, -1e9, -3e38, -np.inf) == [1, 1, 0, 0, 0, 0]
-    assert at("one_minus_exp", 0.0, -20.0, -1e9, -np.inf) == [0, 1, 1, 1]
+    assert at("one_minus_exp_lanes", 0.0, -20.0, -1e9, -np.inf) == [0, 1, 1, 1]
     assert at("log_lanes", 1.0) == [0]
     assert at("erf_lanes", 0.0, 4.0, 1e9, np.inf) == [0, 1, 1, 1]
 
@@ -125,7 +125,7 @@ def test_constants_are_those_that_were_derived():
             assert error < -24
             expected |= {f"{name}{i}": powers[i] for i in range(len(powers))}
         expected |= dict(zip(("LOG2_HIGH", "LOG2_LOW", "ONE_OVER_LOG2"), made.log_parts(), strict=True))
-    text = opencl_source("lane_math")
+    text = opencl_source("lanes/math")
     defined = re.findall(r"^#define (\w+) (\S+)f$", text, re.MULTILINE)
     found = {name: float(np.float32(value)) for name, value in defined}
     assert {name: found[name] for name in expected} == expected

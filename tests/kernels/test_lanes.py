@@ -13,11 +13,13 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import beam_tolerance, differing
+from gpusense.interface.kernel_files import opencl_names, opencl_source
 from gpusense.interface.lanes import widened
-from gpusense.interface.signatures import LANES, lanes_of
+from gpusense.interface.signatures import KERNELS, LANES, lanes_of
+from gpusense.interface.sources import assemble, relevant, required_files
 
 RANGE = 9.0
-KERNELS = ("cast_ranges", "score_beams", "score_field")
+KINDS = ("cast_ranges", "score_beams", "score_field")
 
 
 @pytest.fixture
@@ -81,10 +83,10 @@ def compiled(device, monkeypatch):
 @pytest.mark.parametrize(("particles", "beams"), [(1, 1), (15, 15), (16, 16), (17, 33), (63, 40), (130, 200)])
 def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled):
     one = results(device(1), particles, beams, outside)
-    assert all(compiled[kernel] == {1} for kernel in KERNELS)
+    assert all(compiled[kernel] == {1} for kernel in KINDS)
     compiled.clear()
     found = results(device(LANES), particles, beams, outside)
-    assert all(compiled[kernel] == {LANES} for kernel in KERNELS)
+    assert all(compiled[kernel] == {LANES} for kernel in KINDS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
     # Drivers have elementary functions of their own for vectors.
@@ -146,6 +148,30 @@ def test_only_scenes_that_have_such_kernels_get_them():
     assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
     assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
     assert widened(wide.lanes, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
+
+
+def test_programs_in_lanes_begin_in_their_folder():
+    for file in {row.file for row in KERNELS.values()}:
+        scalar, wide = required_files(file), required_files(file, frozenset({"WIDE"}))
+        assert not any(name.startswith("lanes/") for name in scalar)
+        assert scalar[-1] == file
+        if f"lanes/{file}" in opencl_names():
+            assert wide[-1] == f"lanes/{file}"
+            assert "lanes/types" in wide
+            assert file not in wide or "kernel void" not in opencl_source(file)
+            assert "WIDE" in relevant(file, frozenset({"WIDE"}))
+            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"WIDE"}))
+        else:
+            assert wide == scalar
+            assert "WIDE" not in relevant(file, frozenset({"WIDE"}))
+
+
+def test_scalar_files_hold_nothing_of_vectors():
+    for name in opencl_names():
+        text = opencl_source(name)
+        assert "WIDE" not in text.replace("WIDE_", "")
+        if not name.startswith("lanes/"):
+            assert "lanes" not in text.split("// requires:")[-1].splitlines()[0]
 
 
 @pytest.mark.parametrize(

@@ -32,10 +32,10 @@ FIND = """
 import json
 import sys
 import gpusense
-from gpusense.interface.kernel_files import kernel_root, opencl_source
+from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source
 
 root = kernel_root()
-sources = {path.stem: opencl_source(path.stem) for path in root.glob("opencl/*.cl")}
+sources = {name: opencl_source(name) for name in opencl_names()}
 print(json.dumps({"package": gpusense.__file__, "root": str(root), "path": sys.path, "opencl": sources}))
 """
 
@@ -227,8 +227,9 @@ def test_kernels_are_found(layout: Layout, checkout: Path, tmp_path: Path) -> No
     assert Path(report["package"]).parent == layout.package
     assert Path(report["root"]) == layout.kernels
     assert str(layout.kernels) not in report["path"]
-    sources = (checkout / "kernels" / "opencl").glob("*.cl")
-    assert report["opencl"] == {path.stem: path.read_text(encoding="utf-8") for path in sources}
+    sources = contents(checkout / "kernels" / "opencl")
+    assert report["opencl"] == {name.removesuffix(".cl"): text.decode() for name, text in sources.items()}
+    assert any(name.startswith("lanes/") for name in sources)
 
 
 @needs_warp

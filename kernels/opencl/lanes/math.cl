@@ -1,25 +1,25 @@
-// Exponentials, logarithms and the error function in lanes; PoCL's own are calls that pass vectors through memory.
-// e^a = 2^k e^r with |r| <= log(2)/2 and e^r = 1 + r + r^2 E(r); log(2^k (1 + f)) = k log 2 + f - f^2/2 + f^3 L(f) with
-// 1 + f from sqrt(1/2) to sqrt(2); erf(x) = 1 - exp(-x W(x)); arctan t = t + t^3 A(t^2). bench/lane_constants.py derives the constants;
-// tests/test_lane_math.py measures the worst errors that stand here, in ulps of float32.
-// requires: lanes
+// Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors
+// through memory. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
+//     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
+//     erf(x) = 1 - exp(-x W(x));   arctan t = t + t^3 A(t^2).
+// bench/lane_constants.py derives the constants; tests/test_lane_math.py measures the worst errors that stand below, in
+// ulps of float32.
+// requires: lanes/types
 
-#if WIDE
-#if !FLOAT64
-// log 2 in a part of 16 bits, which has exact products with counts, and the rest.
+// log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
 #define LOG2_HIGH 0.693145752f
 #define LOG2_LOW 1.42860677e-06f
 #define ONE_OVER_LOG2 1.44269502f
-// 1.5 * 2^23: a sum with it is rounded to a whole number, which its last bits are.
+// 1.5 * 2^23: a sum with it is rounded to a whole number, which stands in its last bits.
 #define LANE_ROUNDER 12582912.0f
-// e to this is next to the smallest number that is no denormal, and to that below half of the last bit of 1.
+// e^EXP_ZERO is close to the smallest normal number; e^EXP_LOST is below half of the last bit of 1.
 #define EXP_ZERO -87.0f
 #define EXP_LOST -20.0f
 // Bits of sqrt(1/2).
 #define ROOT_HALF 0x3f3504f3
-// The error function is 1 to the last bit from here on.
+// From here on the error function is 1 to the last bit.
 #define LANE_ERF_ONE 4.0f
-// E, L, A and W, lowest power first; relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t) and 2^-24.2.
+// E, L, A and W, lowest power first. Their relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t) and 2^-24.2.
 #define E0 0.49999997f
 #define E1 0.166665465f
 #define E2 0.041667223f
@@ -48,29 +48,29 @@
 #define W7 0.000117640826f
 #define W8 -9.25621225e-06f
 
-// e^r - 1, and the count k, for e^a. Polynomials are summed in pairs, for processors to compute side by side.
-lanes reduced_exp(const lanes a, ilanes *count) {
+// Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
+lanes reduced_exp_lanes(const lanes a, ilanes *count) {
     const lanes shifted = a * ONE_OVER_LOG2 + LANE_ROUNDER, k = shifted - LANE_ROUNDER;
     const lanes r = (a - k * LOG2_HIGH) - k * LOG2_LOW, square = r * r;
     *count = as_ilanes(shifted) - as_int(LANE_ROUNDER);
     return r + square * ((E0 + E1 * r) + square * ((E2 + E3 * r) + square * E4));
 }
 
-// e^a for a <= 0, within 1.1 ulp; 0 instead of denormal numbers, which processors are slow to compute with.
+// Return e^a for a <= 0, within 1.1 ulp. Denormal results become 0: processors compute slowly with them.
 lanes exp_lanes(const lanes a) {
     ilanes k;
-    const lanes rest = reduced_exp(a, &k), found = (1.0f + rest) * as_lanes((k + 127) << 23);
-    return a < EXP_ZERO ? (lanes)0 : found;
+    const lanes rest = reduced_exp_lanes(a, &k), power = (1.0f + rest) * as_lanes((k + 127) << 23);
+    return a < EXP_ZERO ? (lanes)0 : power;
 }
 
-// 1 - e^a for a <= 0, within 1.1 ulp. Nothing cancels: without a count the first term is 0.
-lanes one_minus_exp(const lanes a) {
+// Return 1 - e^a for a <= 0, within 1.1 ulp. Nothing cancels: where the count is 0, so is the first term.
+lanes one_minus_exp_lanes(const lanes a) {
     ilanes k;
-    const lanes rest = reduced_exp(a < EXP_LOST ? (lanes)EXP_LOST : a, &k), scale = as_lanes((k + 127) << 23);
+    const lanes rest = reduced_exp_lanes(a < EXP_LOST ? (lanes)EXP_LOST : a, &k), scale = as_lanes((k + 127) << 23);
     return (1.0f - scale) - scale * rest;
 }
 
-// log(p) for a finite p > 0 that is no denormal, within 0.9 ulp.
+// Return log(p) of a finite normal number p > 0, within 0.9 ulp.
 lanes log_lanes(const lanes p) {
     const ilanes above = as_ilanes(p) - ROOT_HALF;
     const lanes k = to_lanes(above >> 23), f = as_lanes((above & 0x7fffff) + ROOT_HALF) - 1.0f, square = f * f;
@@ -79,19 +79,17 @@ lanes log_lanes(const lanes p) {
     return (f + ((cubic + k * LOG2_LOW) - 0.5f * square)) + k * LOG2_HIGH;
 }
 
-// arctan t - t for |t| <= tan(pi/8).
-lanes arc_rest(const lanes t) {
+// Return arctan t - t for |t| <= tan(pi/8).
+lanes arc_rest_lanes(const lanes t) {
     const lanes z = t * t;
     return t * z * ((A0 + A1 * z) + z * z * ((A2 + A3 * z) + z * z * A4));
 }
 
-// erf(x) for x >= 0, within 3.8 ulp, 1 from 4 on.
+// Return erf(x) for x >= 0, within 3.8 ulp; exactly 1 from 4 on.
 lanes erf_lanes(const lanes x) {
-    if (!some(x < LANE_ERF_ONE)) return (lanes)1.0f;
+    if (!any_lane(x < LANE_ERF_ONE)) return (lanes)1.0f;
     const lanes b = x < LANE_ERF_ONE ? x : (lanes)LANE_ERF_ONE;
     const lanes square = b * b, low = (W0 + W1 * b) + square * (W2 + W3 * b);
     const lanes high = (W4 + W5 * b) + square * ((W6 + W7 * b) + square * W8);
-    return one_minus_exp(-b * (low + (square * square) * high));
+    return one_minus_exp_lanes(-b * (low + (square * square) * high));
 }
-#endif
-#endif

@@ -1,7 +1,7 @@
-"""The discrete model: what its rows look like, and how fast it tends to continuous densities as bins shrink.
+"""Draw rows of the discrete model, and measure how fast it tends to continuous densities as bins shrink.
 
-    python bench/discrete_convergence.py        # writes docs/img/discrete_*.png, prints the table of docs/discrete.md
-    python bench/discrete_convergence.py --output DIRECTORY --most 512
+    python bench/accuracy/discrete_convergence.py           # docs/img/discrete_*.png, and the table of docs/discrete.md
+    python bench/accuracy/discrete_convergence.py --figures DIRECTORY --most 512
 
 *Convergence*: the largest difference of densities (probability over width) from the continuous model, over readings and
 expected ranges but next to p_short's jump at z*, for the causes of a mixture (limit: the mixture) and for separate
@@ -12,7 +12,7 @@ independent.
 
 from __future__ import annotations
 
-import argparse
+import sys
 from pathlib import Path
 
 import matplotlib as mpl
@@ -22,6 +22,10 @@ from scipy.stats import truncnorm
 import gpusense as gs
 from gpusense.models.scan.densities import log_mixture
 from gpusense.plots.drawing import new_figure, save
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import FIGURES, make_parser, parse, publish, table
 
 mpl.use("Agg")
 RANGE = 6.0
@@ -36,13 +40,13 @@ SENSORS = {
 
 
 def mixture_limit() -> tuple[np.ndarray, np.ndarray]:
-    """Densities of the mixture, and its probability of no return."""
+    """Return the densities of the mixture, and its probability of no return."""
     log_p = log_mixture(READINGS, EXPECTED[:, None], range_max=RANGE, **MIXTURE.to_dict())
     return np.exp(log_p), np.full(len(EXPECTED), MIXTURE.z_max)
 
 
 def waiting_limit() -> tuple[np.ndarray, np.ndarray]:
-    """Densities of the first of three waits, and the probability that none ends."""
+    """Return the densities of the first of three waits, and the probability that none ends."""
     z, c, ahead = READINGS, CAUSES, EXPECTED[:, None]
     normal = truncnorm(-ahead / c.sigma_hit, (RANGE - ahead) / c.sigma_hit, loc=ahead, scale=c.sigma_hit)
     missed = 1 - c.p_detect * normal.cdf(z)
@@ -53,16 +57,16 @@ def waiting_limit() -> tuple[np.ndarray, np.ndarray]:
 
 
 def errors(causes: object, limit: tuple[np.ndarray, np.ndarray], bins: int, away: float) -> tuple[float, float]:
-    """Largest errors of density [1/m] and of the probability of no return."""
-    table = gs.DiscreteBeamModel(causes, RANGE, bins)
-    found = np.exp(table.log_likelihood(*np.broadcast_arrays(READINGS, EXPECTED[:, None])))
-    none = np.exp(table.log_likelihood(np.full(len(EXPECTED), np.inf), EXPECTED))
+    """Return the largest errors of density [1/m] and of the probability of no return."""
+    model = gs.DiscreteBeamModel(causes, RANGE, bins)
+    found = np.exp(model.log_likelihood(*np.broadcast_arrays(READINGS, EXPECTED[:, None])))
+    none = np.exp(model.log_likelihood(np.full(len(EXPECTED), np.inf), EXPECTED))
     sure = np.abs(READINGS - EXPECTED[:, None]) > away
     return float(np.abs(found - limit[0])[sure].max()), float(np.abs(none - limit[1]).max())
 
 
 def draw_convergence(path: Path, bins: list[int]) -> list[tuple[float, ...]]:
-    """Plot errors over the width of bins; the rows of the table."""
+    """Plot errors over the width of bins, and return the rows of the table."""
     figure = new_figure(6.4, 4.6)
     ax = figure.subplots()
     width = RANGE / np.array(bins)
@@ -81,7 +85,7 @@ def draw_convergence(path: Path, bins: list[int]) -> list[tuple[float, ...]]:
 
 
 def independent(c: gs.DiscreteCauses, expected: float) -> gs.BeamParameters:
-    """A mixture whose components have the shares that the causes would have if none hid another."""
+    """Make a mixture whose components have the shares that the causes would have if none hid another."""
     short, rand = 1 - np.exp(-c.lambda_short * expected), 1 - np.exp(-c.lambda_rand * RANGE)
     none = 1 - c.p_detect
     total = c.p_detect + short + rand + none
@@ -90,7 +94,7 @@ def independent(c: gs.DiscreteCauses, expected: float) -> gs.BeamParameters:
 
 
 def draw_rows(path: Path) -> None:
-    """Rows of the tables of two sensors at two distances."""
+    """Draw rows of the tables of two sensors at two distances."""
     figure = new_figure(11.0, 6.4)
     axes = figure.subplots(2, 2, sharey="row")
     for row, (name, causes) in zip(axes, SENSORS.items(), strict=True):
@@ -108,21 +112,26 @@ def draw_rows(path: Path) -> None:
     save(figure, path)
 
 
-def main() -> None:
-    """Plots, then the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parents[1] / "docs" / "img")
+def main() -> int:
+    """Draw the plots and write the table."""
+    parser = make_parser(__doc__, backend="")
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the drawings (default: docs/img)")
     parser.add_argument("--most", type=int, default=2048, help="most bins")
-    arguments = parser.parse_args()
-    arguments.output.mkdir(parents=True, exist_ok=True)
+    arguments = parse(parser)
+    arguments.figures.mkdir(parents=True, exist_ok=True)
     bins = [2**k for k in range(5, 13) if 2**k <= arguments.most]
-    rows = draw_convergence(arguments.output / "discrete_convergence.png", bins)
-    draw_rows(arguments.output / "discrete_rows.png")
-    print("| bins | width [m] | a mixture's causes: density [1/m] | no return | separate causes: density | no return |")
-    print("| --- " * 6 + "|")
-    for count, (width, *values) in zip(bins, rows, strict=True):
-        print(f"| {count} | {width:.4f} | " + " | ".join(f"{value:.1e}" for value in values) + " |")
+    rows = draw_convergence(arguments.figures / "discrete_convergence.png", bins)
+    draw_rows(arguments.figures / "discrete_rows.png")
+    columns = (
+        "bins", "width [m]", "a mixture's causes: density [1/m]", "no return", "separate causes: density", "no return",
+    )  # fmt: skip
+    lines = (
+        [count, f"{width:.4f}", *(f"{value:.1e}" for value in values)]
+        for count, (width, *values) in zip(bins, rows, strict=True)
+    )
+    publish(__file__, arguments, table(columns, lines), {"bins": bins, "rows": rows})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,6 +1,6 @@
-"""PoCL's proof on processors that are not here: QEMU's user mode emulates their instruction sets.
+"""Prove PoCL on processors that this machine is not: QEMU's user mode emulates their instruction sets.
 
-    python bench/emulated_processors.py --output bench/results/emulated_processors
+    python bench/accuracy/emulated_processors.py --output bench/results/emulated_processors
 
 Needs ``qemu-x86_64`` (Debian: qemu-user) and PoCL's wheel. For each processor the proof of
 ``gpusense.evaluation.proof`` runs in an emulated interpreter: LLVM and PoCL see the emulated CPUID, and an instruction
@@ -10,7 +10,6 @@ file. It emulates AVX2, but neither AVX-512 nor AMD's FMA4 and XOP; NumPy's whee
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -21,7 +20,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from speed import publish
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import ROOT, make_parser, parse, publish, table
 
 _NEHALEM = "sse sse2 pni ssse3 cx16 sse4_1 sse4_2 popcnt"
 _HASWELL = f"{_NEHALEM} avx f16c avx2 fma abm bmi1 bmi2 movbe"
@@ -49,12 +50,11 @@ prove({"info": dataclasses.asdict(info)}, lambda said: print(json.dumps(said), f
 
 
 def proved(model: str, flags: str) -> dict[str, Any]:
-    """Run the proof on one processor and return what it said."""
+    """Run the proof on one processor and return its outcome."""
     with tempfile.TemporaryDirectory() as folder:
         cpuinfo = Path(folder) / "cpuinfo"
         cpuinfo.write_text(f"processor\t: 0\nmodel name\t: {model}\nflags\t\t: {flags}\n")
-        here = str(Path(__file__).resolve().parent.parent)
-        path = json.dumps([here, *(entry for entry in sys.path if entry)])
+        path = json.dumps([str(ROOT), *(entry for entry in sys.path if entry)])
         python = os.path.realpath(sys.executable)
         command = ["qemu-x86_64", "-cpu", model, python, "-P", "-c", _PROOF, path, str(cpuinfo)]
         places = {"GPUSENSE_PROOF": "off", "GPUSENSE_CACHE_DIR": folder, "XDG_CACHE_HOME": folder}
@@ -71,20 +71,19 @@ def proved(model: str, flags: str) -> dict[str, Any]:
 
 def main() -> int:
     """Run the proofs and write; the exit code is 1 where one fails."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, backend="")
     parser.add_argument("--processor", action="append", choices=PROCESSORS, help="default: all")
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     if shutil.which("qemu-x86_64") is None:
         parser.error("qemu-x86_64 is not installed (Debian: qemu-user)")
     rows = [proved(model, PROCESSORS[model]) for model in arguments.processor or PROCESSORS]
-    lines = ["| processor | LLVM's name | target | lanes | proved | s |", "| --- | --- | --- | --- | --- | --- |"]
-    for row in rows:
-        verdict = row["failure"] or ", ".join(row["proved"])
-        cells = (row.get("named", "-"), row.get("target", "-"), row.get("lanes", "-"), verdict, f"{row['seconds']:.0f}")
-        lines.append(f"| {row['processor']} | " + " | ".join(map(str, cells)) + " |")
-    publish(Path(__file__).name, arguments, "\n".join(lines), {"rows": rows}, "Emulated by QEMU.")
+    columns = ("processor", "LLVM's name", "target", "lanes", "proved", "s")
+    named = ("named", "target", "lanes")
+    lines = [
+        [r["processor"], *(r.get(name, "-") for name in named), r["failure"] or ", ".join(r["proved"]),
+         f"{r['seconds']:.0f}"] for r in rows
+    ]  # fmt: skip
+    publish(__file__, arguments, table(columns, lines), {"rows": rows}, "Emulated by QEMU.")
     return int(any(row["failure"] for row in rows))
 
 

@@ -1,7 +1,7 @@
-"""Extreme sizes and levels: 100 000 beams, 10 000 000 particles, maps of 20 000 x 20 000 cells, log p of -1e9.
+"""Try extreme sizes and levels: 100 000 beams, 10 000 000 particles, maps of 400 million cells, log p of -1e9.
 
-    python bench/extreme.py --backend opencl --backend warp:cpu --output bench/results/extreme-cpu
-    python bench/extreme.py --full --part sizes               # sizes meant for a GPU; nothing is left out
+    python bench/accuracy/extreme.py --backend opencl --backend warp:cpu --output bench/results/extreme-cpu
+    python bench/accuracy/extreme.py --full --part sizes               # sizes meant for a GPU; nothing is left out
 
 Parts: *sizes* are long scans and large clouds; *products* weights that nav2 and Beluga would make of the same beams;
 *maps* large grids with a local and a global cloud; *levels* log-likelihoods around -1e9. Prints tables and writes JSON.
@@ -13,11 +13,8 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import json
 import math
 import resource
-import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -29,10 +26,13 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands.common import machine
 from gpusense.evaluation.replay import Recorder, replay
 from gpusense.evaluation.tolerances import differing, per_scan
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import make_parser, note, parse, publish, table, table_line
 
 RANGE_MAX, SIGMA, FARTHEST = 30.0, 0.2, 2.0  # metres; the last two are nav2's defaults for its field
 SIZES, LARGER = ((1_000, 100_000), (1_000_000, 1_000), (10_000_000, 4)), ((10_000, 100_000), (10_000_000, 60))
@@ -52,22 +52,22 @@ Row = dict[str, Any]
 
 
 def exp_of_sum(density: np.ndarray) -> np.ndarray:
-    """nav2_amcl likelihood_field_model_prob.cpp and Beluga likelihood_field_prob_model.hpp: exp of the sum of log p."""
+    """Weigh as nav2_amcl's likelihood_field_model_prob.cpp and Beluga's likelihood_field_prob_model.hpp do."""
     return np.exp(np.log(density).sum(axis=1))
 
 
 def product(density: np.ndarray) -> np.ndarray:
-    """The book's table 6.3 as it stands: ``q = q * p``."""
+    """Weigh as the book's table 6.3 does as it stands: ``q = q * p``."""
     return np.prod(density, axis=1)
 
 
 def nav2_weights(raw: np.ndarray) -> np.ndarray:
-    """nav2_amcl pf.c, pf_update_sensor: over the total where that is positive, else uniform without a word."""
+    """Normalise as nav2_amcl's pf_update_sensor does: uniform without a warning where the total is 0."""
     return raw / raw.sum() if raw.sum() > 0 else np.full(len(raw), 1 / len(raw))
 
 
 def beluga_weights(raw: np.ndarray) -> np.ndarray:
-    """Beluga actions/normalize.hpp: over the total, whatever that is."""
+    """Normalise as Beluga's actions/normalize.hpp does, whatever the total is."""
     return raw / raw.sum()
 
 
@@ -79,24 +79,25 @@ class Scene:
         self.pose = free_pose(self.grid, np.random.default_rng(seed))
 
     def scan(self, beams: int) -> tuple[gs.Scanner, np.ndarray, int]:
-        """A scanner that looks all around, what it reads, and how many of its readings are ranges."""
+        """Draw a scan: the scanner, its readings, and the number of ranges among them."""
         scanner, rng = around(beams), np.random.default_rng((self.seed, beams))
         ranges = simulate_scan(self.grid, scanner, self.pose, gs.BeamParameters(), rng)
         return scanner, ranges, int(np.count_nonzero(np.isfinite(ranges)))
 
     def cloud(self, kind: str, particles: int) -> np.ndarray:
-        """Particles around the pose of the scan, or all over the building."""
+        """Draw particles around the pose of the scan, or all over the building."""
         rng, local = np.random.default_rng((self.seed, particles)), kind == "tracking"
         return cloud_around(self.pose, particles, 0.3, 0.1, rng) if local else cloud_uniform(self.grid, particles, rng)
 
 
 def around(beams: int) -> gs.Scanner:
+    """Make a scanner that looks all around."""
     step = 2 * math.pi / beams
     return gs.Scanner.uniform(angle_min=-math.pi, angle_increment=step, count=beams, range_max=RANGE_MAX)
 
 
 def weighed(log_p: np.ndarray) -> Row:
-    """Log-likelihoods and their weights in numbers."""
+    """Describe log-likelihoods and their weights in numbers."""
     row = {"finite": int(np.count_nonzero(np.isfinite(log_p))), "least": float(log_p.min()), "most": float(log_p.max())}
     made = gs.normalize_weights(log_p)
     apart, zero = abs(math.fsum(made.weights) - 1), int(np.count_nonzero(made.weights == 0))
@@ -105,7 +106,7 @@ def weighed(log_p: np.ndarray) -> Row:
 
 
 def judged(make: Callable[..., Any], backend: str, poses: np.ndarray, ranges: np.ndarray, found: np.ndarray) -> Row:
-    """A few particles again: errors against float64 on their rounded inputs, bound, and bits that batching changed."""
+    """Score a few particles again: errors against float64 on their rounded inputs, and bits that batching changed."""
     recorder = Recorder(get_backend(backend))
     again, _ = make(backend=recorder).log_likelihood(poses, ranges, per_beam=True)
     truth, parts = replay(launch := recorder.launches[0])
@@ -116,7 +117,7 @@ def judged(make: Callable[..., Any], backend: str, poses: np.ndarray, ranges: np
 
 
 def sizes(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Long scans and large clouds."""
+    """Yield long scans and large clouds."""
     scene, info = Scene(arguments.seed), get_backend(backend).info
     for particles, beams in SIZES + (LARGER if arguments.full else ()):
         scanner, ranges, hits = scene.scan(beams)
@@ -140,7 +141,7 @@ def sizes(backend: str, precision: str, arguments: argparse.Namespace) -> Iterat
 
 
 def products(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Weights of 1000 particles, ours and those that peers make of the same densities."""
+    """Yield weights of 1000 particles, ours and those that peers make of the same densities."""
     scene, particles = Scene(arguments.seed), 1_000
     for beams in PRODUCTS:
         scanner, ranges, hits = scene.scan(beams)
@@ -169,7 +170,7 @@ def products(backend: str, precision: str, arguments: argparse.Namespace) -> Ite
 
 
 def rooms(side: int, rng: np.random.Generator) -> np.ndarray:
-    """Rooms of 160 x 160 cells with doors and a pillar each: (side, side) cells, 100 where occupied."""
+    """Draw rooms of 160 x 160 cells with doors and a pillar each: (side, side) cells, 100 where occupied."""
     cells, corners = np.zeros((side, side), np.int8), np.arange(0, side, 160)
     cells[corners], cells[:, corners] = 100, 100
     for row in corners:
@@ -181,7 +182,7 @@ def rooms(side: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def cut(grid: gs.OccupancyGrid, pose: np.ndarray) -> gs.OccupancyGrid:
-    """What a scan can reach from a pose as a map of its own, exactly: cells of 1 / 16 m add up without rounding."""
+    """Cut out the part that a scan can reach from a pose, exactly: cells of 1 / 16 m add up without rounding."""
     reach, col, row = math.ceil((RANGE_MAX + FARTHEST) / grid.resolution) + 4, *(pose[:2] // grid.resolution)
     low_row, low_col = max(int(row) - reach, 0), max(int(col) - reach, 0)
     cells = grid.cells[low_row : int(row) + reach, low_col : int(col) + reach]
@@ -189,7 +190,7 @@ def cut(grid: gs.OccupancyGrid, pose: np.ndarray) -> gs.OccupancyGrid:
 
 
 def maps(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Large grids: clouds in one place and all over, a few particles held to NumPy on a cut-out around each."""
+    """Yield large grids: clouds in one place and all over, some particles held to NumPy on a cut-out around each."""
     for side in arguments.side or [20_000]:
         rng, metres = np.random.default_rng(arguments.seed), side / 16
         grid, scanner = gs.OccupancyGrid(rooms(side, rng), 1 / 16), around(60)
@@ -220,7 +221,7 @@ def maps(backend: str, precision: str, arguments: argparse.Namespace) -> Iterato
 
 
 def levels(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """A scan of 1000 beams that only p_hit may explain, sigma such that log p is about -1e9; in both precisions."""
+    """Yield scans of 1000 beams that only p_hit may explain, with a sigma that makes log p about -1e9."""
     scene = Scene(arguments.seed)
     scanner, ranges, _ = scene.scan(1_000)
     narrow = cloud_around(scene.pose, 1_000, 1e-9, 1e-10, np.random.default_rng(scene.seed))
@@ -250,48 +251,43 @@ COLUMNS = {
 }
 
 
-def line(part: str, row: Row) -> str:
-    """A row of a part's table."""
-    shown = (row.get(name, "") for name in ["backend", "precision", *COLUMNS[part].split()])
-    return "| " + " | ".join(f"{value:.4g}" if isinstance(value, float) else str(value) for value in shown) + " |"
+def columns(part: str) -> list[str]:
+    """Return the columns of a part's table."""
+    return ["backend", "precision", *COLUMNS[part].split()]
+
+
+def cells(part: str, row: Row) -> list[str]:
+    """Format the cells of a row."""
+    shown = (row.get(name, "") for name in columns(part))
+    return [f"{value:.4g}" if isinstance(value, float) else str(value) for value in shown]
 
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", action="append", help="selection string; default: every device present but NumPy")
+    parser = make_parser(__doc__, backend="kernels")
     parser.add_argument("--precision", action="append", choices=("float32", "float64"), help="default: float32")
     parser.add_argument("--part", action="append", choices=tuple(PARTS), help="default: all")
     parser.add_argument("--side", action="append", type=int, help="rows and columns of a large map; default: 20000")
     parser.add_argument("--full", action="store_true", help="sizes meant for a GPU; leave nothing out")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json file")
-    arguments = parser.parse_args()
-    present = [d.selection for d in gs.devices() if d.available and d.kind != "simulator" and d.backend != "numpy"]
-    devices = [get_backend(name).info for name in arguments.backend or present]
-    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    commit = arguments.commit or subprocess.run(git, capture_output=True, text=True).stdout.strip()
+    arguments = parse(parser)
+    devices = [get_backend(name).info for name in arguments.backend]
     rows: dict[str, list[Row]] = {part: [] for part in arguments.part or PARTS}
     begin = time.perf_counter()
     for part, kept in rows.items():
-        head = ["backend", "precision", *COLUMNS[part].split()]
-        print(f"\n### {part}: {PARTS[part].__doc__}\n\n| {' | '.join(head)} |\n|{' --- |' * len(head)}")
         for device in devices:
             both = ["float32", "float64"] if part == "levels" and device.float64 else ["float32"]
             for precision in arguments.precision or both:
                 for row in PARTS[part](device.selection, precision, arguments):
                     kept.append({"backend": device.selection, "precision": precision, **row})
-                    print(line(part, kept[-1]), flush=True)
+                    note(table_line(cells(part, kept[-1])))
     seconds, peak = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    report = {
-        "command": shlex.join(["python", "bench/extreme.py", *sys.argv[1:]]), "date": time.strftime("%Y-%m-%d"),
-        "machine": {**machine(), "commit": commit}, "devices": [asdict(device) for device in devices],
-        "seconds": seconds, "peak_memory": peak, "rows": rows,
-    }  # fmt: skip
-    print(f"\n{seconds:.0f} s, at most {peak / 1e9:.1f} GB. Machine: {report['machine']}")
-    if arguments.output:
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+    tables = [
+        f"### {part}: {PARTS[part].__doc__}\n\n" + table(columns(part), (cells(part, row) for row in kept))
+        for part, kept in rows.items()
+    ]
+    report = {"devices": [asdict(d) for d in devices], "seconds": seconds, "peak_memory": peak, "rows": rows}
+    remark = f"{seconds:.0f} s, at most {peak / 1e9:.1f} GB."
+    publish(__file__, arguments, "\n\n".join(tables), report, remark)
     return int(not all(row.get("ok", True) for kept in rows.values() for row in kept))
 
 

@@ -1,6 +1,6 @@
-"""Fuzzed rays: are float32 ranges the same bits on every device?
+"""Fuzz rays: are float32 ranges the same bits on every device?
 
-    python bench/fuzz_rays.py --backend opencl --backend warp:cpu --rays 2000000 --output bench/results/fuzz_rays_cpu
+    python bench/accuracy/fuzz_rays.py --backend opencl --backend warp:cpu --rays 2000000 --output NAME
 
 Every case is a map, poses and bearings drawn to be awkward: sparse to dense maps of one cell to hundreds on a side,
 diagonal walls, resolutions from 1 mm to 100 m, origins at 5e6 m with yaw, poses on edges and corners, in walls and off
@@ -10,12 +10,7 @@ device is compared with float32 NumPy bit by bit. Exit code 1 where a bit differ
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
-import shlex
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +18,13 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends import get_backend
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import differing_bits, make_parser, parse, publish, table
+
 
 def draw_grid(rng: np.random.Generator) -> gs.OccupancyGrid:
-    """A map to trip over."""
+    """Draw a map to trip over."""
     rows, cols = (int(n) for n in np.ceil(10 ** rng.uniform(0, 2.7, 2)))
     density = rng.choice([0.0, 0.002, 0.02, 0.2, 0.7, 1.0], p=[0.05, 0.3, 0.3, 0.2, 0.1, 0.05])
     cells = np.where(rng.random((rows, cols)) < density, 100, 0)
@@ -40,7 +39,7 @@ def draw_grid(rng: np.random.Generator) -> gs.OccupancyGrid:
 
 
 def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> np.ndarray:
-    """Poses in, on the edges of, and around the map."""
+    """Draw poses in, on the edges of, and around the map."""
     rows, cols = grid.shape
     col, row = rng.uniform(-0.3 * cols - 2, 1.3 * cols + 2, count), rng.uniform(-0.3 * rows - 2, 1.3 * rows + 2, count)
     on_edge = rng.random((2, count)) < 0.25
@@ -55,14 +54,10 @@ def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> 
 
 def main() -> int:
     """Fuzz until enough rays are cast."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", action="append", help="selection string; default: every device present")
+    parser = make_parser(__doc__, backend="kernels")
     parser.add_argument("--rays", type=int, default=2_000_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path, help="path without ending for the .json file")
-    arguments = parser.parse_args()
-    present = [d.selection for d in gs.devices() if d.available and d.kind != "simulator" and d.backend != "numpy"]
-    backends = arguments.backend or present
+    arguments = parse(parser)
+    backends = arguments.backend
     rng = np.random.default_rng(arguments.seed)
     cast = maps = nothing = 0
     differing = dict.fromkeys(backends, 0)
@@ -75,22 +70,18 @@ def main() -> int:
         truth = gs.RayCaster(grid, range_max, backend="numpy", **policy).cast(poses, bearings)
         for backend in backends:
             ranges = gs.RayCaster(grid, range_max, backend=backend, **policy).cast(poses, bearings)
-            differing[backend] += int(np.count_nonzero(ranges.view(np.uint32) != truth.view(np.uint32)))
+            differing[backend] += differing_bits(ranges, truth)
         cast, maps = cast + truth.size, maps + 1
         nothing += int(np.count_nonzero(truth == np.float32(range_max)))
-    names = {backend: get_backend(backend).info for backend in backends}
-    report = {
-        "command": shlex.join(["python", "bench/fuzz_rays.py", *sys.argv[1:]]), "date": time.strftime("%Y-%m-%d"),
-        "platform": platform.platform(terse=True), "numpy": np.__version__, "rays": cast, "maps": maps,
-        "rays_without_obstacle": nothing,
-        "differing_bits_from_numpy_float32": {
-            b: {"device": names[b].name, "driver": names[b].driver, "rays": differing[b]} for b in backends
-        },
-    }  # fmt: skip
-    print(json.dumps(report, indent=1))
-    if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
+    infos = {backend: get_backend(backend).info for backend in backends}
+    rows = [
+        {"backend": info.selection, "device": info.name, "driver": info.driver, "differing_rays": differing[backend]}
+        for backend, info in infos.items()
+    ]
+    report = {"rays": cast, "maps": maps, "rays_without_obstacle": nothing, "rows": rows}
+    text = table(("backend", "device", "driver", "rays with other bits"), (row.values() for row in rows))
+    remark = f"{cast} rays in {maps} maps, {nothing} of them without an obstacle."
+    publish(__file__, arguments, text, report, remark)
     return int(any(differing.values()))
 
 

@@ -1,7 +1,7 @@
-"""Real maps and logs: how far backends lie apart, and how well both models rank the logged poses.
+"""Compare backends on real maps and logs, and measure how well both models rank the logged poses.
 
-    python bench/real_scores.py --data DATA --output bench/results/real            # everything; tens of minutes
-    python bench/real_scores.py --data DATA --scans 20 --log intel --map intel_even_05cm
+    python bench/accuracy/real_scores.py --data DATA --output bench/results/real           # everything; tens of minutes
+    python bench/accuracy/real_scores.py --data DATA --scans 20 --log intel --map intel_even_05cm
 
 Writes Markdown and JSON with devices, sizes, differences, scores and the command. Differences are those of
 ``gpusense selftest`` on a scene in each map, NumPy and every other device pairwise and with the float64 truth. Scores
@@ -12,20 +12,21 @@ every device but NumPy, and the first of them on NumPy too.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from speed import publish
-
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.commands.score import summary
 from gpusense.evaluation import selftest
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, logged_scans, score_log
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, score_log
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import make_parser, note, odd_scans, parse, present, publish, table
 
 MAPS = {
     Path(name).stem: name
@@ -54,7 +55,7 @@ COLUMNS = {
 
 
 def differences(data: Path, name: str) -> list[dict[str, Any]]:
-    """Rows of one map, each a pair of backends or a backend with the truth."""
+    """Return the rows of one map, each a pair of backends or a backend with the truth."""
     grid = gs.read_map(data / MAPS[name])
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.025, count=161, range_max=20.0)
     scene = selftest.scene_in(grid, scanner)
@@ -73,23 +74,20 @@ def differences(data: Path, name: str) -> list[dict[str, Any]]:
 
 
 def scores(data: Path, name: str, kind: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Both the fast devices on many scans and every device on a few."""
-    folder = data / "carmen_logs"
-    grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
-    log = folder / f"{name}-corrected.log.gz"
-    odd = logged_scans(log, every=2, offset=1)
+    """Score many scans on the fast devices, and some on every device."""
+    grid, odd = odd_scans(data, name)
     some = odd[:: max(-(-len(odd) // arguments.scans), 1)] if arguments.scans else odd
     scanner = some[0][1].scanner
     make, parameters = {
         "beam": (gs.BeamModel, BEAM_PARAMETERS), "field": (gs.LikelihoodFieldModel, FIELD_PARAMETERS),
     }[kind]  # fmt: skip
-    names = [device.selection for device in gs.devices() if device.available and device.kind != "simulator"]
+    names = present()
     fast = [backend for backend in names if backend != "numpy"]
     cloud = Cloud(arguments.particles)
 
     def score(backends: list[str], scans: list) -> tuple[list, list]:
         models = [make(grid, scanner, parameters, backend=b, temperature=arguments.temperature) for b in backends]
-        return score_log(models, scans, cloud, lambda text: print(name, kind, text, file=sys.stderr, flush=True))
+        return score_log(models, scans, cloud, lambda text: note(f"{name} {kind} {text}"))
 
     many, agreement = score(fast or names, some)
     few, every = score(names, some[: arguments.numpy_scans]) if fast and arguments.numpy_scans else ([], [])
@@ -104,60 +102,57 @@ def scores(data: Path, name: str, kind: str, arguments: argparse.Namespace) -> d
 
 
 def to_markdown(maps: list[dict[str, Any]], logs: list[dict[str, Any]]) -> str:
-    """Three tables: differences, scores, agreement of rankings."""
-    lines = ["### Largest differences between backends on real maps", ""]
-    lines += ["| map | cells | pair | " + " | ".join(COLUMNS.values()) + " |", "| --- " * (3 + len(COLUMNS)) + "|"]
+    """Format three tables: differences, scores, agreement of rankings."""
+    lines = []
     for row in maps:
         numbers = [row["differences"].get(quantity) for quantity in COLUMNS]
         cells = ["-" if number is None else f"{number:.2g}" for number in numbers]
-        lines.append(f"| {row['map']} | {row['cells']} | {row['left']}, {row['right']} | " + " | ".join(cells) + " |")
-    lines += ["", "### Rank of the logged pose and error of the weighted mean of the other particles", ""]
-    lines.append(
-        "| log | model | device | scans x particles | percentile median (least) | rank median "
-        "| error median / 90 % [m] | [rad] | effective | M particle-beams/s |"
-    )
-    lines.append("| --- " * 10 + "|")
-    for log in logs:
-        for s in log["backends"]:
-            lines.append(
-                f"| {log['log']} | {log['model']} | {s['device']['selection']} ({s['device']['name']}) "
-                f"| {s['scans']} x {log['particles']} | {s['percentile_median']:.3f} ({s['percentile_min']:.3f}) "
-                f"| {s['rank_median']:g} | {s['error_position_median']:.3f} / {s['error_position_90']:.3f} "
-                f"| {s['error_heading_median']:.4f} / {s['error_heading_90']:.4f} | {s['effective_median']:.1f} "
-                f"| {s['particle_beams_per_second'] / 1e6:.1f} |"
-            )
-    lines += ["", "### Agreement of rankings", ""]
-    lines.append(
-        "| log | model | pair | scans | same rank of the logged pose | no particles swapped | least Spearman "
-        "| largest difference [nats] | gap of swapped particles [nats] | same ranking |"
-    )
-    lines.append("| --- " * 10 + "|")
-    for log in logs:
-        for a in log["agreement"]:
-            lines.append(
-                f"| {log['log']} | {log['model']} | {a['left']}, {a['right']} | {a['scans']} | {a['same_rank']} "
-                f"| {a['same_order']} | {a['spearman']:.9f} | {a['difference']:.2g} | {a['gap']:.2g} "
-                f"| {'yes' if a['same_ranking'] else 'NO'} |"
-            )
-    return "\n".join(lines)
+        lines.append([row["map"], row["cells"], f"{row['left']}, {row['right']}", *cells])
+    text = "### Largest differences between backends on real maps\n\n"
+    text += table(("map", "cells", "pair", *COLUMNS.values()), lines)
+    columns = (
+        "log", "model", "device", "scans x particles", "percentile median (least)", "rank median",
+        "error median / 90 % [m]", "[rad]", "effective", "M particle-beams/s",
+    )  # fmt: skip
+    lines = [
+        [
+            log["log"], log["model"], f"{s['device']['selection']} ({s['device']['name']})",
+            f"{s['scans']} x {log['particles']}", f"{s['percentile_median']:.3f} ({s['percentile_min']:.3f})",
+            f"{s['rank_median']:g}", f"{s['error_position_median']:.3f} / {s['error_position_90']:.3f}",
+            f"{s['error_heading_median']:.4f} / {s['error_heading_90']:.4f}", f"{s['effective_median']:.1f}",
+            f"{s['particle_beams_per_second'] / 1e6:.1f}",
+        ]
+        for log in logs
+        for s in log["backends"]
+    ]  # fmt: skip
+    text += "\n\n### Rank of the logged pose and error of the weighted mean of the other particles\n\n"
+    text += table(columns, lines)
+    columns = (
+        "log", "model", "pair", "scans", "same rank of the logged pose", "no particles swapped", "least Spearman",
+        "largest difference [nats]", "gap of swapped particles [nats]", "same ranking",
+    )  # fmt: skip
+    lines = [
+        [
+            log["log"], log["model"], f"{a['left']}, {a['right']}", a["scans"], a["same_rank"], a["same_order"],
+            f"{a['spearman']:.9f}", f"{a['difference']:.2g}", f"{a['gap']:.2g}", "yes" if a["same_ranking"] else "NO",
+        ]
+        for log in logs
+        for a in log["agreement"]
+    ]  # fmt: skip
+    return f"{text}\n\n### Agreement of rankings\n\n{table(columns, lines)}"
 
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
+    parser = make_parser(__doc__, backend="", data=True)
     parser.add_argument("--map", action="append", choices=(*MAPS, "none"), help="default: all")
     parser.add_argument("--log", action="append", choices=(*LOGS, "none"), help="default: all")
     parser.add_argument("--model", action="append", choices=("beam", "field"), help="default: both")
-    parser.add_argument("--scans", type=int, default=0, help="about so many odd scans of each log; 0: all")
-    parser.add_argument("--numpy-scans", type=int, default=3, help="so many of them on NumPy too")
+    parser.add_argument("--scans", type=int, default=0, help="least number of odd scans of each log; 0: all")
+    parser.add_argument("--numpy-scans", type=int, default=3, help="of these on NumPy too")
     parser.add_argument("--particles", type=int, default=20_000)
     parser.add_argument("--temperature", type=float, default=1.0)
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
-    arguments = parser.parse_args()
-    if arguments.data is None:
-        parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
+    arguments = parse(parser)
     begin = time.perf_counter()
     maps = [row for name in arguments.map or MAPS if name != "none" for row in differences(arguments.data, name)]
     logs = [
@@ -166,9 +161,9 @@ def main() -> int:
         if name != "none"
         for kind in arguments.model or ("beam", "field")
     ]
-    devices = [asdict(get_backend(d.selection).info) for d in gs.devices() if d.available and d.kind != "simulator"]
+    devices = [asdict(get_backend(selection).info) for selection in present()]
     report = {"devices": devices, "seconds": time.perf_counter() - begin, "maps": maps, "logs": logs}
-    publish("real_scores.py", arguments, to_markdown(maps, logs), report)
+    publish(__file__, arguments, to_markdown(maps, logs), report)
     breached = any(row["breaches"] for row in maps)
     return 1 if breached or not all(a["same_ranking"] for log in logs for a in log["agreement"]) else 0
 

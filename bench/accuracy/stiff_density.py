@@ -1,30 +1,36 @@
-"""Errors of the beam densities against 60 digits, ours beside the textbook's formulas: plots and the page's tables.
+"""Measure errors of the beam densities against 60 digits, ours beside the textbook's formulas.
 
-    python bench/stiff_density.py                       # writes docs/img, prints the tables of docs/numerics.md
-    python bench/stiff_density.py --output DIRECTORY --backend numpy --backend opencl
+    python bench/accuracy/stiff_density.py              # docs/img/stiff_*.png, and the tables of docs/numerics.md
+    python bench/accuracy/stiff_density.py --figures DIRECTORY --backend numpy --backend opencl
+    python bench/accuracy/stiff_density.py --figures DIRECTORY --backend numpy --step 4     # a quick look
 
 Truth is mpmath (60 digits) on the same rounded numbers. The unit is eps (1 + |log p|) with the eps of the precision.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import mpmath as mp
 import numpy as np
 
 import gpusense as gs
-from gpusense.backends import devices, get_backend
+from gpusense.backends import get_backend
 from gpusense.evaluation import stiff
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.models.scan.densities import naive_log_hit, naive_log_short
 from gpusense.reference.mixture import log_density
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import FIGURES, make_parser, parse, publish, table
 
 mpl.use("Agg")
 mp.mp.dps = 60
@@ -36,6 +42,7 @@ CEILING = 1e20  # failures are drawn here
 
 @functools.cache
 def exact_hit(z: float, expected: float, sigma: float) -> mp.mpf:
+    """Compute log p_hit."""
     z, e, s, top = (mp.mpf(v) for v in (z, expected, sigma, RANGE_MAX))
     root = s * mp.sqrt(2)
     return -(((z - e) / s) ** 2) / 2 - mp.log(s * mp.sqrt(mp.pi / 2) * (mp.erf((top - e) / root) + mp.erf(e / root)))
@@ -43,6 +50,7 @@ def exact_hit(z: float, expected: float, sigma: float) -> mp.mpf:
 
 @functools.cache
 def exact_short(z: float, expected: float, rate: float) -> mp.mpf:
+    """Compute log p_short."""
     if not 0 <= z <= expected or expected == 0:
         return -mp.inf
     z, e, rate = (mp.mpf(v) for v in (z, expected, rate))
@@ -50,7 +58,7 @@ def exact_short(z: float, expected: float, rate: float) -> mp.mpf:
 
 
 def in_eps(found: np.ndarray, truth: list[mp.mpf], precision: str) -> np.ndarray:
-    """Errors against mpmath without rounding the truth first."""
+    """Return errors against mpmath without rounding the truth first."""
     eps = float(np.finfo(precision).eps)
     errors = [
         float(abs(mp.mpf(float(f)) - t) / (1 + abs(t))) / eps if math.isfinite(f) else math.inf
@@ -64,7 +72,7 @@ Places = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
 
 def sweep(precision: str, shares: np.ndarray, weights: tuple[float, ...], places: Places) -> Sweep:
-    """Worst error of ours and of the textbook's formula for each sigma / Z, or each lambda z* with z* = Z / 4."""
+    """Find the worst errors of ours and of the textbook's formula: for sigma / Z, or lambda z* with z* = Z / 4."""
     real, ours, textbook = np.dtype(precision), [], []
     hit = weights[0] > 0
     for share in shares:
@@ -84,7 +92,7 @@ def sweep(precision: str, shares: np.ndarray, weights: tuple[float, ...], places
 
 
 def around(sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """Readings from both ends to z* and a few deviations away, for five expected ranges."""
+    """Return readings from both ends to z* and some deviations away, for five expected ranges."""
     pairs = []
     for expected in (0.0, 1e-6, 0.3, 0.5, 1.0):
         e = expected * RANGE_MAX
@@ -94,13 +102,13 @@ def around(sigma: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def along(rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Readings from 0 to z* = Z / 4."""
+    """Return readings from 0 to z* = Z / 4."""
     z = np.array([0.0, 0.1, 0.5, 1.0]) * RANGE_MAX / 4
     return z, np.full(4, RANGE_MAX / 4)
 
 
 def plot(path: Path, sweeps: dict[str, Sweep], label: str, title: str) -> None:
-    """One panel a precision; what is not finite stands at the top."""
+    """Draw a panel for each precision, with values that are not finite at the top."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 4.2), layout="constrained")
@@ -127,75 +135,82 @@ def plot(path: Path, sweeps: dict[str, Sweep], label: str, title: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def grid_table(backends: list[str]) -> None:
-    """The density grid and the catalogue of scenes on every backend."""
-    columns = (
-        "backend",
-        "precision",
-        "worst",
-        "not finite",
-        "bound",
-        "rows kept",
-        "textbook: above 16 eps",
-        "not finite",
-    )
-    print(f"| {' | '.join(columns)} |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+def grid_rows(backends: list[str]) -> list[dict[str, Any]]:
+    """Judge the density grid and the catalogue of scenes on every backend."""
+    found = []
     for backend in backends:
         for precision in PRECISIONS[: 1 + get_backend(backend).info.float64]:
             rows = stiff.run(backend, precision)
             own, naive, *_ = rows
-            kept = f"{sum(row.ok for row in rows)} of {len(rows)}"
-            print(
-                f"| {backend} | {precision} | {own.worst:.1f} | {own.nonfinite} | {own.bound:.0f} | {kept} "
-                f"| {100 * naive.worst:.0f} % | {naive.nonfinite} of {own.case.split()[0]} |"
-            )
+            found.append({
+                "backend": backend, "precision": precision, "worst": own.worst, "not_finite": own.nonfinite,
+                "bound": own.bound, "kept": sum(row.ok for row in rows), "rows": len(rows), "naive_worst": naive.worst,
+                "naive_not_finite": naive.nonfinite, "readings": own.case.split()[0],
+            })  # fmt: skip
+    return found
 
 
-def bilinear_table() -> None:
-    """What rounding a position within a cell costs the interpolated field in float32, beside a cliff of distances."""
+def bilinear_rows() -> list[list[Any]]:
+    """Measure the error of the interpolated field in float32 that rounding a position makes beside a cliff."""
     from gpusense.evaluation.replay import Recorder, replay
     from gpusense.evaluation.tolerances import beam_tolerance
 
     case = next(case for case in stiff.cases() if case.name.startswith("in walls"))
     poses = np.random.default_rng(1).uniform((-2, -2, -4), (6, 5, 4), (2000, 3))
-    print("| max_distance / sigma | worst [eps (1 + abs(log p))] |")
-    print("| --- | --- |")
+    rows = []
     for ratio in (10, 20, 40, 80, 160, 1000, 1_000_000):
         p = gs.LikelihoodFieldParameters(sigma_hit=5.0 / ratio, max_distance=5.0, interpolation="bilinear")
         recorder = Recorder(get_backend("numpy"))
         model = gs.LikelihoodFieldModel(case.grid, case.scanner, p, backend=recorder, precision="float32")
         model.log_likelihood(poses, replace(case, readings=(3.0, 7.7, 12.1)).ranges, per_beam=True)
         (launch,) = recorder.launches
-        worst = beam_tolerance("float32").difference(launch.parts, replay(launch)[1])
-        print(f"| {ratio} | {worst:.1f} |")
+        rows.append([ratio, float(beam_tolerance("float32").difference(launch.parts, replay(launch)[1]))])
+    return rows
 
 
-def main() -> None:
-    """Plots, then tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parents[1] / "docs" / "img")
-    parser.add_argument("--backend", action="append", default=[], help="default: every device but simulators")
-    arguments = parser.parse_args()
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    sigmas, rates = 10.0 ** np.arange(-8, 6.01, 0.25), 10.0 ** np.arange(-20, 6.01, 0.5)
+def sweep_lines(name: str, sweeps: dict[str, Sweep]) -> list[list[str]]:
+    """Format the rows of the plots' table."""
+    lines = []
+    for precision, (_, ours, textbook) in sweeps.items():
+        finite = textbook[np.isfinite(textbook)]
+        lost = f"{np.isinf(textbook).sum()} of {len(ours)}"
+        lines.append([name, precision, f"{ours.max():.1f}", lost, f"{finite.max(initial=0):.1g}"])
+    return lines
+
+
+def main() -> int:
+    """Draw the plots and write the tables."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the drawings (default: docs/img)")
+    parser.add_argument("--step", type=float, default=0.25, help="of the plots [decades of sigma] (default: 0.25)")
+    arguments = parse(parser)
+    arguments.figures.mkdir(parents=True, exist_ok=True)
+    sigmas, rates = 10.0 ** np.arange(-8, 6.01, arguments.step), 10.0 ** np.arange(-20, 6.01, 2 * arguments.step)
     hits = {precision: sweep(precision, sigmas, (1.0, 0.0, 0.0, 0.0), around) for precision in PRECISIONS}
-    plot(arguments.output / "stiff_hit.png", hits, "sigma / range_max", "p_hit: worst error over readings and z*")
+    plot(arguments.figures / "stiff_hit.png", hits, "sigma / range_max", "p_hit: worst error over readings and z*")
     shorts = {precision: sweep(precision, rates, (0.0, 1.0, 0.0, 0.0), along) for precision in PRECISIONS}
-    plot(arguments.output / "stiff_short.png", shorts, "lambda z*", "p_short: worst error over readings")
-    for name, sweeps in (("p_hit over sigma / Z", hits), ("p_short over lambda z*", shorts)):
-        for precision, (_, ours, textbook) in sweeps.items():
-            finite = textbook[np.isfinite(textbook)]
-            print(
-                f"{name}, {precision}: ours at most {ours.max():.1f} eps; the textbook's formula is not finite at "
-                f"{np.isinf(textbook).sum()} of {len(ours)}, elsewhere up to {finite.max(initial=0):.1g} eps"
-            )
-    print()
-    bilinear_table()
-    print()
-    here = [device.selection for device in devices() if device.available and device.kind != "simulator"]
-    grid_table(arguments.backend or here)
+    plot(arguments.figures / "stiff_short.png", shorts, "lambda z*", "p_short: worst error over readings")
+    worst = table(
+        ("errors [eps (1 + \\|log p\\|)]", "precision", "ours, worst", "textbook: not finite", "elsewhere, worst"),
+        [*sweep_lines("p_hit over sigma / Z", hits), *sweep_lines("p_short over lambda z*", shorts)],
+    )
+    bilinear = bilinear_rows()
+    cliff = table(
+        ("max_distance / sigma", "worst [eps (1 + abs(log p))]"), ([ratio, f"{eps:.1f}"] for ratio, eps in bilinear)
+    )
+    rows = grid_rows(arguments.backend)
+    columns = (
+        "backend", "precision", "worst", "not finite", "bound", "rows kept", "textbook: above 16 eps", "not finite",
+    )  # fmt: skip
+    grid = table(columns, (
+        [r["backend"], r["precision"], f"{r['worst']:.1f}", r["not_finite"], f"{r['bound']:.0f}",
+         f"{r['kept']} of {r['rows']}", f"{100 * r['naive_worst']:.0f} %",
+         f"{r['naive_not_finite']} of {r['readings']}"]
+        for r in rows
+    ))  # fmt: skip
+    publish(__file__, arguments, f"{worst}\n\n{cliff}\n\n{grid}", {"bilinear": bilinear, "rows": rows})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

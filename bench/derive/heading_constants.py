@@ -1,4 +1,4 @@
-"""The constants of ``heading`` in the three kernel languages, derived with mpmath: run it to see them and their errors.
+"""Derive the constants of ``heading`` in the three kernel languages with mpmath, and print them and their errors.
 
 Sines and cosines are polynomials in z = r^2 for |r| <= pi/4, of least largest relative error (Remez's exchange):
 sin r = r + r z S(z), cos r = 1 - z/2 + z^2 C(z). pi/2 is cut into parts that have products with counts without
@@ -7,9 +7,14 @@ rounding, and 2/pi into words of 32 bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from pathlib import Path
 
 import mpmath as mp
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from derive.remez import polynomial, remez
 
 # 2/pi is needed to 1184 bits.
 mp.mp.dps = 400
@@ -21,50 +26,18 @@ PART_BITS, WORD_BITS = 33, 32
 # Two words of zeros come first. A number below 2^1024 needs the bits up to 2^-969 and 192 more.
 ZERO_WORDS, WORDS = 2, 39
 
-Function = Callable[[mp.mpf], mp.mpf]
-
-
-def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
-    """Its value; lowest power first."""
-    value = mp.mpf(0)
-    for power in reversed(powers):
-        value = value * z + power
-    return value
-
-
-def remez(f: Function, weight: Function) -> list[mp.mpf]:
-    """The coefficients, lowest power first, of the polynomial on (0, END] with the least largest weighted error."""
-    count = COEFFICIENTS
-    grid = [END * (1 - mp.cos(mp.pi * i / 1000)) / 2 for i in range(1, 1001)]
-    targets, weights = [f(z) for z in grid], [weight(z) for z in grid]
-    chosen = [round((1 - mp.cos(mp.pi * (i + 0.5) / (count + 1))) / 2 * 999) for i in range(count + 1)]
-    for _ in range(20):
-        rows = [[grid[i] ** k for k in range(count)] + [(-1) ** j / weights[i]] for j, i in enumerate(chosen)]
-        powers = list(mp.lu_solve(mp.matrix(rows), mp.matrix([targets[i] for i in chosen])))[:count]
-        error = [(polynomial(powers, z) - t) * w for z, t, w in zip(grid, targets, weights, strict=True)]
-        # The largest error between two changes of its sign.
-        runs: list[int] = []
-        for i, e in enumerate(error):
-            if not runs or e * error[runs[-1]] < 0:
-                runs.append(i)
-            elif abs(e) > abs(error[runs[-1]]):
-                runs[-1] = i
-        if runs == chosen:
-            break
-        chosen = runs
-    return powers
-
 
 def polynomials() -> tuple[list[float], list[float]]:
-    """The coefficients of S and of C, rounded."""
+    """Return the coefficients of S and of C, rounded."""
     root, sin, cos = mp.sqrt, mp.sin, mp.cos
-    sine = remez(lambda z: (sin(root(z)) / root(z) - 1) / z, lambda z: z * root(z) / sin(root(z)))
-    cosine = remez(lambda z: (cos(root(z)) - 1 + z / 2) / z**2, lambda z: z**2 / cos(root(z)))
+    grid = [END * (1 - mp.cos(mp.pi * i / 1000)) / 2 for i in range(1, 1001)]
+    sine = remez(lambda z: (sin(root(z)) / root(z) - 1) / z, lambda z: z * root(z) / sin(root(z)), grid, COEFFICIENTS)
+    cosine = remez(lambda z: (cos(root(z)) - 1 + z / 2) / z**2, lambda z: z**2 / cos(root(z)), grid, COEFFICIENTS)
     return [float(c) for c in sine], [float(c) for c in cosine]
 
 
 def errors(sine: list[float], cosine: list[float]) -> tuple[float, float]:
-    """Base-2 logarithms of the largest relative errors of sine and cosine by these polynomials."""
+    """Return base-2 logarithms of the largest relative errors of sine and cosine by these polynomials."""
     worst = [mp.mpf(0), mp.mpf(0)]
     for i in range(1, 2001):
         z = END * i / 2000
@@ -76,7 +49,7 @@ def errors(sine: list[float], cosine: list[float]) -> tuple[float, float]:
 
 
 def quarter_parts() -> list[float]:
-    """pi/2 in three parts of 33 bits and a fourth that is rounded."""
+    """Cut pi/2 into three parts of 33 bits and a fourth that is rounded."""
     rest, parts = mp.pi / 2, []
     for i in range(3):
         scale = mp.mpf(2) ** (PART_BITS * (i + 1) - 1)
@@ -86,13 +59,13 @@ def quarter_parts() -> list[float]:
 
 
 def quarter_pair() -> list[float]:
-    """pi/2 as the sum of two rounded numbers."""
+    """Return pi/2 as the sum of two rounded numbers."""
     high = float(mp.pi / 2)
     return [high, float(mp.pi / 2 - high)]
 
 
 def words() -> list[int]:
-    """The first bits of 2/pi in words of 32, after the zeros."""
+    """Return the first bits of 2/pi in words of 32, after the zeros."""
     bits = int(mp.floor(2 / mp.pi * mp.mpf(2) ** (WORD_BITS * (WORDS - ZERO_WORDS))))
     shifts = range(WORD_BITS * (WORDS - ZERO_WORDS - 1), -1, -WORD_BITS)
     return [0] * ZERO_WORDS + [bits >> shift & (1 << WORD_BITS) - 1 for shift in shifts]

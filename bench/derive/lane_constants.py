@@ -1,4 +1,4 @@
-"""The constants of ``kernels/opencl/lane_math.cl``, derived with mpmath: run it to see them and their errors.
+"""Derive the constants of ``kernels/opencl/lane_math.cl`` with mpmath, and print them and their errors.
 
 Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
 |r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);
@@ -8,10 +8,15 @@ has products with counts without rounding and the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from pathlib import Path
 
 import mpmath as mp
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from derive.remez import Function, remez, weighted_errors
 
 mp.mp.dps = 50
 # log(2)/2 with room for a count that is rounded to its wrong side.
@@ -24,70 +29,48 @@ ARC_END = (mp.sqrt(2) - 1) * (1 + mp.mpf(2) ** -10)
 PART_BITS = 16
 POINTS = 1001
 
-Function = Callable[[mp.mpf], mp.mpf]
 
-
-def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
-    """Its value by Horner's rule; lowest power first."""
-    value = mp.mpf(0)
-    for power in reversed(powers):
-        value = value * z + power
-    return value
-
-
-def remez(f: Function, weight: Function, low: mp.mpf, high: mp.mpf, count: int) -> tuple[list[float], float]:
-    """The float32 coefficients, lowest power first, of the polynomial with the least largest weighted error.
+def rounded_polynomial(
+    f: Function, weight: Function, low: mp.mpf, high: mp.mpf, count: int
+) -> tuple[list[float], float]:
+    """Find the polynomial with the least largest weighted error, and round its coefficients to float32.
 
     Returns:
-        The coefficients, and the base-2 logarithm of the largest weighted error of the rounded ones.
+        The coefficients, lowest power first, and the base-2 logarithm of the largest weighted error of the rounded
+        ones.
     """
     middle, reach = (low + high) / 2, (high - low) / 2
     grid = [middle - reach * mp.cos(mp.pi * (i + 0.5) / POINTS) for i in range(POINTS)]
-    targets, weights = [f(z) for z in grid], [weight(z) for z in grid]
-    chosen = [round((1 - mp.cos(mp.pi * (i + 0.5) / (count + 1))) / 2 * (POINTS - 1)) for i in range(count + 1)]
-    powers: list = []
-    for _ in range(30):
-        rows = [[grid[i] ** k for k in range(count)] + [(-1) ** j / weights[i]] for j, i in enumerate(chosen)]
-        powers = list(mp.lu_solve(mp.matrix(rows), mp.matrix([targets[i] for i in chosen])))[:count]
-        error = [(polynomial(powers, z) - t) * w for z, t, w in zip(grid, targets, weights, strict=True)]
-        # The largest error between two changes of its sign.
-        runs: list[int] = []
-        for i, e in enumerate(error):
-            if not runs or e * error[runs[-1]] < 0:
-                runs.append(i)
-            elif abs(e) > abs(error[runs[-1]]):
-                runs[-1] = i
-        if runs == chosen or len(runs) != count + 1:
-            break
-        chosen = runs
-    rounded = [float(np.float32(float(c))) for c in powers]
-    worst = max(abs((polynomial(rounded, z) - t) * w) for z, t, w in zip(grid, targets, weights, strict=True))
-    return rounded, float(mp.log(worst, 2))
+    rounded = [float(np.float32(float(c))) for c in remez(f, weight, grid, count)]
+    error = weighted_errors(rounded, [f(z) for z in grid], [weight(z) for z in grid], grid)
+    return rounded, float(mp.log(max(map(abs, error)), 2))
 
 
 def exponential() -> tuple[list[float], float]:
-    """E, and its error."""
-    return remez(lambda r: (mp.expm1(r) - r) / r**2, lambda r: r**2 / abs(mp.expm1(r)), -HALF, HALF, 5)
+    """Return E and its error."""
+    return rounded_polynomial(lambda r: (mp.expm1(r) - r) / r**2, lambda r: r**2 / abs(mp.expm1(r)), -HALF, HALF, 5)
 
 
 def logarithm() -> tuple[list[float], float]:
-    """L, and its error."""
-    return remez(lambda f: (mp.log1p(f) - f + f**2 / 2) / f**3, lambda f: f**3 / mp.log1p(f), LOW, HIGH, 8)
+    """Return L and its error."""
+    return rounded_polynomial(lambda f: (mp.log1p(f) - f + f**2 / 2) / f**3, lambda f: f**3 / mp.log1p(f), LOW, HIGH, 8)
 
 
 def error_function() -> tuple[list[float], float]:
-    """W, and its error."""
+    """Return W and its error."""
     zero = mp.mpf(0)
-    return remez(lambda x: -mp.log(mp.erfc(x)) / x, lambda x: x * mp.erfc(x) / mp.erf(x), zero, ERF_ONE, 9)
+    return rounded_polynomial(lambda x: -mp.log(mp.erfc(x)) / x, lambda x: x * mp.erfc(x) / mp.erf(x), zero, ERF_ONE, 9)
 
 
 def arc() -> tuple[list[float], float]:
-    """A, and its error."""
-    return remez(lambda z: (mp.atan(mp.sqrt(z)) / mp.sqrt(z) - 1) / z, lambda z: z, mp.mpf(0), ARC_END**2, 5)
+    """Return A and its error."""
+    return rounded_polynomial(
+        lambda z: (mp.atan(mp.sqrt(z)) / mp.sqrt(z) - 1) / z, lambda z: z, mp.mpf(0), ARC_END**2, 5
+    )
 
 
 def log_parts() -> list[float]:
-    """log 2 in a part of 16 bits and the rest, and its reciprocal."""
+    """Return log 2 in a part of 16 bits and the rest, and its reciprocal."""
     scale = mp.mpf(2) ** PART_BITS
     first = mp.floor(mp.log(2) * scale) / scale
     return [float(first), *(float(np.float32(float(v))) for v in (mp.log(2) - first, 1 / mp.log(2)))]

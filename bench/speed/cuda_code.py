@@ -1,9 +1,9 @@
-"""Machine instructions of the code that Warp makes of a kernel for a CUDA device; no GPU is needed.
+"""Count the machine instructions of the code that Warp makes of a kernel for a CUDA device; no GPU is needed.
 
-    python bench/cuda_code.py field_blocks --flags LOG_TABLE,CAREFUL,QUICK,INSIDE --terms 16
+    python bench/speed/cuda_code.py field_blocks --flags LOG_TABLE,CAREFUL,QUICK,INSIDE --terms 16
 
-Prints all instructions by kind, and those of the longest stretch without branches: the body of an
-unrolled loop, for so many terms. Needs NVIDIA's ``nvdisasm`` (from PyPI: nvidia-cuda-nvdisasm; part of CUDA's tools).
+Prints all instructions by kind, and those of the longest stretch without branches: the body of an unrolled loop, which
+computes --terms readings. Needs NVIDIA's ``nvdisasm`` (from PyPI: nvidia-cuda-nvdisasm; part of CUDA's tools).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ENDS = {"BRA", "CALL", "EXIT", "RET", "BSYNC", "WARPSYNC"}
 
 
 def disassembled(kernel: str, flags: frozenset[str], arch: int, nvdisasm: str) -> str:
-    """The machine code of a kernel as text."""
+    """Return the machine code of a kernel as text."""
     made = warp_module(KERNELS[kernel].file).make(kernel, flags)
     with tempfile.TemporaryDirectory() as folder:
         wp.compile_aot_module(made.module, arch=arch, module_dir=folder, use_ptx=False)
@@ -37,7 +37,7 @@ def disassembled(kernel: str, flags: frozenset[str], arch: int, nvdisasm: str) -
 
 
 def stretches(text: str) -> list[list[str]]:
-    """Names of the instructions of each stretch between labels and branches."""
+    """Return the names of the instructions of each stretch between labels and branches."""
     found: list[list[str]] = [[]]
     for line in text.splitlines():
         match = _INSTRUCTION.search(line)
@@ -51,7 +51,7 @@ def stretches(text: str) -> list[list[str]]:
 
 
 def described(names: list[str], terms: int) -> str:
-    """How many instructions, also by term, and which."""
+    """Describe instructions: their number, also by term, and their kinds."""
     kinds = ", ".join(f"{name} {count}" for name, count in Counter(names).most_common())
     return f"{len(names)} instructions, {len(names) / terms:.4g} a term: {kinds}"
 
@@ -60,7 +60,7 @@ def main() -> int:
     """Count and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kernel", choices=sorted(KERNELS))
-    parser.add_argument("--flags", default="", help="with commas between them; gpusense/signatures.py lists them")
+    parser.add_argument("--flags", default="", help="with commas between them, of gpusense/interface/signatures.py")
     parser.add_argument("--arch", type=int, default=90, help="compute capability without its point")
     parser.add_argument("--terms", type=int, default=1, help="readings that the longest stretch computes")
     parser.add_argument("--nvdisasm", default=shutil.which("nvdisasm"), help="the program's path")

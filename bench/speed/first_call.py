@@ -1,7 +1,7 @@
-"""First calls: what a new process waits for, with nothing kept on disk and with everything.
+"""Measure first calls: the wait of a new process, with an empty cache on disk and with a full one.
 
-    python bench/first_call.py --backend opencl --backend warp:cpu
-    python bench/first_call.py --backend opencl --tree .:now --tree ../old:before --output bench/results/first_call_name
+    python bench/speed/first_call.py --backend opencl --backend warp:cpu
+    python bench/speed/first_call.py --backend opencl --tree .:now --tree ../old:before --output NAME
 
 Each time is of a new process: the import of the package, opening the device, the first call of the likelihood field,
 the first one of the beam model after it. "Cold" begins with an empty cache folder, so that the device is proved too;
@@ -11,7 +11,6 @@ holds on a busy machine.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -21,7 +20,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from speed import publish
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import ROOT, make_parser, parse, publish, table
 
 _PROCESS = """
 import json, sys, time
@@ -31,7 +32,7 @@ import gpusense as gs
 mark()
 import numpy as np
 from gpusense.backends import get_backend
-from gpusense.evaluation.worlds import building
+from gpusense.worlds import building
 grid = building(0)
 scanner = gs.Scanner.uniform(angle_min=-1.5, angle_increment=0.05, count=60, range_max=12.0)
 poses, ranges = np.random.default_rng(0).uniform(2, 8, (2000, 3)), np.full(60, 3.0)
@@ -46,6 +47,7 @@ mark()
 print(json.dumps([1e3 * (b - a) for a, b in zip(marks, marks[1:])]))
 """
 STEPS = ("import and scene", "open", "field", "beam model")
+COLUMNS = ("backend", "tree", "cache", *STEPS, "open and field", "all")
 
 
 def milliseconds(tree: Path, backend: str, folder: str) -> list[float]:
@@ -76,33 +78,24 @@ def measured(trees: list[tuple[Path, str]], backend: str, repeats: int) -> list[
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return the rows as Markdown."""
-    columns = ("backend", "tree", "cache", *STEPS, "open and field", "all")
-    lines = ["| " + " | ".join(columns) + " |", "| " + " | ".join("---" for _ in columns) + " |"]
-    for row in rows:
-        cells = (str(row[column]) if column in columns[:3] else f"{row[column]:.0f}" for column in columns)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+def cells(row: dict[str, Any]) -> list[str]:
+    """Format the cells of a row."""
+    return [str(row[column]) if column in COLUMNS[:3] else f"{row[column]:.0f}" for column in COLUMNS]
 
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", action="append", help="selection string (default: opencl and warp:cpu)")
+    parser = make_parser(__doc__, backend="kernels")
     parser.add_argument(
         "--tree", action="append", default=[], metavar="PATH:NAME", help="a checkout (default: this one)"
     )
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
-    arguments = parser.parse_args()
-    here = f"{Path(__file__).parent.parent}:this"
-    trees = [(Path(path), name) for path, _, name in (text.rpartition(":") for text in arguments.tree or [here])]
-    rows: list[dict[str, Any]] = []
-    for backend in arguments.backend or ["opencl", "warp:cpu"]:
-        rows += measured(trees, backend, arguments.repeats)
-    publish(Path(__file__).name, arguments, table(rows), {"rows": rows}, f"Milliseconds, {arguments.repeats} runs.")
+    arguments = parse(parser)
+    texts = arguments.tree or [f"{ROOT}:this"]
+    trees = [(Path(path), name) for path, _, name in (text.rpartition(":") for text in texts)]
+    rows = [row for backend in arguments.backend for row in measured(trees, backend, arguments.repeats)]
+    remark = f"Milliseconds, {arguments.repeats} runs."
+    publish(__file__, arguments, table(COLUMNS, map(cells, rows)), {"rows": rows}, remark)
     return 0
 
 

@@ -1,7 +1,7 @@
-"""How fast the beam model's parameters are learned, and how well: rates, fifty scenes, ten starts.
+"""Measure how fast the beam model's parameters are learned, and how well: rates, fifty scenes, ten starts.
 
-    python bench/learning.py --backend numpy --backend opencl --backend warp:cpu --output bench/results/learning_cpu
-    python bench/learning.py --backend numpy --backend opencl --pairs 100000 --count 1000 --starts 2     # a quick look
+    python bench/speed/learning.py --backend numpy --backend opencl --backend warp:cpu --output NAME
+    python bench/speed/learning.py --backend opencl --pairs 100000 --count 1000 --starts 2     # a quick look
 
 *Rates*: one EM iteration (M-step and the passes over the pairs that it tries) on --pairs pairs of a typical scene,
 without the second derivatives and with them, the upload, and a whole fit from its own start, as the best and the
@@ -10,8 +10,8 @@ their sum on the host, and in brackets a pass without lanes where the device has
 on the same pairs (a part of them where it is slow, said so), whose sums each backend's must match: *error* is the
 largest difference of the fitted parameters, relative, in float64.
 
-*Scenes*: fifty scenes with known parameters, from mild to stiff. Parameters whose standard error is below 30 % of
-them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
+*Scenes*, on the last backend: fifty with known parameters, from mild to stiff. Parameters whose standard error is
+below 30 % of them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
 log-likelihood in an iteration of exact EM and of the book's; and from --starts starts, by how many nats "gradient" and
 "hill_climb" end from EM's optimum in scenes that are identified as a whole.
 
@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from speed import best, publish
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
@@ -41,6 +40,10 @@ from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Point, first_guess, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import add_repeats, best, make_parser, parse, publish, table
+
 TYPICAL = Scene("typical", gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 0.5), 30.0, (0.02, 0.98))
 IDENTIFIED, FALLS, SHARE, NATS = 0.3, 1e-9, 0.95, 1e-4
 
@@ -49,7 +52,7 @@ class Timed:
     """A backend that passes everything on to another one, and notes how long kernels and copies back take.
 
     Attributes:
-        info: That of the other one; without lanes where it is told so.
+        info: That of the other one; without lanes where ``lanes`` is False.
         seconds: Of kernels and of downloads, since it was last emptied.
     """
 
@@ -83,7 +86,7 @@ class Timed:
 
 
 def pass_parts(backend: Backend, real: np.dtype, pairs: Pairs, point: Point, repeats: int) -> dict[str, float]:
-    """Seconds of the quickest of some passes over the pairs, without second derivatives, and of its parts.
+    """Return the seconds of the quickest of some passes over the pairs, without second derivatives, and of its parts.
 
     ``scalar_s`` is that of passes without lanes, in turns with the others, where the device asks for lanes.
     """
@@ -104,14 +107,14 @@ def pass_parts(backend: Backend, real: np.dtype, pairs: Pairs, point: Point, rep
 
 
 def values(parameters: gs.BeamParameters) -> np.ndarray:
-    """The six numbers."""
+    """Return the six parameters as an array."""
     return np.array(list(parameters.to_dict().values()))
 
 
 def rates(
     selection: str, precision: str, arguments: argparse.Namespace, truth: dict[int, np.ndarray]
 ) -> dict[str, Any]:
-    """Seconds of one iteration and of a fit on one backend."""
+    """Measure the seconds of one iteration and of a fit on one backend."""
     backend, real = open_device(selection, precision)
     count = min(arguments.pairs, arguments.numpy_pairs) if selection == "numpy" else arguments.pairs
     z, expected = TYPICAL.draw(count, np.random.default_rng(arguments.seed))
@@ -163,12 +166,12 @@ def rates(
 
 
 def fall(trace: np.ndarray) -> float:
-    """The largest fall in an iteration over the log-likelihood's size."""
+    """Return the largest fall in an iteration over the log-likelihood's size."""
     return float(np.max(-np.diff(trace), initial=0.0) / abs(trace[-1]))
 
 
 def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
-    """What one scene shows."""
+    """Fit one scene from all starts, and compare."""
     z, expected = scene.draw(arguments.count, np.random.default_rng(arguments.seed + number))
     pairs = make_pairs(z, expected, scene.range_max)
     bounds = make_bounds(pairs)
@@ -202,7 +205,7 @@ def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[
 
 
 def passes_text(scenes: list[dict[str, Any]]) -> str:
-    """Between which numbers of passes most fits of each method take: the quantiles of 5 and 95 %."""
+    """Format the quantiles of 5 and 95 % of the passes that a fit of each method takes."""
     found = {}
     for method in ("em", "gradient", "hill_climb"):
         counts = [count for scene in scenes for count in scene["passes"].get(method, [])]
@@ -213,57 +216,49 @@ def passes_text(scenes: list[dict[str, Any]]) -> str:
 
 
 def to_markdown(rows: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> str:
-    """Both tables."""
-    lines = [
-        "| backend | precision | pairs | upload ms | EM iteration ms | with 2nd derivatives ms "
-        "| one pass (no lanes) ms | kernel, copy, sum ms | 10^6 pairs/s | x NumPy | fit s | passes | error |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    """Format both tables."""
+    columns = (
+        "backend", "precision", "pairs", "upload ms", "EM iteration ms", "with 2nd derivatives ms",
+        "one pass (no lanes) ms", "kernel, copy, sum ms", "10^6 pairs/s", "x NumPy", "fit s", "passes", "error",
+    )  # fmt: skip
+    lines = []
     numpy = {row["precision"]: row["pairs_per_s"] for row in rows if row["backend"] == "numpy"}
     for r in rows:
         base = numpy.get(r["precision"])
         ratio = f"{r['pairs_per_s'] / base:.1f}" if base else "-"
         scalar = f" ({1e3 * r['scalar_s']:.2f})" if "scalar_s" in r else ""
         left = r["pass_s"] - r["kernel_s"] - r["download_s"]
-        lines.append(
-            f"| {r['backend']} ({r['device']}) | {r['precision']} | {r['pairs']} | {1e3 * r['upload_s']:.1f} "
-            f"| {1e3 * r['iteration_s']:.2f} | {1e3 * r['second_s']:.2f} | {1e3 * r['pass_s']:.2f}{scalar} "
-            f"| {1e3 * r['kernel_s']:.2f}, {1e3 * r['download_s']:.2f}, {1e3 * left:.2f} "
-            f"| {r['pairs_per_s'] / 1e6:.1f} | {ratio} "
-            f"| {r['fit_s']:.3f} | {r['passes']} | {r['error']:.1e} |"
-        )
-    lines += [
-        "", "| scene | identified | within 3 s.e. | worst, s.e. | iterations | EM's worst fall | book: falls "
-        "| book: nats behind | gradient, nats off | hill climbing, nats off |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+        lines.append([
+            f"{r['backend']} ({r['device']})", r["precision"], r["pairs"], f"{1e3 * r['upload_s']:.1f}",
+            f"{1e3 * r['iteration_s']:.2f}", f"{1e3 * r['second_s']:.2f}", f"{1e3 * r['pass_s']:.2f}{scalar}",
+            f"{1e3 * r['kernel_s']:.2f}, {1e3 * r['download_s']:.2f}, {1e3 * left:.2f}",
+            f"{r['pairs_per_s'] / 1e6:.1f}", ratio, f"{r['fit_s']:.3f}", r["passes"], f"{r['error']:.1e}",
+        ])  # fmt: skip
+    scene_columns = (
+        "scene", "identified", "within 3 s.e.", "worst, s.e.", "iterations", "EM's worst fall", "book: falls",
+        "book: nats behind", "gradient, nats off", "hill climbing, nats off",
+    )  # fmt: skip
+    scene_lines = []
     for s in scenes:
-        ends = " | ".join(f"{s['ends'][m]:.0e}" if m in s["ends"] else "-" for m in ("gradient", "hill_climb"))
-        lines.append(
-            f"| {s['scene']} | {s['identified']} | {s['within']} | {s['worst']:.1f} | {s['iterations']} "
-            f"| {s['fall']:.0e} | {s['book_falls']} | {s['book_behind']:.3g} | {ends} |"
-        )
-    return "\n".join(lines)
+        ends = [f"{s['ends'][m]:.0e}" if m in s["ends"] else "-" for m in ("gradient", "hill_climb")]
+        scene_lines.append([
+            s["scene"], s["identified"], s["within"], f"{s['worst']:.1f}", s["iterations"], f"{s['fall']:.0e}",
+            s["book_falls"], f"{s['book_behind']:.3g}", *ends,
+        ])  # fmt: skip
+    return f"{table(columns, lines)}\n\n{table(scene_columns, scene_lines)}"
 
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--backend", action="append", required=True, help="selection string; the last one has the scenes"
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--precision", action="append", help="float64 and float32 where not given")
     parser.add_argument("--pairs", type=int, default=10_000_000)
     parser.add_argument("--numpy-pairs", type=int, default=1_000_000, help="pairs of the NumPy reference at most")
     parser.add_argument("--scenes", type=int, default=50)
     parser.add_argument("--count", type=int, default=4000, help="readings of each scene")
     parser.add_argument("--starts", type=int, default=10)
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--seconds", type=float, default=20.0, help="longest time of the repeats of one figure")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
-    arguments = parser.parse_args()
+    add_repeats(parser, 10, 20.0)
+    arguments = parse(parser)
     truth: dict[int, np.ndarray] = {}
     # The reference first: others are held against it.
     selections = sorted(arguments.backend, key=lambda name: name != "numpy")
@@ -276,13 +271,13 @@ def main() -> int:
     identified, within = (sum(scene[name] for scene in scenes) for name in ("identified", "within"))
     fell = max((scene["fall"] for scene in scenes), default=0.0)
     off = max((nats for scene in scenes for nats in scene["ends"].values()), default=0.0)
-    table = (
+    text = (
         f"{to_markdown(rows, scenes)}\n\n{within} of {identified} identified parameters within 3 standard errors; "
         f"exact EM falls by at most {fell:.1e} of the log-likelihood; other ways end within {off:.1e} nats. "
         f"Passes over the pairs of 9 fits in 10: {passes_text(scenes)}."
     )
     report = {"rows": rows, "scenes": scenes, "identified": identified, "within": within, "fall": fell, "off": off}
-    publish("learning.py", arguments, table, report)
+    publish(__file__, arguments, text, report)
     return 1 if fell > FALLS or within < SHARE * identified or off > NATS else 0
 
 

@@ -1,22 +1,23 @@
-"""How long a map's preparation takes, step by step, and what an edit of 50 x 50 cells costs against it.
+"""Measure the preparation of a map step by step, and an edit of 50 x 50 cells beside it.
 
-    python bench/preparation.py --backend opencl --backend warp:cpu --cells 2000
+    python bench/speed/preparation.py --backend opencl --backend warp:cpu --cells 2000
 
 For each backend and map: distances without and with a cap of 40 cells, empty rectangles for 1, 2 and 4 sectors, and a
-model's preparation of the whole map, each as the best and the median of several runs; then where the time goes (every
-upload, allocation and kernel waits for the device, so their sum is more than the whole); then ``update_map`` against a
+model's preparation of the whole map, each as the best and the median of several runs; then every upload, allocation
+and kernel, which wait for the device, so that their sum is more than the whole; then ``update_map`` against a
 new model, whose log-likelihoods must be the same. Distances must be SciPy's. Exit code 1 where anything differs.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
+import math
 import statistics
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,14 @@ from gpusense.evaluation.selftest import scipy_squares
 from gpusense.evaluation.worlds import building
 from gpusense.tables.distances import empty_rectangles, packed, squared_distances
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import MODELS, best, make_parser, note, parse, publish, table, table_line
+
 RESOLUTION, CAP, EDIT = 0.05, 1601, 50
 SCANNER = gs.Scanner(np.linspace(-2, 2, 60), 10.0)
-MODELS = {"beam model": gs.BeamModel, "field": gs.LikelihoodFieldModel}
+COLUMNS = ("backend", "map", "step", "best, ms", "median, ms")
+Row = dict[str, Any]
 
 
 class Waiting:
@@ -39,7 +45,7 @@ class Waiting:
         self.backend, self.info, self.spent = backend, backend.info, defaultdict[str, float](float)
 
     def timed(self, name: str, step: Callable[..., Any]) -> Callable[..., Any]:
-        """The step, with its seconds added to those of the name."""
+        """Return the step, with its seconds added to those of the name."""
 
         def run(*arguments: Any, **named: Any) -> Any:
             self.backend.synchronize()
@@ -59,7 +65,7 @@ class Waiting:
 
 
 def maps(size: int) -> dict[str, np.ndarray]:
-    """Cells of an ordinary map, and of those that are hard on a search."""
+    """Make the cells of an ordinary map, and of maps that are hard on a search."""
     metres = size * RESOLUTION
     line = np.arange(size)
     empty = np.zeros((size, size), np.int8)
@@ -70,26 +76,26 @@ def maps(size: int) -> dict[str, np.ndarray]:
     return {"building": rooms, "empty": empty, "one obstacle": one, "diagonal": diagonal, "sparse": sparse}
 
 
-def times(step: Callable[[], Any], repeats: int) -> str:
-    """Best and median milliseconds after one run that does not count."""
+def times(step: Callable[[], Any], repeats: int) -> dict[str, float]:
+    """Return the best and the median seconds after one run that does not count."""
     step()
-    taken = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        step()
-        taken.append(1e3 * (time.perf_counter() - begin))
-    return f"{min(taken):8.2f} {statistics.median(taken):8.2f}"
+    least, median = best(step, repeats, math.inf)
+    return {"best_s": least, "median_s": median}
 
 
 def whole(kind: type[Any], grid: gs.OccupancyGrid, backend: Any) -> Any:
-    """A model that has prepared all of its map."""
+    """Make a model that has prepared all of its map."""
     model = kind(grid, SCANNER, backend=backend, specialize=False)
     model.prepare(np.zeros((1, 3)))
     return model
 
 
-def time_map(backend: Backend, name: str, cells: np.ndarray, repeats: int) -> bool:
-    """Print the times of a map; whether its distances are exact."""
+def time_map(backend: Backend, name: str, cells: np.ndarray, repeats: int) -> tuple[list[Row], bool]:
+    """Measure the steps of a map's preparation.
+
+    Returns:
+        A row for each step, and whether the distances are SciPy's.
+    """
     grid = gs.OccupancyGrid(cells, RESOLUTION)
     obstacles = grid.obstacles()
     steps: dict[str, Callable[[], Any]] = {
@@ -97,34 +103,42 @@ def time_map(backend: Backend, name: str, cells: np.ndarray, repeats: int) -> bo
         "distances": lambda: squared_distances(backend, obstacles),
         "distances to 40 cells": lambda: squared_distances(backend, obstacles, CAP),
     }
-    steps |= {
-        f"rectangles, sectors: {n}": functools.partial(empty_rectangles, backend, obstacles, n) for n in (1, 2, 4)
-    }
+    steps |= {f"rectangles, {n} sectors": functools.partial(empty_rectangles, backend, obstacles, n) for n in (1, 2, 4)}
     steps |= {f"{key}, whole": functools.partial(whole, kind, grid, backend) for key, kind in MODELS.items()}
+    rows = []
     for step, run in steps.items():
-        print(f"{backend.info.selection:12} {name:14} {step:24} {times(run, repeats)} ms")
+        rows.append({"backend": backend.info.selection, "map": name, "step": step, **times(run, repeats)})
+        note(table_line(cells_of(rows[-1])))
     found = backend.download(squared_distances(backend, obstacles), np.empty(cells.shape, np.int32))
     exact = np.full(cells.shape, np.iinfo(np.int32).max) if not obstacles.any() else scipy_squares(obstacles)
-    return bool((found == exact).all())
+    return rows, bool((found == exact).all())
 
 
-def time_steps(backend: Backend, cells: np.ndarray) -> None:
-    """Print where the time goes."""
+def time_steps(backend: Backend, cells: np.ndarray) -> list[Row]:
+    """Measure every upload, allocation and kernel of a preparation, each of which waits for the device."""
     grid = gs.OccupancyGrid(cells, RESOLUTION)
+    rows = []
     for key, kind in MODELS.items():
         whole(kind, grid, backend)
         waiting = Waiting(backend)
         whole(kind, grid, waiting)
-        spent = ", ".join(f"{step} {1e3 * taken:.2f}" for step, taken in waiting.spent.items())
-        print(f"{backend.info.selection:12} {key}: {spent} ms")
+        for step, taken in waiting.spent.items():
+            where = {"backend": backend.info.selection, "map": "building"}
+            rows.append({**where, "step": f"{key}: {step}", "best_s": taken, "median_s": taken})
+    return rows
 
 
-def time_edits(backend: Backend, cells: np.ndarray, repeats: int) -> bool:
-    """Print the times of edits; whether edited models say what new ones do."""
+def time_edits(backend: Backend, cells: np.ndarray, repeats: int) -> tuple[list[Row], bool]:
+    """Measure edits of a map.
+
+    Returns:
+        Rows of edits and of new models, and whether edited models give the log-likelihoods of new ones.
+    """
     rng, same = np.random.default_rng(1), True
     size = len(cells)
     poses = rng.uniform((0, 0, -3), (size * RESOLUTION, size * RESOLUTION, 3), (200, 3))
     ranges = rng.uniform(0, 10, SCANNER.count)
+    rows = []
     for key, kind in MODELS.items():
         model = whole(kind, gs.OccupancyGrid(cells, RESOLUTION), backend)
         edits, rebuilds = [], []
@@ -135,32 +149,41 @@ def time_edits(backend: Backend, cells: np.ndarray, repeats: int) -> bool:
             model.update_map(patch, place)
             middle = time.perf_counter()
             anew = whole(kind, model.grid, backend)
-            edits.append(1e3 * (middle - begin))
-            rebuilds.append(1e3 * (time.perf_counter() - middle))
+            edits.append(middle - begin)
+            rebuilds.append(time.perf_counter() - middle)
             same &= bool((model.log_likelihood(poses, ranges) == anew.log_likelihood(poses, ranges)).all())
-        edit, rebuild = statistics.median(edits), statistics.median(rebuilds)
-        print(
-            f"{backend.info.selection:12} {key}: update_map of {EDIT} x {EDIT} cells {edit:.2f} ms, a new model "
-            f"{rebuild:.2f} ms, ratio {rebuild / edit:.1f}"
-        )
-    return same
+        for what, taken in ((f"update_map of {EDIT} x {EDIT} cells", edits), ("a new model", rebuilds)):
+            where = {"backend": backend.info.selection, "map": "building", "step": f"{key}, {what}"}
+            rows.append({**where, "best_s": min(taken), "median_s": statistics.median(taken)})
+            note(table_line(cells_of(rows[-1])))
+    return rows, same
+
+
+def cells_of(row: Row) -> list[str]:
+    """Format the cells of a row."""
+    seconds = [f"{1e3 * row[key]:.2f}" for key in ("best_s", "median_s")]
+    return [row["backend"], row["map"], row["step"], *seconds]
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", action="append", help="selection string; may be given more than once")
-    parser.add_argument("--cells", type=int, default=2000, help="rows and columns of the maps (default %(default)s)")
-    parser.add_argument("--repeats", type=int, default=9, help="runs that count (default %(default)s)")
-    arguments = parser.parse_args()
-    made, right = maps(arguments.cells), True
-    for selection in arguments.backend or ["auto"]:
+    """Measure and write."""
+    parser = make_parser(__doc__)
+    parser.add_argument("--cells", type=int, default=2000, help="rows and columns of the maps (default: %(default)s)")
+    parser.add_argument("--repeats", type=int, default=9, help="runs that count (default: %(default)s)")
+    arguments = parse(parser)
+    made, rows, right = maps(arguments.cells), [], True
+    for selection in arguments.backend:
         backend = get_backend(selection)
-        print(f"{backend.info.selection}: {backend.info.name}; best and median")
         for name, cells in made.items():
-            right &= time_map(backend, name, cells, arguments.repeats)
-        time_steps(backend, made["building"])
-        right &= time_edits(backend, made["building"], arguments.repeats)
-    print("as exact as it must be" if right else "NOT as exact as it must be")
+            found, exact = time_map(backend, name, cells, arguments.repeats)
+            rows, right = rows + found, right and exact
+        rows += time_steps(backend, made["building"])
+        found, same = time_edits(backend, made["building"], arguments.repeats)
+        rows, right = rows + found, right and same
+    remark = f"Maps of {arguments.cells} x {arguments.cells} cells. " + (
+        "Distances and edited models are exact." if right else "Distances or edited models are NOT exact."
+    )
+    publish(__file__, arguments, table(COLUMNS, map(cells_of, rows)), {"rows": rows, "exact": right}, remark)
     return 0 if right else 1
 
 

@@ -1,4 +1,4 @@
-"""What a device can do at most, measured by kernels that do nothing else; bench/scaling.py makes its floors of it.
+"""Measure what a device can do at most by kernels that do nothing else; scaling.py makes its floors of it.
 
 A probe is run a few times and its best time counts, so that a floor is rather too low than too high:
 
@@ -14,12 +14,12 @@ one thread; their figures are multiplied by the number of threads. NumPy's "kern
 """
 
 import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from common import best
 
 from gpusense.backends import get_backend
 from gpusense.backends.workspace import Workspace
@@ -98,27 +98,22 @@ def rate(rates: dict[int, float], size: float) -> float:
     return max(rates[measured] for measured in rates if measured >= max(below, default=0))
 
 
-def best(run: Callable[[], Any], seconds: float = 0.12, least: int = 3) -> float:
-    """The shortest of some calls."""
-    times: list[float] = []
+def shortest(run: Callable[[], Any], seconds: float = 0.12, least: int = 3) -> float:
+    """Return the seconds of the shortest of some calls, after one that does not count."""
     run()
-    while len(times) < least or (sum(times) < seconds and len(times) < 50):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    return best(run, 50, seconds, least)[0]
 
 
-def best_in_a_row(one: Callable[[], Any], wait: Callable[[], Any]) -> float:
-    """Seconds of a launch among so many that waiting for the last of them takes no time beside."""
+def shortest_in_a_row(one: Callable[[], Any], wait: Callable[[], Any]) -> float:
+    """Return the seconds of a launch among many, so that the wait for the last of them takes no time beside."""
 
     def run(count: int) -> None:
         for _ in range(count):
             one()
         wait()
 
-    count = int(min(max(3e-3 / best(lambda: run(1), 0, 2), 1), 100))
-    return best(lambda: run(count)) / count
+    count = int(min(max(3e-3 / shortest(lambda: run(1), 0, 2), 1), 100))
+    return shortest(lambda: run(count)) / count
 
 
 def threads() -> int:
@@ -141,8 +136,8 @@ def probe(selection: str, quick: bool = False) -> Figures:
     many = kernels.threads
     array = np.zeros((1 << 16 if quick else 1 << 25) // 4, np.float32)
     space = Workspace(backend)
-    up = best(lambda: (space.upload("probe", array), space.wait()))
-    down = best(lambda: backend.download(space.empty("probe", array.size, array.dtype), array))
+    up = shortest(lambda: (space.upload("probe", array), space.wait()))
+    down = shortest(lambda: backend.download(space.empty("probe", array.size, array.dtype), array))
     space.release()
     launch, round_trip = kernels.nothing()
     sheet = next((sheet for name, sheet in SHEETS.items() if name in info.name), (0.0, 0.0, ""))
@@ -169,7 +164,7 @@ def _launches(one: Callable[[], None], wait: Callable[[], None]) -> tuple[float,
         one()
         wait()
 
-    return best(many, 0.05) / 200, best(single, 0.02, 20)
+    return shortest(many, 0.05) / 200, shortest(single, 0.02, 20)
 
 
 class _OpenCL:
@@ -212,7 +207,7 @@ class _OpenCL:
         kernel = self._kernels[name]
         kernel.set_args(*arguments)
         group = (min(self._group, items),)
-        return best_in_a_row(
+        return shortest_in_a_row(
             lambda: self._cl.enqueue_nd_range_kernel(self._queue, kernel, (items,), group), self._queue.finish
         )
 
@@ -309,7 +304,7 @@ class _Warp:
         )
 
     def _time(self, name: str, items: int, *arguments: Any) -> float:
-        return best_in_a_row(self._command(name, items, *arguments).launch, self._wait)
+        return shortest_in_a_row(self._command(name, items, *arguments).launch, self._wait)
 
     def nothing(self) -> tuple[float, float]:
         """See _launches."""
@@ -352,7 +347,7 @@ class _NumPy:
     def issue(self) -> float:
         """Additions per second of numbers in the nearest cache."""
         numbers = np.zeros(4096, np.float32)
-        return 4096 * 64 / best(lambda: [np.add(numbers, numbers, out=numbers) for _ in range(64)])
+        return 4096 * 64 / shortest(lambda: [np.add(numbers, numbers, out=numbers) for _ in range(64)])
 
     def gather(self, size: int, together: bool) -> float:
         """Look-ups per second in a table of that size."""
@@ -362,9 +357,9 @@ class _NumPy:
         if together:
             place = (place & np.uint32(0xFFFFFFE0)) | (item & np.uint32(31))
         index, out = place.astype(np.intp), np.empty(self._items, np.float32)
-        return self._items / best(lambda: np.take(table, index, out=out, mode="clip"), 0.03)
+        return self._items / shortest(lambda: np.take(table, index, out=out, mode="clip"), 0.03)
 
     def copy(self, size: int) -> float:
         """Bytes read and written per second."""
         one, other = np.zeros(size // 4, np.float32), np.zeros(size // 4, np.float32)
-        return 2 * size / best(lambda: np.copyto(other, one))
+        return 2 * size / shortest(lambda: np.copyto(other, one))

@@ -1,7 +1,7 @@
 """How speed grows with particles, beams and the map, with the floor that the device sets: what could be had at most.
 
-    python bench/scaling.py --backend opencl:0:0 --backend warp:cuda:0 --output bench/results/scaling_h200
-    python bench/scaling.py --backend opencl --seconds 0.2 --total 60             # a processor
+    python bench/speed/scaling.py --backend opencl:0:0 --backend warp:cuda:0 --output bench/results/scaling_h200
+    python bench/speed/scaling.py --backend opencl --seconds 0.2 --total 60             # a processor
 
 Three curves of rays, beam model and likelihood field (nearest), float32, 30 m of range at 5 cm: N particles with 60
 beams, K beams with 10 000 particles, and the side of the map with 360 beams and 100 000 particles (4096 on processors).
@@ -14,7 +14,7 @@ A *call* has NumPy arrays in and out. *Launches* are the kernels of that call ag
 everything on the device. Points that take too long (--seconds, --total) or too much memory are left out and listed with
 the reason.
 
-The floor. bench/probes.py measures what the device does at most: launches, round trip, additions/s (issue), look-ups/s,
+The floor. probes.py measures what the device does at most: launches, round trip, additions/s (issue), look-ups/s,
 bytes/s of copies, up and down. With E particle-beams, N particles and L launches
 
     launches >= max(L * launch, round trip, operations / issue, look-ups / nearest, bytes / copy)
@@ -48,7 +48,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 import time
 from dataclasses import dataclass, field
@@ -56,14 +55,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from probes import Figures, probe, rate
-from scaling_report import KINDS, draw, figures_markdown, table_line
-from scaling_scenes import CHECKED, RANGE_MAX, Scene, count_reads, make_scene
-from speed import Recorder, best, command_line, machine
 
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.tables.distances import sectors_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import Recorder, best, make_parser, note, one_by_one, parse, publish, table_line, waited
+from speed.probes import Figures, probe, rate
+from speed.scaling_report import KINDS, cells, draw, figures_markdown
+from speed.scaling_scenes import CHECKED, RANGE_MAX, Scene, count_reads, make_scene
 
 OPERATIONS = {"field": 17, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
 
@@ -212,12 +214,7 @@ class Device:
         seconds = min(self.arguments.seconds, self.arguments.total)
         least, median = best(lambda: call(poses), self.arguments.repeats, seconds) if once < seconds else (once, once)
 
-        def again() -> None:
-            for launch in launches:
-                launch()
-            self.backend.synchronize()
-
-        alone, _ = best(again, self.arguments.repeats, seconds)
+        alone, _ = best(waited(self.backend, one_by_one(launches)), self.arguments.repeats, seconds)
         # They hold the call's buffers.
         launches_of_call = len(launches)
         launches.clear()
@@ -235,7 +232,7 @@ class Device:
             "floor_launch_s": floor.launches, "scattered_s": floor.scattered, "cause": floor.cause,
         }  # fmt: skip
         self.rows.append(row)
-        note(table_line(row))
+        note(table_line(cells(row)))
 
     def model(self, kind: str, side: int, scanner: gs.Scanner) -> Any:
         """A model of the device, kept while map and beams stay the same."""
@@ -280,11 +277,6 @@ def host_memory() -> float:
         return 8e9
 
 
-def note(text: str) -> None:
-    """A line for who waits."""
-    print(text, file=sys.stderr, flush=True)
-
-
 def numbers(text: str) -> list[int]:
     """Whole numbers with commas between them; 1e4 is one."""
     return [int(float(word)) for word in text.split(",") if word]
@@ -292,10 +284,7 @@ def numbers(text: str) -> list[int]:
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--backend", action="append", required=True, help="selection string; may be given more than once"
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--particles", type=numbers, default=numbers("1e2,1e3,1e4,1e5,1e6,1e7"))
     parser.add_argument("--beams", type=numbers, default=numbers("1,3,10,30,100,300,1000,3000,10000"))
     parser.add_argument("--sides", type=numbers, default=numbers("100,300,1000,3000,10000,20000"))
@@ -311,9 +300,7 @@ def main() -> int:
         "--total", type=float, default=36.0, help="time of one device after its probes [s]; what is left is listed"
     )
     parser.add_argument("--quick", action="store_true", help="probes of small arrays, to try the script")
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json, .md and .png files")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     scenes: dict[int, Scene] = {}
     truths: dict[tuple[Any, ...], np.ndarray] = {}
     devices, failed = [], False
@@ -326,18 +313,11 @@ def main() -> int:
             "figures": dataclasses.asdict(device.figures), "rows": device.rows, "left_out": device.left_out,
             "seconds": time.perf_counter() - device.start,
         })  # fmt: skip
-    command, host = command_line("bench/scaling.py"), machine(arguments.commit)
-    described = ", ".join(f"{name} {value}" for name, value in host.items())
-    table = "\n".join(map(figures_markdown, devices)) + f"\nMachine: {described}. Command: `{command}`.\n"
-    print(table)
-    if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        report = {"command": command, "machine": host, "operations": OPERATIONS, "devices": devices}
-        base = arguments.output.parent / arguments.output.name
-        base.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        base.with_suffix(".md").write_text(table)
-        for device in devices:
-            draw(device, base.with_name(f"{base.name}_{device['backend'].replace(':', '_')}.png"))
+    report = {"operations": OPERATIONS, "devices": devices}
+    publish(__file__, arguments, "\n".join(map(figures_markdown, devices)).rstrip("\n"), report)
+    for device in devices if arguments.output else ():
+        name = f"{arguments.output.name}_{device['backend'].replace(':', '_')}.png"
+        draw(device, arguments.output.with_name(name))
     return int(failed)
 
 

@@ -1,28 +1,31 @@
-"""The report of bench/scaling.py: its table, what the probes found, and the diagram."""
+"""Report what scaling.py measured: its table, the probes' figures, and the diagram."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+# scaling.py has made bench/ importable.
+from common import table
+
 KINDS = ("rays", "beam model", "field")
 AXES = {"particles": "particles", "beams": "beams", "side": "side of the map [cells]"}
-HEAD = (
-    "| backend | what | particles x beams | map | ms a call (median) | ms, launches alone | floor of both, ms | set by "
-    "| M/s, call | M/s, launches | share of the floor's rate | max error |\n" + "| --- " * 12 + "|"
-)
+COLUMNS = (
+    "backend", "what", "particles x beams", "map", "ms a call (median)", "ms, launches alone", "floor of both, ms",
+    "set by", "M/s, call", "M/s, launches", "share of the floor's rate", "max error",
+)  # fmt: skip
 
 
-def table_line(r: dict[str, Any]) -> str:
-    """A row of the table; a time below the floor is marked."""
+def cells(r: dict[str, Any]) -> list[str]:
+    """Format the cells of a row; a time below the floor is marked."""
     work = r["particles"] * r["beams"] / 1e6
     share = r["floor_launch_s"] / r["launch_s"]
-    return (
-        f"| {r['backend']} | {r['what']} | {r['particles']} x {r['beams']} | {r['side']} x {r['side']} "
-        f"| {r['call_s'] * 1e3:.4g} ({r['median_s'] * 1e3:.4g}) | {r['launch_s'] * 1e3:.4g} "
-        f"| {r['floor_call_s'] * 1e3:.3g}, {r['floor_launch_s'] * 1e3:.3g} | {r['cause']} | {work / r['call_s']:.4g} "
-        f"| {work / r['launch_s']:.4g} | {share:.0%}{' (below the floor)' if share > 1 else ''} | {r['error']:.1e} |"
-    )
+    return [
+        r["backend"], r["what"], f"{r['particles']} x {r['beams']}", f"{r['side']} x {r['side']}",
+        f"{r['call_s'] * 1e3:.4g} ({r['median_s'] * 1e3:.4g})", f"{r['launch_s'] * 1e3:.4g}",
+        f"{r['floor_call_s'] * 1e3:.3g}, {r['floor_launch_s'] * 1e3:.3g}", r["cause"], f"{work / r['call_s']:.4g}",
+        f"{work / r['launch_s']:.4g}", f"{share:.0%}{' (below the floor)' if share > 1 else ''}", f"{r['error']:.1e}",
+    ]  # fmt: skip
 
 
 def figures_markdown(device: dict[str, Any]) -> str:
@@ -35,7 +38,7 @@ def figures_markdown(device: dict[str, Any]) -> str:
         f"Floor of {f['source']}: launch {f['launch_s'] * 1e6:.3g} us, round trip {f['round_trip_s'] * 1e6:.3g} us; "
         f"additions {f['issue'] / 1e9:.4g} G/s; look-ups nearest {f['together'] / 1e9:.4g} G/s, at random in {sizes}; "
         f"copies of {copies}; upload {f['upload'] / 1e9:.3g} GB/s, download {f['download'] / 1e9:.3g} GB/s.", "",
-        HEAD, *(table_line(row) for row in device["rows"]), "",
+        table(COLUMNS, map(cells, device["rows"])), "",
         f"Left out: {len(device['left_out'])} points." if device["left_out"] else "No point was left out.",
         *(f"- {line}" for line in device["left_out"] + f["left_out"]), "",
     ]  # fmt: skip
@@ -64,7 +67,7 @@ def draw(device: dict[str, Any], path: Path) -> None:
             ax.plot(x, y["floor_call_s"], "-.", color=colours[kind], lw=0.8)
             ax.fill_between(x, y["floor_launch_s"], y["scattered_s"], color=colours[kind], alpha=0.12, lw=0)
         fixed = [row for row in device["rows"] if row["axis"] == axis][:1]
-        told = {
+        caption = {
             "particles": "{beams} beams, map of {side} cells",
             "beams": "{particles} particles, map of {side} cells",
             "side": "{particles} particles, {beams} beams",
@@ -72,7 +75,7 @@ def draw(device: dict[str, Any], path: Path) -> None:
         ax.set(xlabel=AXES[axis])
         if fixed:
             ax.set(xscale="log", yscale="log")
-        ax.set_title(told.format(**fixed[0]) if fixed else "every point left out", loc="left", fontsize="medium")
+        ax.set_title(caption.format(**fixed[0]) if fixed else "every point left out", loc="left", fontsize="medium")
         ax.grid(True, which="major", color="#e3e7ed", lw=0.6)
     figure.axes[0].set_ylabel("time per ray or particle-beam [ns]")
     _legend(figure, colours)

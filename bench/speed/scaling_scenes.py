@@ -1,4 +1,4 @@
-"""Maps of any size for bench/scaling.py, clouds in them, and how often casting a ray reads the map's table there."""
+"""Make maps of any size for scaling.py and clouds in them; count how often a ray reads the map's table there."""
 
 from __future__ import annotations
 

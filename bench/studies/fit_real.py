@@ -1,7 +1,7 @@
-"""The beam model's parameters of real sensors, and what they gain on held-out readings over others' defaults.
+"""Fit the beam model's parameters of real sensors, and compare them with others' defaults on held-out readings.
 
-    python bench/fit_real.py --data DATA --output bench/results/fit_real             # everything; some minutes
-    python bench/fit_real.py --data DATA --set lidar_wall --set sonar1 --discrete 0.1
+    python bench/studies/fit_real.py --data DATA --output bench/results/fit_real             # everything; some minutes
+    python bench/studies/fit_real.py --data DATA --set lidar_wall --set sonar1 --discrete 0.1
 
 Each set is fitted on one half and scored on the other:
 
@@ -22,8 +22,8 @@ does not. Standard errors of the held-out figures are those of blocks of neighbo
 of a sonar. Others' defaults are those of nav2_amcl and Beluga with their weights divided by their sums, in the book's
 normalised mixture. Where the fitted parameters make a held-out reading impossible, half a reading of each cause is
 added to them ("softened"). --discrete adds the discrete model with dependent causes, learned in steps of that width
-on the same half, and what it gains over the fitted mixture in the same steps. --incidence adds, for the logs of SICK
-lasers, parameters for so many bins of angles of incidence, and what they gain over the same parameters for all angles.
+on the same half, and its gain over the fitted mixture in the same steps. --incidence adds, for the logs of SICK lasers,
+parameters for a number of bins of angles of incidence, and their gain over the same parameters for all angles.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from __future__ import annotations
 import argparse
 import csv
 import gzip
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -39,23 +38,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sonar_field import recorded, ring_of
-from speed import publish
 
 import gpusense as gs
 from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
 from gpusense.evaluation.range_data import RangeData
-from gpusense.evaluation.scoring import logged_scans
 
-LOGS = ("intel", "freiburg-079", "csail", "aces")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import LOGS, make_parser, note, odd_scans, parse, publish, table
+from studies.sonar_field import recorded, ring_of
+
 SONARS = {"sonar1": (8.0, 0.0), "sonar2": (5.0, 0.3)}
 # In the scanner's name: range_max [m], the reading that means "no return" below range_min, x of the mount [m].
 LASERS = {"nav350": (25.0, 0.0), "s3000": (51.2, None)}
 
 
-def table(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a compressed CSV file, as numbers where they are."""
+def read_columns(path: Path) -> dict[str, np.ndarray]:
+    """Read the columns of a compressed CSV file, as numbers where they are."""
     with gzip.open(path, "rt", newline="") as stream:
         rows = list(csv.DictReader(stream))
     columns = {}
@@ -69,12 +69,12 @@ def table(path: Path) -> dict[str, np.ndarray]:
 
 
 def sonar(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """The two recordings of a sonar, as halves or in blocks."""
+    """Read the two recordings of a sonar, as halves or in blocks."""
     name, transfer, _ = name.partition("-transfer")
     top, blind = SONARS[name]
     halves = []
     for file in ("calibration", "training1"):
-        columns = table(data / "sonar_enmt482" / f"{file}.csv.gz")
+        columns = read_columns(data / "sonar_enmt482" / f"{file}.csv.gz")
         seen = columns["range"] >= blind
         z, expected = columns[name][seen], columns["range"][seen]
         halves.append(RangeData(z, expected, None, np.arange(len(z)) // 100, top))
@@ -87,8 +87,8 @@ def sonar(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
 
 
 def wall(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """All set-ups before the wall, a scan a block."""
-    columns = table(data / "lidar_wall" / "frontal_beams.csv.gz")
+    """Read all set-ups before the wall, a scan a block."""
+    columns = read_columns(data / "lidar_wall" / "frontal_beams.csv.gz")
     expected = columns["true_distance_m"] / np.cos(columns["angle_rad"])
     _, bag = np.unique(columns["bag"], return_inverse=True)
     _, block = np.unique(np.stack([bag, columns["scan"]]), axis=1, return_inverse=True)
@@ -96,17 +96,15 @@ def wall(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDat
 
 
 def log(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """The odd scans of a log in the map of the even ones."""
-    folder = data / "carmen_logs"
-    grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
-    scans = logged_scans(folder / f"{name}-corrected.log.gz", every=2, offset=1, limit=arguments.scans or None)
+    """Read the odd scans of a log in the map of the even ones."""
+    grid, scans = odd_scans(data, name, arguments.scans or None)
     return fitting.data_of_log(
         grid, scans, backend=arguments.backend, block=arguments.block, incidence=bool(arguments.incidence)
     ).halves()
 
 
 def laser(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """A laser of the vehicle, at its reference poses."""
+    """Read a laser of the vehicle, at its reference poses."""
     top, nothing = LASERS[name]
     folder = data / "jarvis_lab"
     with np.load(folder / "jarvis_complex_path_fast.npz", allow_pickle=False) as run:
@@ -130,7 +128,7 @@ def laser(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
 
 
 def ring(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """The odd frames of the sonar ring in the map of the even ones."""
+    """Read the odd frames of the sonar ring in the map of the even ones."""
     place = recorded(data / "sonar_pioneer8", arguments.scans or 1 << 30)
     cone = {"cone": np.radians(15), "cone_rays": 7} if name.endswith("cone") else {}
     model = gs.BeamModel(place.grid, ring_of(place, **cone), backend=arguments.backend)
@@ -184,7 +182,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
 def by_incidence(
     half: RangeData, rest: RangeData, parameters: gs.BeamParameters, bins: int, backend: str
 ) -> dict[str, Any]:
-    """Parameters by angle of incidence learned on one half, against those for all angles on the other."""
+    """Learn parameters by angle of incidence on one half, and compare with those for all angles on the other."""
     assert half.incidence is not None
     fit = gs.fit_incidence_parameters(
         half.ranges, half.expected, half.incidence, half.range_max, range_min=half.range_min, bins=bins, backend=backend
@@ -204,7 +202,7 @@ def by_incidence(
 def discrete(
     half: RangeData, rest: RangeData, parameters: gs.BeamParameters, bias: float, width: float
 ) -> dict[str, Any]:
-    """The discrete model learned on one half, against the fitted mixture in the same steps on the other."""
+    """Learn the discrete model on one half, and compare with the fitted mixture in the same steps on the other."""
     bins = min(max(round(half.range_max / width), 1), 4096)
 
     def moved(data: RangeData) -> RangeData:
@@ -231,84 +229,77 @@ def discrete(
 
 
 def finite(value: float) -> float | None:
-    """A number that JSON has."""
+    """Return a number that JSON has, or None."""
     return value if np.isfinite(value) else None
 
 
 def pair(value: float | None, error: float | None, digits: int = 3) -> str:
-    """A value and its standard error."""
+    """Format a value and its standard error."""
     if value is None:
         return "-inf"
     return f"{value:.{digits}g}" if error is None else f"{value:.{digits}g} +- {error:.1g}"
 
 
 def to_markdown(reports: list[dict[str, Any]]) -> str:
-    """Fitted parameters, held-out comparison, and the discrete model where it was asked for."""
+    """Format fitted parameters, held-out comparison, and what options add."""
     names = list(gs.BeamParameters().to_dict())
-    lines = ["### Fitted parameters", "", "| set | range_max [m] | readings | " + " | ".join(names) + " | bias [m] |"]
-    lines.append("| --- " * (len(names) + 4) + "|")
+    fitted, compared, discrete_lines, incidence_lines = [], [], [], []
     for report in reports:
         fit = report["fit"]
         cells = [pair(fit["parameters"][name], fit["standard_errors"][name]) for name in names]
         bias = pair(fit["range_bias"], fit["range_bias_error"]) if report["range_bias_fitted"] else "-"
-        lines.append(
-            f"| {report['set']} | {report['range_max']:g} | {report['readings']} | {' | '.join(cells)} | {bias} |"
-        )
-    lines += ["", "### Held-out log-likelihood of a reading [nats]", ""]
-    lines.append("| set | held out (blocks) | fitted | gain over nav2_amcl's defaults | gain over Beluga's defaults |")
-    lines.append("| --- " * 5 + "|")
-    for report in reports:
+        fitted.append([report["set"], f"{report['range_max']:g}", report["readings"], *cells, bias])
         *own, amcl, beluga = report["held_out"]
-        note = f" (softened: {own[0]['impossible']} impossible)" if len(own) > 1 else ""
-        lines.append(
-            f"| {report['set']} | {report['held_out_readings']} ({report['held_out_blocks']}) "
-            f"| {pair(own[-1]['per_beam'], own[-1]['error'])}{note} | {pair(amcl['gain'], amcl['gain_error'])} "
-            f"| {pair(beluga['gain'], beluga['gain_error'])} |"
-        )
-    if any("discrete" in report for report in reports):
-        lines += ["", "### Dependent causes against the fitted mixture in the same steps, on the held-out readings", ""]
-        causes = list(gs.DiscreteCauses().to_dict())
-        lines += ["| set | bins | " + " | ".join(causes) + " | gain over the mixture [nats] |"]
-        lines.append("| --- " * (len(causes) + 3) + "|")
-        for report in reports:
+        remark = f" (softened: {own[0]['impossible']} impossible)" if len(own) > 1 else ""
+        compared.append([
+            report["set"], f"{report['held_out_readings']} ({report['held_out_blocks']})",
+            pair(own[-1]["per_beam"], own[-1]["error"]) + remark, pair(amcl["gain"], amcl["gain_error"]),
+            pair(beluga["gain"], beluga["gain_error"]),
+        ])  # fmt: skip
+        if "discrete" in report:
             own = report["discrete"]
-            cells = [pair(own["causes"][name], own["standard_errors"][name]) for name in causes]
-            gain = pair(own["gain"], own["gain_error"])
-            lines.append(f"| {report['set']} | {own['bins']} | {' | '.join(cells)} | {gain} |")
-    if any("incidence" in report for report in reports):
-        lines += ["", "### Parameters by angle of incidence against the same for all, on the held-out readings", ""]
-        lines += ["| set | sigma_hit of the bins [m] | z_max of the bins | readings without a surface | gain [nats] |"]
-        lines.append("| --- " * 5 + "|")
-        for report in (report for report in reports if "incidence" in report):
+            cells = [pair(own["causes"][name], own["standard_errors"][name]) for name in own["causes"]]
+            discrete_lines.append([report["set"], own["bins"], *cells, pair(own["gain"], own["gain_error"])])
+        if "incidence" in report:
             own = report["incidence"]
             each = own["fit"]["parameters"]["parameters"]
             cells = [", ".join(f"{one[name]:.3g}" for one in each) for name in ("sigma_hit", "z_max")]
             gain = pair(own["gain"], own["gain_error"])
-            lines.append(f"| {report['set']} | {' | '.join(cells)} | {own['fit']['no_surface_count']} | {gain} |")
-    return "\n".join(lines)
+            incidence_lines.append([report["set"], *cells, own["fit"]["no_surface_count"], gain])
+    tables = {
+        "Fitted parameters": (("set", "range_max [m]", "readings", *names, "bias [m]"), fitted),
+        "Held-out log-likelihood of a reading [nats]": (
+            ("set", "held out (blocks)", "fitted", "gain over nav2_amcl's defaults", "gain over Beluga's defaults"),
+            compared,
+        ),
+        "Dependent causes against the fitted mixture in the same steps, on the held-out readings": (
+            ("set", "bins", *gs.DiscreteCauses().to_dict(), "gain over the mixture [nats]"), discrete_lines,
+        ),
+        "Parameters by angle of incidence against the same for all, on the held-out readings": (
+            ("set", "sigma_hit of the bins [m]", "z_max of the bins", "readings without a surface", "gain [nats]"),
+            incidence_lines,
+        ),
+    }  # fmt: skip
+    return "\n\n".join(f"### {title}\n\n{table(*content)}" for title, content in tables.items() if content[1])
 
 
 def main() -> int:
     """Fit, compare and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
+    parser = make_parser(__doc__, backend="auto", data=True)
     parser.add_argument("--set", action="append", choices=tuple(SETS), help="default: all")
-    parser.add_argument("--scans", type=int, default=0, help="at most so many scans of a laser; 0: all")
+    parser.add_argument("--scans", type=int, default=0, help="most scans of a laser; 0: all")
     parser.add_argument("--block", type=int, default=10, help="neighbouring scans of a block")
-    parser.add_argument("--discrete", type=float, help="also learn the discrete model, in steps of so many metres")
-    parser.add_argument("--incidence", type=int, help="also fit so many bins of angles of incidence, where known")
-    parser.add_argument("--backend", default="auto")
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
-    arguments = parser.parse_args()
-    if arguments.data is None:
-        parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
+    parser.add_argument("--discrete", type=float, help="also learn the discrete model, in steps of that width [m]")
+    parser.add_argument(
+        "--incidence", type=int, help="also fit that number of bins of angles of incidence, where known"
+    )
+    arguments = parse(parser)
     reports = []
     for name in arguments.set or SETS:
-        print(name, file=sys.stderr, flush=True)
+        note(name)
         reports.append(measure(arguments.data, name, arguments))
     device = reports[0]["fit"]["device"]
-    publish("fit_real.py", arguments, to_markdown(reports), {"device": device, "sets": reports}, f"Device: {device}.")
+    publish(__file__, arguments, to_markdown(reports), {"device": device, "sets": reports}, f"Device: {device}.")
     return 0 if all(report["fit"]["converged"] for report in reports) else 1
 
 

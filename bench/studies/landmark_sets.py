@@ -1,4 +1,4 @@
-"""Recorded runs among landmarks, each in its own text format, as gpusense.logs.records.LandmarkRun."""
+"""Read recorded runs among landmarks, each in its own text format, as gpusense.logs.records.LandmarkRun."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _TURN, _WAY = 0.05, 0.1
 
 
 def run_of(data: Path, name: str) -> LandmarkRun:
-    """The run of a name: mrclam_1, mrclam_2, mrclam_3, beacons, lego or freiburg."""
+    """Read the run of a name: mrclam_1, mrclam_2, mrclam_3, beacons, lego or freiburg."""
     if name.startswith("mrclam_"):
         return read_mrclam(data / "mrclam_ds1", int(name[-1]))
     return {"beacons": _beacons, "lego": _lego, "freiburg": _freiburg}[name](data)
 
 
 def _beacons(data: Path) -> LandmarkRun:
-    """A camera's fiducials; every row is a moment, some without a beacon, and poses are those of SLAM.
+    """Read a camera's fiducials; every row is a moment, some without a beacon, and poses are those of SLAM.
 
     From 275 s on SLAM is lost and leaps by metres: the run ends where it first moves half a metre more than odometry.
     """
@@ -40,8 +40,8 @@ def _beacons(data: Path) -> LandmarkRun:
         rows = sorted(csv.DictReader(stream), key=lambda row: int(row["time_ns"]))
     clock = np.array([int(row["time_ns"]) for row in rows])
     _, first, scan = np.unique(clock, return_index=True, return_inverse=True)
-    tracks = [np.array([[float(row[f"{who}_{name}"]) for name in ("x", "y", "theta")] for row in rows])[first]
-              for who in ("odom", "map")]  # fmt: skip
+    tracks = [np.array([[float(row[f"{frame}_{name}"]) for name in ("x", "y", "theta")] for row in rows])[first]
+              for frame in ("odom", "map")]  # fmt: skip
     seen = [(i, row) for i, row in enumerate(rows) if row["beacon_id"]]
     kept = [(i, row) for i, row in seen if int(float(row["beacon_id"])) in index]
     local = np.array([[float(row["beacon_x"]), float(row["beacon_y"])] for _, row in kept])
@@ -59,7 +59,7 @@ def _beacons(data: Path) -> LandmarkRun:
 
 
 def cylinders(ranges: np.ndarray) -> np.ndarray:
-    """(F, 2) ranges and bearings of cylinders in a scan: what lies between a jump nearer and one farther."""
+    """Find (F, 2) ranges and bearings of cylinders in a scan: readings between a jump nearer and one farther."""
     bearings = (np.arange(ranges.size) - 330) * 0.006135923 - 0.0698
     found, inside, active = [], [], False
     for k in range(1, ranges.size - 1):
@@ -77,7 +77,7 @@ def cylinders(ranges: np.ndarray) -> np.ndarray:
 
 
 def _lego(data: Path) -> LandmarkRun:
-    """A lidar's cylinders. Positions are an overhead camera's; headings are those that explain most cylinders."""
+    """Read a lidar's cylinders. Positions are an overhead camera's; headings are those that explain most cylinders."""
     folder = data / "brenner_lego"
     xy = np.loadtxt(folder / "robot_arena_landmarks.txt", usecols=(2, 3)) / 1000
     position = np.loadtxt(folder / "robot4_reference.txt", usecols=(2, 3)) / 1000
@@ -116,7 +116,7 @@ def _lego(data: Path) -> LandmarkRun:
 
 
 def _freiburg(data: Path) -> LandmarkRun:
-    """Simulated; there is no true path, so logged poses are those of its nearly exact odometry.
+    """Read a simulated run without a true path, whose logged poses are those of its nearly exact odometry.
 
     A filter would have nothing to do with that: it gets the odometry with noise of a poor robot added.
     """
@@ -146,7 +146,7 @@ def _freiburg(data: Path) -> LandmarkRun:
 
 
 def _path(moves: np.ndarray) -> np.ndarray:
-    """(S, 3) poses after (S, 3) first turns, ways and second turns, from the origin."""
+    """Return (S, 3) poses after (S, 3) first turns, ways and second turns, from the origin."""
     heading = np.cumsum(moves[:, 0] + moves[:, 2])
     along = heading - moves[:, 2]
     return np.column_stack([

@@ -1,11 +1,11 @@
-"""Noise, association and localisation of real robots among landmarks.
+"""Fit the noise of real robots among landmarks, associate and localise.
 
-    python bench/landmarks_real.py --data DATA --output bench/results/landmarks_real      # some minutes
+    python bench/studies/landmarks_real.py --data DATA --output bench/results/landmarks_real      # some minutes
 
 For each run: parameters fitted at the logged poses with known and with unknown landmarks; landmarks whose readings
 stand where another one is; how often the likeliest landmark of a feature is the recorded one, at logged poses and at
 poses moved at random; and the error of a plain particle filter (odometry, ``LandmarkModel``, systematic resampling)
-that is told the landmarks, or not, with the parameters of the fit of its kind. It starts 0.5 m and 0.3 rad (one
+that knows the landmarks, or does not, with the parameters of the fit of its kind. It starts 0.5 m and 0.3 rad (one
 deviation) around the first logged pose. Two landmarks of the UTIAS data are exchanged in the published positions: they
 are left so, and for comparison put back as reported ("repaired"). Fits and filters use the same run.
 
@@ -16,23 +16,24 @@ it with noise added. The LEGO robot's headings are made of the features themselv
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
-from landmark_sets import run_of
-from speed import publish
-
 import gpusense as gs
 from gpusense.evaluation import landmark_runs as lr
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import make_parser, note, parse, publish, table
+from studies.landmark_sets import run_of
 
 SETS = ("mrclam_1", "mrclam_2", "mrclam_3", "beacons", "lego", "freiburg")
 MOVED = ((0.0, 0.0), (0.1, 0.05), (0.3, 0.15))
 
 
 def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The figures of one run."""
+    """Return the figures of one run."""
     run = lr.first_scans(run_of(data, name), arguments.scans)
     fit = lr.fit_run(run)
     found = lr.suspicions(run, fit)
@@ -53,7 +54,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
             track = lr.localise(own, model, known=known, particles=arguments.particles, seed=arguments.seed)
             row["filter"] = track.summary()
             rows.append(row)
-            print(f"{name}: {variant}, {'known' if known else 'unknown'}", file=sys.stderr, flush=True)
+            note(f"{name}: {variant}, {'known' if known else 'unknown'}")
     label = run.labels.tolist()
     return {
         "set": name, "scans": len(run.time), "features": len(run.ids), "landmarks": len(run.landmarks),
@@ -67,41 +68,35 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
 
 
 def to_markdown(sets: list[dict[str, Any]]) -> str:
-    """Tables of all runs."""
-    lines = [
-        "| run (scans, features) | map | landmarks | sigma_range [m] | sigma_bearing [rad] | z_false | p_detect "
-        "| range bias [m] | bearing bias [rad] |",
-        "| --- " * 9 + "|",
-    ]
+    """Format the tables of all runs, and the list of suspicious landmarks."""
+    fits, errors, associations = [], [], []
     for one in sets:
         for row in one["rows"]:
-            p, e, f = row["fit"]["parameters"], row["fit"]["standard_errors"], row["fit"]
-            lines.append(
-                f"| {one['set']} ({one['scans']}, {one['features']}) | {row['map']} | {_told(row)} "
-                f"| {p['sigma_range']:.4f} +- {_number(e['sigma_range'])} "
-                f"| {p['sigma_bearing']:.4f} +- {_number(e['sigma_bearing'])} | {p['z_false']:.4f} "
-                f"| {p['p_detect']:.2f} | {f['range_bias']:+.4f} | {f['bearing_bias']:+.4f} |"
-            )
-    lines += ["", "| run | map | landmarks | error [m], median / 90 % / largest | heading [rad], median / 90 % |",
-              "| --- " * 5 + "|"]  # fmt: skip
-    for one in sets:
-        for row in one["rows"]:
-            f = row["filter"]
-            lines.append(
-                f"| {one['set']} | {row['map']} | {_told(row)} | {f['error_median']:.3f} / {f['error_90']:.3f} / "
-                f"{f['error_max']:.2f} | {f['heading_median']:.3f} / {f['heading_90']:.3f} |"
-            )
-    head = " | ".join(f"moved {m:g} m, {h:g} rad" for m, h in MOVED)
-    lines += ["", f"| association right / none / wrong [%] | map | {head} |", "| --- " * (2 + len(MOVED)) + "|"]
-    for one in sets:
-        for row in one["rows"]:
+            p, e, fit, f = row["fit"]["parameters"], row["fit"]["standard_errors"], row["fit"], row["filter"]
+            which = "known" if row["known"] else "unknown"
+            fits.append([
+                f"{one['set']} ({one['scans']}, {one['features']})", row["map"], which,
+                f"{p['sigma_range']:.4f} +- {_number(e['sigma_range'])}",
+                f"{p['sigma_bearing']:.4f} +- {_number(e['sigma_bearing'])}", f"{p['z_false']:.4f}",
+                f"{p['p_detect']:.2f}", f"{fit['range_bias']:+.4f}", f"{fit['bearing_bias']:+.4f}",
+            ])  # fmt: skip
+            errors.append([
+                one["set"], row["map"], which,
+                f"{f['error_median']:.3f} / {f['error_90']:.3f} / {f['error_max']:.2f}",
+                f"{f['heading_median']:.3f} / {f['heading_90']:.3f}",
+            ])  # fmt: skip
             if "association" in row:
-                cells = " | ".join(
-                    f"{100 * a['right']:.1f} / {100 * a['none']:.1f} / {100 * a['wrong']:.1f}"
-                    for a in row["association"]
-                )
-                lines.append(f"| {one['set']} | {row['map']} | {cells} |")
-    lines.append("")
+                shares = [[f"{100 * a[key]:.1f}" for key in ("right", "none", "wrong")] for a in row["association"]]
+                associations.append([one["set"], row["map"], *(" / ".join(share) for share in shares)])
+    fit_columns = (
+        "run (scans, features)", "map", "landmarks", "sigma_range [m]", "sigma_bearing [rad]", "z_false", "p_detect",
+        "range bias [m]", "bearing bias [rad]",
+    )  # fmt: skip
+    error_columns = ("run", "map", "landmarks", "error [m], median / 90 % / largest", "heading [rad], median / 90 %")
+    moved = (f"moved {m:g} m, {h:g} rad" for m, h in MOVED)
+    association_columns = ("association right / none / wrong [%]", "map", *moved)
+    tables = [table(fit_columns, fits), table(error_columns, errors), table(association_columns, associations)]
+    lines = []
     for one in sets:
         for e in one["exchanged"]:
             lines.append(
@@ -113,11 +108,7 @@ def to_markdown(sets: list[dict[str, Any]]) -> str:
             f"- {one['set']}: {100 * m['agree']:.0f} % of the readings of landmark {m['landmark']} agree with its place"
             for m in one["misplaced"]
         ]
-    return "\n".join(lines)
-
-
-def _told(row: dict[str, Any]) -> str:
-    return "known" if row["known"] else "unknown"
+    return "\n\n".join([*tables, "\n".join(lines)]).rstrip()
 
 
 def _number(value: float | None) -> str:
@@ -126,21 +117,14 @@ def _number(value: float | None) -> str:
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
+    parser = make_parser(__doc__, backend="auto", data=True)
     parser.add_argument("--set", action="append", choices=SETS, help="default: all")
-    parser.add_argument("--scans", type=int, help="at most so many of each run")
+    parser.add_argument("--scans", type=int, help="most scans of each run")
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--backend", default="auto")
-    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
-    arguments = parser.parse_args()
-    if arguments.data is None:
-        parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
+    arguments = parse(parser)
     sets = [measure(arguments.data, name, arguments) for name in arguments.set or SETS]
     note, report = f"{arguments.particles} particles.", {"particles": arguments.particles, "sets": sets}
-    publish("landmarks_real.py", arguments, to_markdown(sets), report, note)
+    publish(__file__, arguments, to_markdown(sets), report, note)
     return 0
 
 

@@ -1,7 +1,7 @@
-"""Does the likelihood field work for ultrasound sensors? Fields and beam models on simulated and recorded sonar rings.
+"""Compare the likelihood field with beam models for ultrasound sensors, on simulated and recorded sonar rings.
 
-    python bench/sonar_field.py --output bench/results/sonar --figures docs/img
-    python bench/sonar_field.py --quick --places building
+    python bench/studies/sonar_field.py --output bench/results/sonar --figures docs/img
+    python bench/studies/sonar_field.py --quick --places building
 
 Simulated: a ring of 16 sensors in the built-in building, cones of 30 degrees, walls that are mirrors beyond 0.4 rad.
 Recorded, where GPUSENSE_DATA names the data: the run ``sonar_pioneer8``, 8 sensors, in a map made of its even frames.
@@ -17,10 +17,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import math
 import os
-import shlex
 import sys
 import time
 from dataclasses import dataclass
@@ -31,9 +29,12 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands.common import machine, machine_line
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.plots import drawing as plots
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import make_parser, parse, publish, table
 
 SPREAD_XY, SPREAD_THETA = 0.3, 0.2
 FIELD, LASER, CONE, MIRRORS = "likelihood field", "beams without cone", "beams with cone", "cone and mirrors"
@@ -52,7 +53,7 @@ class Place:
 
 
 def moved(poses: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Poses after steps in their own frames."""
+    """Move poses by steps in their own frames."""
     c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     x, y = steps[..., 0], steps[..., 1]
     turned = poses[..., 2] + steps[..., 2]
@@ -60,7 +61,7 @@ def moved(poses: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def steps_from(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """The steps that lead from one pose to others."""
+    """Return the steps that lead from one pose to others."""
     off = others - pose
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.stack([c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0], off[:, 2]], axis=-1)
@@ -70,7 +71,7 @@ def steps_from(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def simulated(frames: int, rng: np.random.Generator) -> Place:
-    """Paths of 8 frames through the building, 0.15 m and some turn apart."""
+    """Simulate paths of 8 frames through the building, 0.15 m and some turn apart."""
     grid = building(2, (24.0, 16.0), 0.05)
     bearings = np.arange(16) * math.pi / 8
     ring = gs.Scanner(bearings, 5.0, cone=math.radians(30), cone_rays=31, critical_incidence=0.4)
@@ -92,7 +93,7 @@ def simulated(frames: int, rng: np.random.Generator) -> Place:
 
 
 def recorded(folder: Path, frames: int) -> Place:
-    """The run of a Pioneer with 8 sonars; odd frames are tuned on and scored in turn."""
+    """Read the run of a Pioneer with 8 sonars; odd frames are tuned on and scored in turn."""
     raw, pose = (np.loadtxt(folder / name) for name in ("measurement.txt", "poses.txt"))
     poses = np.column_stack([pose[:, 1:3] / 1000, np.radians(pose[:, 3] / 10)])
     z = np.where(raw[:, 1:] >= 5110, np.inf, raw[:, 1:] / 1000)
@@ -103,7 +104,7 @@ def recorded(folder: Path, frames: int) -> Place:
 
 
 def sonar_map(ring: gs.Scanner, poses: np.ndarray, z: np.ndarray, *, width: float) -> gs.OccupancyGrid:
-    """Log odds of occupancy from cones: free before a reading, occupied at it, less so towards the cone's edges."""
+    """Map by log odds from cones: free before a reading, occupied at it, less so towards the cone's edges."""
     side, reach = 0.05, ring.range_max
     low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
     shape = np.ceil((high - low) / side).astype(int)[::-1]
@@ -129,7 +130,7 @@ def sonar_map(ring: gs.Scanner, poses: np.ndarray, z: np.ndarray, *, width: floa
 
 
 def rings(place: Place, name: str) -> list[tuple[dict[str, float], gs.Scanner]]:
-    """The sensors that a way may be tuned to."""
+    """List the sensors that a way may be tuned to."""
     if name in (FIELD, LASER):
         return [({}, ring_of(place))]
     found = []
@@ -140,13 +141,13 @@ def rings(place: Place, name: str) -> list[tuple[dict[str, float], gs.Scanner]]:
 
 
 def ring_of(place: Place, **options: Any) -> gs.Scanner:
-    """The place's sensors with other cones."""
+    """Return the place's sensors with other cones."""
     ring = place.ring
     return gs.Scanner(ring.bearings, ring.range_max, ring.range_min, ring.mount, **options)
 
 
 def mixtures(name: str, quick: bool) -> list[tuple[dict[str, float], Any]]:
-    """The parameters that a way may be tuned to, a middling one first."""
+    """List the parameters that a way may be tuned to, a middling one first."""
     if name == FIELD:
         pairs = [(0.1, 0.5)] if quick else itertools.product((0.1, 0.05, 0.2, 0.4), (0.5, 0.1, 0.3, 0.7, 0.9))
         return [
@@ -169,7 +170,7 @@ def mixtures(name: str, quick: bool) -> list[tuple[dict[str, float], Any]]:
 def tuned(
     place: Place, name: str, clouds: np.ndarray, z: np.ndarray, quick: bool, backend: Any
 ) -> tuple[dict[str, float], Any]:
-    """The numbers and the model with the largest mean information about the first poses of clouds.
+    """Find the numbers and the model with the largest mean information about the first poses of clouds.
 
     Cones are chosen with a middling mixture, and then the mixture.
     """
@@ -192,7 +193,7 @@ def tuned(
 
 
 def information(log_p: np.ndarray) -> float:
-    """Logarithm of the first particle's weight times their number."""
+    """Return the logarithm of the first particle's weight times their number."""
     p = log_p.astype(np.float64)
     if not np.isfinite(p).any():
         return 0.0
@@ -202,7 +203,7 @@ def information(log_p: np.ndarray) -> float:
 
 
 def weighted_error(log_p: np.ndarray, cloud: np.ndarray, truth: np.ndarray) -> float:
-    """Distance from the truth to the weighted mean of a cloud's positions."""
+    """Return the distance from the truth to the weighted mean of a cloud's positions."""
     p = log_p.astype(np.float64)
     weights = np.exp(p - p.max()) if np.isfinite(p).any() else np.ones(len(p))
     return float(np.hypot(*(weights @ cloud[:, :2] / weights.sum() - truth[:2])))
@@ -211,7 +212,7 @@ def weighted_error(log_p: np.ndarray, cloud: np.ndarray, truth: np.ndarray) -> f
 def scores(
     place: Place, model: Any, window: int, particles: int, every: int, rng: np.random.Generator
 ) -> dict[str, list[float]]:
-    """Scores of windows of consecutive frames, whose motion is known, around a guess and over the whole map."""
+    """Score windows of consecutive frames, whose motion is known, around a guess and over the whole map."""
     poses, z = place.scored
     found: dict[str, list[float]] = {name: [] for name in ("rank", "information", "error", "global rank", "prior")}
     for last in range(window - 1, len(poses), every):
@@ -232,12 +233,12 @@ def scores(
 
 
 def better(log_p: np.ndarray) -> float:
-    """Share of particles that score better than the first; of those that score the same, half."""
+    """Return the share of particles that score better than the first; equal ones count half."""
     return float((log_p[1:] > log_p[0]).mean() + 0.5 * (log_p[1:] == log_p[0]).mean())
 
 
 def at_the_truth(model: Any, poses: np.ndarray, z: np.ndarray) -> dict[str, float | None]:
-    """How the readings differ from what a beam model expects at the true poses.
+    """Compare the readings with those that a beam model expects at the true poses.
 
     The median of the differences of those that have both a reading and an expected return, and the share of readings
     without an echo where one is expected.
@@ -280,31 +281,31 @@ def measure(place: Place, arguments: argparse.Namespace, backend: Any) -> list[d
 
 
 def known(number: float | None) -> str:
-    """A number, or a dash."""
+    """Format a number, or a dash."""
     return "-" if number is None else f"{number:.2f}"
 
 
 def to_markdown(rows: list[dict[str, Any]]) -> str:
-    """A table of medians and means."""
-    lines = [
-        "| place (scored) | frames | model | tuned to | rank median / mean | global rank median / mean "
-        "| information mean [nats] | error median / mean [m] | of the guess [m] | reading less expected, median [m] "
-        "| no echo where one is expected |",
-        "| --- " * 11 + "|",
-    ]
+    """Format a table of medians and means."""
+    columns = (
+        "place (scored)", "frames", "model", "tuned to", "rank median / mean", "global rank median / mean",
+        "information mean [nats]", "error median / mean [m]", "of the guess [m]", "reading less expected, median [m]",
+        "no echo where one is expected",
+    )  # fmt: skip
+    lines = []
     for row in rows:
         numbers = ", ".join(f"{name} {value:g}" for name, value in row["numbers"].items())
         pairs = [f"{np.median(row[k]):.3f} / {np.mean(row[k]):.3f}" for k in ("rank", "global rank", "error")]
-        lines.append(
-            f"| {row['place']} ({len(row['rank'])}) | {row['window']} | {row['model']} | {numbers} | {pairs[0]} "
-            f"| {pairs[1]} | {np.mean(row['information']):.2f} | {pairs[2]} | {np.mean(row['prior']):.3f} "
-            f"| {known(row['bias'])} | {known(row['unexpected_silence'])} |"
-        )
-    return "\n".join(lines)
+        lines.append([
+            f"{row['place']} ({len(row['rank'])})", row["window"], row["model"], numbers, *pairs[:2],
+            f"{np.mean(row['information']):.2f}", pairs[2], f"{np.mean(row['prior']):.3f}", known(row["bias"]),
+            known(row["unexpected_silence"]),
+        ])  # fmt: skip
+    return table(columns, lines)
 
 
 def draw_scores(rows: list[dict[str, Any]], path: Path) -> None:
-    """Shares of frames below each error and rank, for each place."""
+    """Draw the shares of frames below each error and rank, for each place."""
     places = list(dict.fromkeys(row["place"] for row in rows))
     figure = plots.new_figure(9, 3.4 * len(places))
     for i, place in enumerate(places):
@@ -326,7 +327,7 @@ def draw_scores(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def draw_scene(place: Place, path: Path, backend: Any) -> None:
-    """One frame: where its readings end along the axes of the cones, and which rays returned."""
+    """Draw one frame: the ends of its readings along the axes of the cones, and the rays that returned."""
     poses, _ = place.scored
     ring = place.ring
     model = gs.BeamModel(place.grid, ring, backend=backend)
@@ -365,7 +366,7 @@ def draw_scene(place: Place, path: Path, backend: Any) -> None:
 
 
 def draw_run(place: Place, path: Path) -> None:
-    """A map and the poses that are scored in it."""
+    """Draw a map and the poses that are scored in it."""
     figure = plots.new_figure(6.5, 5.0)
     ax = figure.add_subplot()
     plots.draw_map(ax, place.grid)
@@ -377,16 +378,16 @@ def draw_run(place: Place, path: Path) -> None:
 
 def main() -> int:
     """Measure, draw and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
     parser.add_argument("--places", default="building,sonar_pioneer8", help="names, separated by commas")
-    parser.add_argument("--backend", default="auto")
-    parser.add_argument("--scans", type=int, default=100, help="about so many poses are scored at each place")
+    parser.add_argument(
+        "--scans", type=int, default=100, help="about the number of poses that are scored at each place"
+    )
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--quick", action="store_true", help="tune less")
-    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
     parser.add_argument("--figures", type=Path, help="folder for the drawings")
-    arguments = parser.parse_args()
+    arguments = parse(parser)
     begin, device, rows, left_out = time.perf_counter(), get_backend(arguments.backend), [], []
     if arguments.figures:
         arguments.figures.mkdir(parents=True, exist_ok=True)
@@ -407,19 +408,12 @@ def main() -> int:
         parser.error(f"--places: none of {', '.join(left_out)} is there; recorded data need --data or GPUSENSE_DATA")
     if arguments.figures:
         draw_scores(rows, arguments.figures / "sonar-scores.png")
-    hidden = {str(arguments.data): "DATA", str(arguments.output): "OUTPUT", str(arguments.figures): "FIGURES"}
-    command = shlex.join(["python", "bench/sonar_field.py", *(hidden.get(a, a) for a in sys.argv[1:])])
     report = {
-        "command": command, "machine": machine(), "device": device.info.name, "left_out": left_out,
-        "particles": arguments.particles, "seconds": time.perf_counter() - begin, "rows": rows,
+        "device": device.info.name, "left_out": left_out, "particles": arguments.particles,
+        "seconds": time.perf_counter() - begin, "rows": rows,
     }  # fmt: skip
-    text = f"{to_markdown(rows)}\n\n{arguments.particles} particles, on {device.info.name}. {machine_line()}.\n"
-    text += f"Command: `{command}`.\n"
-    print(text)
-    if arguments.output:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
-        arguments.output.with_suffix(".md").write_text(text)
+    remark = f"{arguments.particles} particles, on {device.info.name}."
+    publish(__file__, arguments, to_markdown(rows), report, remark)
     return 0
 
 

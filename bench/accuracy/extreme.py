@@ -282,8 +282,7 @@ def main() -> int:
                     note(table_line(cells(part, kept[-1])))
     seconds, peak = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     tables = [
-        f"### {part}: {PARTS[part].__doc__}\n\n" + table(columns(part), (cells(part, row) for row in kept))
-        for part, kept in rows.items()
+        f"### {part}\n\n" + table(columns(part), (cells(part, row) for row in kept)) for part, kept in rows.items()
     ]
     report = {"devices": [asdict(d) for d in devices], "seconds": seconds, "peak_memory": peak, "rows": rows}
     remark = f"{seconds:.0f} s, at most {peak / 1e9:.1f} GB."

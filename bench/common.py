@@ -206,7 +206,7 @@ def as_a_call(device: Any, launches: list[Callable[[], None]]) -> Callable[[], N
 
 
 def waited(device: Any, start: Callable[[], Any], times: int = 1) -> Callable[..., None]:
-    """Make a function that starts something so many times and waits for the device once; it ignores its arguments."""
+    """Make a function that starts something a number of times and waits for the device once."""
 
     def run(*_: Any) -> None:
         for _ in range(times):

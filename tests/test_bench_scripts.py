@@ -175,8 +175,8 @@ def test_all_kinds_of_landmark_calls_run(tmp_path: Path) -> None:
 def test_sonar_field_runs(tmp_path: Path) -> None:
     """Every way is tuned and scored, and the drawings are made; the recorded run is left out where there is none."""
     report = run_script(
-        "studies/sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4", "--particles", "30",
-        "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
+        "studies/sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4",
+        "--particles", "30", "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
     )  # fmt: skip
     rows = report["rows"]
     assert len({row["model"] for row in rows}) == 4 and {row["window"] for row in rows} == {1, 8}
@@ -279,8 +279,8 @@ def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, t
     assert [row["set"] for row in report["sets"]] == sets and str(data_dir) not in json.dumps(report)
     for row in report["sets"]:
         assert row["fit"]["converged"] and row["discrete"]["converged"] and row["held_out"][0]["name"] == "fitted"
-    logs = run_script("studies/fit_real.py", *arguments, "--set", "intel", "--scans", "60", "--block", "5", "--incidence", "3",
-                      output=tmp_path / "logs")  # fmt: skip
+    arguments += ["--set", "intel", "--scans", "60", "--block", "5", "--incidence", "3"]
+    logs = run_script("studies/fit_real.py", *arguments, output=tmp_path / "logs")
     own = logs["sets"][0]["incidence"]
     assert len(own["fit"]["fits"]) == 3 and 0 < own["gain"] < 1 and own["gain_error"] < 0.2
     # Both sonars sit a little off the reference; the laser's is a set-up error of millimetres.

@@ -1,4 +1,4 @@
-"""Outside rows of ``gpusense bench``: what others do, measured in the same run on the same scenes.
+"""Offer outside rows of ``gpusense bench``: other implementations, measured in the same run on the same scenes.
 
 numba (``pip install numba``): code of our own from public descriptions, parallel over particles on all processors:
 
@@ -34,7 +34,7 @@ CDDT_BINS = (54, 108, 216, 720)
 TABLE_BINS = (54, 108, 216)
 # f1tenth_gym stops where an obstacle is nearer than this [m].
 NEAR = 1e-4
-# Densities of so many beams are multiplied before a logarithm is taken: none over- or underflows float64.
+# Beams whose densities are multiplied before a logarithm is taken: no product over- or underflows float64.
 BLOCK = 16
 
 try:
@@ -46,14 +46,14 @@ else:
 
 
 class Runner:
-    """What ``gpusense bench`` measures."""
+    """A candidate made ready for a scene, as ``gpusense bench`` measures it."""
 
     def __init__(self, run: Callable[[np.ndarray], np.ndarray], table_bytes: int) -> None:
         self.run, self.table_bytes = run, table_bytes
 
 
 def in_cells(scene: Scene, poses: np.ndarray) -> np.ndarray:
-    """(N, 3) poses in the grid's frame, in cell units."""
+    """Return (N, 3) poses in the grid's frame, in cell units."""
     placed = np.empty_like(poses)
     placed[:, :2] = scene.grid.world_to_cells(poses[:, :2])
     placed[:, 2] = poses[:, 2] - scene.grid.origin[2]
@@ -61,7 +61,7 @@ def in_cells(scene: Scene, poses: np.ndarray) -> np.ndarray:
 
 
 def hits(scene: Scene) -> np.ndarray:
-    """Which readings are ranges."""
+    """Return the indices of the readings that are ranges."""
     return np.flatnonzero(classify(scene.readings, scene.scanner) == Reading.HIT)
 
 
@@ -69,7 +69,7 @@ if numba is not None:
 
     @numba.njit(parallel=True, cache=True)
     def score_logs(grid, beyond, poses, points):
-        """Sum of a grid of log densities over the end points of each pose."""
+        """Sum a grid of log densities over the end points of each pose."""
         rows, cols = grid.shape
         found = np.empty(len(poses))
         for i in numba.prange(len(poses)):
@@ -84,7 +84,7 @@ if numba is not None:
 
     @numba.njit(parallel=True, cache=True)
     def score_products(grid, beyond, poses, points):
-        """Logarithms of products of a grid of densities, some beams at a time."""
+        """Add logarithms of products of a grid of densities, some beams at a time."""
         rows, cols = grid.shape
         found = np.empty(len(poses))
         for i in numba.prange(len(poses)):
@@ -101,7 +101,7 @@ if numba is not None:
 
     @numba.njit(parallel=True, cache=True)
     def score_cubes(grid, beyond, poses, points):
-        """Logarithm of the weight 1 + sum of cubed densities."""
+        """Take the logarithm of the weight 1 + sum of cubed densities."""
         rows, cols = grid.shape
         found = np.empty(len(poses))
         for i in numba.prange(len(poses)):
@@ -117,7 +117,7 @@ if numba is not None:
 
     @numba.njit(parallel=True, cache=True)
     def march(distances, resolution, poses, bearings, cosines, sines, range_max):
-        """Ranges [m] by marching through distances between cell centres [m]; poses in metres in the grid's frame."""
+        """March through distances between cell centres [m] to ranges [m]; poses in metres in the grid's frame."""
         rows, cols = distances.shape
         bins = len(cosines)
         found = np.empty((len(poses), len(bearings)))
@@ -140,7 +140,7 @@ if numba is not None:
 
 
 def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
-    """A runner of one of the three ways to score with a precomputed grid."""
+    """Make a runner of one of the three ways to score with a precomputed grid."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         p, chosen = scene.field, hits(scene)
@@ -163,7 +163,7 @@ def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
 
 
 def distances_of(scene: Scene) -> np.ndarray:
-    """Distance between cell centres to the nearest obstacle [m]; far away where there is none."""
+    """Return the distances of cell centres to the nearest obstacle's [m]; far away where there is none."""
     obstacles = scene.grid.occupied
     if not obstacles.any():
         return np.full(obstacles.shape, scene.scanner.range_max)
@@ -171,7 +171,7 @@ def distances_of(scene: Scene) -> np.ndarray:
 
 
 def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
-    """A runner of f1tenth-style marching with so many headings."""
+    """Make a runner of f1tenth-style marching with a number of headings."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         side, scanner = scene.grid.resolution, scene.scanner
@@ -189,7 +189,7 @@ def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
 
 
 def range_libc_caster(library: Any, make_caster: Callable[[Any, float], Any]) -> Callable[[Scene, None, str], Runner]:
-    """A runner of a range_libc method, in cells and in the frame of the grid."""
+    """Make a runner of a range_libc method, in cells and in the frame of the grid."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         occupied, limit = scene.grid.occupied, scene.scanner.range_max / scene.grid.resolution
@@ -211,7 +211,7 @@ def range_libc_caster(library: Any, make_caster: Callable[[Any, float], Any]) ->
 
 
 def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]:
-    """A runner of f1tenth_gym's scan simulator, one scan a call as it offers it."""
+    """Make a runner of f1tenth_gym's scan simulator, one scan a call as it offers it."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         bearings, limit = scene.scanner.bearings, scene.scanner.range_max
@@ -238,7 +238,7 @@ def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]
 
 
 def imported(*names: str) -> tuple[Any, str]:
-    """The first module that can be imported, or why none can."""
+    """Return the first module that can be imported, or the reasons why none can."""
     reasons = []
     for name in names:
         try:
@@ -249,7 +249,7 @@ def imported(*names: str) -> tuple[Any, str]:
 
 
 def candidates() -> list[Candidate]:
-    """The outside rows; those that cannot run say why."""
+    """Return the outside rows; those that cannot run say why."""
     threads = "all threads" if numba is None else f"{numba.get_num_threads()} threads"
     name = "numba" if numba is None else f"numba {numba.__version__}, {threads}"
     own = {"outside": name, "missing": NUMBA_MISSING}

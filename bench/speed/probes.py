@@ -68,8 +68,8 @@ kernel void copy(global const words *from, global words *to) { to[get_global_id(
 """
 
 
-# What is known of devices beside the probes, by a part of their names: additions/s, bytes/s of large copies, and where
-# it is from. The better of both counts, so that no floor is too high because a probe was disturbed.
+# Figures of devices from other sources, by a part of their names: additions/s, bytes/s of large copies, and the source.
+# The better of both counts, so that no floor is too high because a probe was disturbed.
 SHEETS = {
     "H200": (132 * 128 * 1.98e9, 4.27e12, "132 SMs x 128 lanes x 1.98 GHz (data sheet), 4.27 TB/s of copies measured"),
 }
@@ -93,7 +93,7 @@ class Figures:
 
 
 def rate(rates: dict[int, float], size: float) -> float:
-    """The best rate that was measured at this size or a larger one, or near the largest; never too low."""
+    """Return the best rate measured at this size or a larger one, or near the largest; never too low."""
     below = [measured for measured in rates if measured <= size]
     return max(rates[measured] for measured in rates if measured >= max(below, default=0))
 
@@ -117,12 +117,12 @@ def shortest_in_a_row(one: Callable[[], Any], wait: Callable[[], Any]) -> float:
 
 
 def threads() -> int:
-    """Processors that this process may use."""
+    """Count the processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def probe(selection: str, quick: bool = False) -> Figures:
-    """The figures of a device; quick ones, of small arrays, for tests."""
+    """Measure the figures of a device; quick ones, of small arrays, for tests."""
     backend = get_backend(selection)
     info = backend.info
     tables = [1 << 16, 1 << 20] if quick else [1 << 16, 1 << 20, 1 << 24, 1 << 28, 1 << 31]
@@ -153,7 +153,7 @@ def probe(selection: str, quick: bool = False) -> Figures:
 
 
 def _launches(one: Callable[[], None], wait: Callable[[], None]) -> tuple[float, float]:
-    """Seconds of a launch in a row of many, and of one with the wait for it."""
+    """Return the seconds of a launch in a row of many, and of one with the wait for it."""
 
     def many() -> None:
         for _ in range(200):
@@ -212,7 +212,7 @@ class _OpenCL:
         )
 
     def nothing(self) -> tuple[float, float]:
-        """See _launches."""
+        """Measure launches without work; see :func:`_launches`."""
         kernel = self._kernels["nothing"]
         kernel.set_args(self._out)
         return _launches(
@@ -221,19 +221,19 @@ class _OpenCL:
         )
 
     def issue(self) -> float:
-        """Additions per second."""
+        """Measure additions per second."""
         items = max(self._items // (16 if self._cpu else 1), 64)
         return items * self._additions / self._time("issue", items, self._out, np.float32(0.5))
 
     def gather(self, size: int, together: bool) -> float:
-        """Look-ups per second in a table of that size."""
+        """Measure look-ups per second in a table of that size."""
         table, keep = self._buffer(size), np.uint32(0xFFFFFFE0 if together else 0xFFFFFFFF)
         shift, share = np.uint32(33 - (size // 4).bit_length()), np.uint32(5 if together else 0)
         seconds = self._time("gather", self._items, table, self._out, shift, keep, share)
         return self._items * self._width * LOOK_UPS / seconds
 
     def copy(self, size: int) -> float:
-        """Bytes read and written per second."""
+        """Measure bytes read and written per second."""
         one = 64 if self._cpu else 16
         return 2 * size / self._time("copy", size // one, self._buffer(size), self._buffer(size))
 
@@ -307,16 +307,16 @@ class _Warp:
         return shortest_in_a_row(self._command(name, items, *arguments).launch, self._wait)
 
     def nothing(self) -> tuple[float, float]:
-        """See _launches."""
+        """Measure launches without work; see :func:`_launches`."""
         return _launches(self._command("nothing", 32, self._out).launch, self._wait)
 
     def issue(self) -> float:
-        """Additions per second."""
+        """Measure additions per second."""
         items = self._issue_items
         return items * ADDITIONS * WORDS / self._time("issue", items, self._out, 0.5)
 
     def gather(self, size: int, together: bool) -> float:
-        """Look-ups per second in a table of that size."""
+        """Measure look-ups per second in a table of that size."""
         table = self._wp.zeros(size // 4, dtype=self._wp.float32, device=self._device)
         keep, share = (0xFFFFFFE0, 5) if together else (0xFFFFFFFF, 0)
         shift = 32 - (size // 4).bit_length() + 1
@@ -324,13 +324,13 @@ class _Warp:
         return self._items * LOOK_UPS / seconds
 
     def copy(self, size: int) -> float:
-        """Bytes read and written per second."""
+        """Measure bytes read and written per second."""
         one, other = (self._wp.zeros(size // 16, dtype=self._wp.vec4f, device=self._device) for _ in range(2))
         return 2 * size / self._time("copy", size // 16, one, other)
 
 
 class _NumPy:
-    """What whole-array calls of NumPy do."""
+    """Probes by NumPy's calls on whole arrays."""
 
     name = "NumPy calls"
 
@@ -339,18 +339,18 @@ class _NumPy:
         self._items = max(items, 1 << 14)
 
     def nothing(self) -> tuple[float, float]:
-        """Seconds of an addition of no numbers."""
+        """Return the seconds of an addition of no numbers."""
         none = np.zeros(0, np.float32)
         seconds, _ = _launches(lambda: np.add(none, none, out=none), lambda: None)
         return seconds, seconds
 
     def issue(self) -> float:
-        """Additions per second of numbers in the nearest cache."""
+        """Measure additions per second of numbers in the nearest cache."""
         numbers = np.zeros(4096, np.float32)
         return 4096 * 64 / shortest(lambda: [np.add(numbers, numbers, out=numbers) for _ in range(64)])
 
     def gather(self, size: int, together: bool) -> float:
-        """Look-ups per second in a table of that size."""
+        """Measure look-ups per second in a table of that size."""
         table, item = np.zeros(size // 4, np.float32), np.arange(self._items, dtype=np.uint32)
         place = (item >> np.uint32(5 if together else 0)) * np.uint32(2654435761)
         place >>= np.uint32(32 - (size // 4).bit_length() + 1)
@@ -360,6 +360,6 @@ class _NumPy:
         return self._items / shortest(lambda: np.take(table, index, out=out, mode="clip"), 0.03)
 
     def copy(self, size: int) -> float:
-        """Bytes read and written per second."""
+        """Measure bytes read and written per second."""
         one, other = np.zeros(size // 4, np.float32), np.zeros(size // 4, np.float32)
         return 2 * size / shortest(lambda: np.copyto(other, one))

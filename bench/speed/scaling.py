@@ -1,4 +1,4 @@
-"""How speed grows with particles, beams and the map, with the floor that the device sets: what could be had at most.
+"""Measure how time grows with particles, beams and the map, above the floor that the device sets.
 
     python bench/speed/scaling.py --backend opencl:0:0 --backend warp:cuda:0 --output bench/results/scaling_h200
     python bench/speed/scaling.py --backend opencl --seconds 0.2 --total 60             # a processor
@@ -81,7 +81,7 @@ class Floor:
 
 
 def floor_of(kind: str, n: int, k: int, launches: int, table: int, reads: tuple[float, float], f: Figures) -> Floor:
-    """See the top of the file."""
+    """Compute the floor as the top of the file says."""
     work, (per_ray, steps) = n * k, reads
     operations = OPERATIONS["particle"] * n
     look_ups = work if kind == "field" else per_ray * work
@@ -127,13 +127,13 @@ class Device:
         self.start = time.perf_counter()
 
     def scene(self, side: int) -> Scene:
-        """The scene of a map, shared by devices."""
+        """Return the scene of a map, shared by devices."""
         if side not in self.scenes:
             self.scenes[side] = make_scene(side)
         return self.scenes[side]
 
     def run(self) -> None:
-        """All curves."""
+        """Measure all curves."""
         a = self.arguments
         many = a.map_particles or (100_000 if self.info.kind == "gpu" else 4096)
         for place, (axis, values) in enumerate((("particles", a.particles), ("beams", a.beams), ("side", a.sides))):
@@ -157,7 +157,7 @@ class Device:
                     note(f"{self.info.selection}: left out: {self.left_out[-1]}")
 
     def refused(self, axis: str, kind: str, n: int, k: int, side: int) -> str:
-        """Why a point is not to be tried; empty where it is."""
+        """Say why a point is not to be tried; empty where it is."""
         spent = time.perf_counter() - self.start
         if spent > self.until:
             return (
@@ -235,7 +235,7 @@ class Device:
         note(table_line(cells(row)))
 
     def model(self, kind: str, side: int, scanner: gs.Scanner) -> Any:
-        """A model of the device, kept while map and beams stay the same."""
+        """Return a model of the device, kept while map and beams stay the same."""
         key = (side, 0 if kind == "rays" else scanner.count)
         if self.models.get(kind, (None, None))[0] != key:
             # What the old one holds on the device is free before there is a new one.
@@ -252,7 +252,7 @@ class Device:
     def error(
         self, kind: str, scene: Scene, scanner: gs.Scanner, poses: np.ndarray, result: np.ndarray, side: int
     ) -> float:
-        """Largest difference of the first particles from float64 NumPy."""
+        """Return the largest difference of the first particles from float64 NumPy."""
         some = poses[:CHECKED]
         key = (kind, side, scanner.count, len(some), poses[0].tobytes())
         if key not in self.truths:
@@ -269,7 +269,7 @@ class Device:
 
 
 def host_memory() -> float:
-    """Bytes that the host can spare, as far as the system tells."""
+    """Return the bytes that the host can spare, as far as the system says."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
@@ -278,7 +278,7 @@ def host_memory() -> float:
 
 
 def numbers(text: str) -> list[int]:
-    """Whole numbers with commas between them; 1e4 is one."""
+    """Parse whole numbers with commas between them; 1e4 is one."""
     return [int(float(word)) for word in text.split(",") if word]
 
 

@@ -29,7 +29,7 @@ def cells(r: dict[str, Any]) -> list[str]:
 
 
 def figures_markdown(device: dict[str, Any]) -> str:
-    """What the probes found, and what was left out."""
+    """Format the probes' figures, the table, and the points that were left out."""
     f = device["figures"]
     sizes = ", ".join(f"{size >> 10} KiB {value / 1e9:.3g} G/s" for size, value in f["scattered"].items())
     copies = ", ".join(f"{size >> 20} MiB {value / 1e9:.4g} GB/s" for size, value in f["copy"].items())
@@ -46,7 +46,7 @@ def figures_markdown(device: dict[str, Any]) -> str:
 
 
 def draw(device: dict[str, Any], path: Path) -> None:
-    """Three panels: nanoseconds per ray or particle-beam over particles, beams and the map's side."""
+    """Draw three panels: nanoseconds per ray or particle-beam over particles, beams and the map's side."""
     from gpusense.plots.drawing import new_figure
 
     colours = dict(zip(KINDS, ("#0072b2", "#d55e00", "#009e73"), strict=True))

@@ -28,7 +28,7 @@ class Scene:
     seconds: float
 
     def cloud(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Poses over the free cells; the first of them around the pose."""
+        """Draw poses over the free cells, the first of them around the pose."""
         rows, cols = self.grid.shape
         cells = np.empty((0, 2))
         while len(cells) < count:
@@ -42,7 +42,7 @@ class Scene:
 
 
 def make_scene(side: int) -> Scene:
-    """The built-in building of that many cells, many of them side by side where it is larger than one."""
+    """Make the built-in building of that number of cells, many of them side by side where it is larger than one."""
     start = time.perf_counter()
     rng = np.random.default_rng(0)
     resolution = RESOLUTION if side * RESOLUTION >= 10 else 10 / side
@@ -73,7 +73,7 @@ class Counted:
 
 
 def count_reads(scene: Scene, backend: Any) -> tuple[float, float]:
-    """Mean reads and mean steps of a ray, in the middle of the map at most: where rays end early, too few."""
+    """Count mean reads and mean steps of a ray, in the middle of the map at most: where rays end early, too few."""
     rows, cols = (min(side, WINDOW) for side in scene.grid.shape)
     row, col = ((whole - part) // 2 for whole, part in zip(scene.grid.shape, (rows, cols), strict=True))
     size = scene.grid.resolution

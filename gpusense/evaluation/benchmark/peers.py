@@ -1,8 +1,8 @@
 """Outside candidates: other implementations, measured in the same run.
 
-They live in a Python file that is no part of the package: ``bench/speed/baselines.py`` of a checkout, or one that the user
-names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set; their
-``make`` is called with the scene, None and the candidate's precision.
+They live in a Python file that is no part of the package: ``bench/speed/baselines.py`` of a checkout, or one that the
+user names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set;
+their ``make`` is called with the scene, None and the candidate's precision.
 """
 
 from __future__ import annotations

@@ -348,7 +348,7 @@ def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[
         script: The script's ``__file__``.
         arguments: Those of :func:`parse`.
         text: The tables.
-        report: What goes to the .json file beside machine and command.
+        report: The contents of the .json file beside machine and command.
         remark: Sentences before the machine.
     """
     command = command_line(Path(script).resolve().relative_to(ROOT).as_posix())

@@ -55,7 +55,7 @@ def milliseconds(tree: Path, backend: str, folder: str) -> list[float]:
     places = dict.fromkeys(("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "WARP_CACHE_PATH"), folder)
     search = os.pathsep.join(filter(None, (str(tree.resolve()), os.environ.get("PYTHONPATH"))))
     environment = os.environ | places | {"PYTHONPATH": search}
-    # What lies in the working directory is not imported.
+    # Modules of the working directory are not imported.
     command = [sys.executable, "-P", "-c", _PROCESS, backend]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return [float(value) for value in json.loads(done.stdout.splitlines()[-1])]

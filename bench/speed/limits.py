@@ -111,7 +111,7 @@ def prepare_by(model: Callable[..., Any], backend: Any, precision: str) -> Call:
 
 
 def models_of(scene: Scene, scanner: gs.Scanner, rows: list[str]) -> dict[str, Callable[..., Any]]:
-    """Return what makes the models of the chosen rows, by their names."""
+    """Return functions that make the models of the chosen rows, by name."""
     found: dict[str, Callable[..., Any]] = {}
     if "clouds" in rows:
         found = {name: functools.partial(kind, scene.grid, scanner) for name, kind in MODELS.items()}

@@ -151,7 +151,7 @@ def landmark_job(scene: Landmarks, what: str, cloud: str, most: int) -> Job:
 
 
 def absolute_models(grid: gs.OccupancyGrid, xy: np.ndarray) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
-    """Return what makes each model, and its arguments beside the poses."""
+    """Return a function that makes each model, and its arguments beside the poses."""
     x, y = float(xy[0, 0]), float(xy[0, 1])
     region = (x - 500, y - 500, x + 500, y + 500)
     fix, mounted = gs.PositionParameters(sigma=2.0), dict(z_hit=0.9, z_rand=0.1, region=region, mount=(0.2, 0.1))

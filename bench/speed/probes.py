@@ -199,7 +199,7 @@ class _OpenCL:
 
     def _buffer(self, size: int) -> Any:
         buffer = self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
-        # One driver's own clearing hangs beyond 2 GiB; what the rest holds does not matter.
+        # One driver's own clearing hangs beyond 2 GiB; the contents of the rest do not matter.
         self._cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, min(size, 1 << 30))
         return buffer
 

@@ -72,7 +72,7 @@ OPERATIONS = {"field": 17, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
 
 @dataclass(frozen=True)
 class Floor:
-    """Least seconds of a call and of its launches, what sets them, and the upper edge of the band."""
+    """Least seconds of a call and of its launches, their cause, and the upper edge of the band."""
 
     call: float
     launches: float
@@ -238,7 +238,7 @@ class Device:
         """Return a model of the device, kept while map and beams stay the same."""
         key = (side, 0 if kind == "rays" else scanner.count)
         if self.models.get(kind, (None, None))[0] != key:
-            # What the old one holds on the device is free before there is a new one.
+            # The memory of the old one is free before there is a new one.
             self.models.pop(kind, None)
             grid = self.scene(side).grid
             if kind == "rays":

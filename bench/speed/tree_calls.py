@@ -109,7 +109,7 @@ class Rows:
 
     Attributes:
         info: The device, as a model describes it.
-        makers: What makes each row ready, by its label.
+        makers: Functions that make the rows ready, by label.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], selection: str) -> None:
@@ -209,7 +209,7 @@ def main() -> None:
     """Answer requests until there are no more."""
     with np.load(sys.argv[1], allow_pickle=False) as file:
         arrays = {name: file[name] for name in file}
-    # What libraries print goes elsewhere.
+    # Libraries that print do so on standard error.
     answers, sys.stdout = sys.stdout, sys.stderr
 
     def answer(value: Any) -> None:

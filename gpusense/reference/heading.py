@@ -3,7 +3,7 @@
 A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
 count times pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in
 integers (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
-``bench/heading_constants.py`` derives the constants.
+``bench/derive/heading_constants.py`` derives the constants.
 """
 
 from __future__ import annotations

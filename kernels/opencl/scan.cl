@@ -1,5 +1,5 @@
-// Placement of poses and readings that lie on the device. Readings are selected and placed as in gpusense/models/scan/classed.py on the
-// host. Uninformative readings are left out and the others move up, so that sums over blocks of readings have the same
+// Placement of poses and readings that lie on the device. Readings are selected and placed as
+// gpusense.models.scan.classed does it on the host. Uninformative readings are left out and the others move up, so that sums over blocks of readings have the same
 // bits. The places that remain at the end get missing readings (nan), which add nothing.
 // requires: error_free placement
 

@@ -24,9 +24,6 @@ OTHER_FILES = {
     WARP: {"__init__": "makes the folder a package", "prelude": "types and decorators of all Warp kernels"},
     NUMPY: {
         "__init__": "makes the folder a package",
-        "densities": "plain float64 formulas from the book, an oracle for mixtures and fields",
-        "discrete": "probabilities of a sensor with dependent causes; the host makes a table of them",
-        "normals": "normals of walls, which the host uploads as a table",
         "scans": "loops over the scans of a launch; a work-item finds its scan by a division",
     },
 }

@@ -31,7 +31,8 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(drivers, "_SYSTEM", str(vendors))
     monkeypatch.setattr(drivers.cl, "__file__", str(beside.parent / "__init__.py"))
-    monkeypatch.setattr(drivers, "_chosen", drivers._chosen.__wrapped__)
+    monkeypatch.setattr(drivers, "_choice", None)
+    monkeypatch.setattr(drivers, "choice", lambda: drivers._chosen())
     monkeypatch.setattr(drivers, "scratch_folder", lambda: tmp_path)
     return tmp_path
 

@@ -25,7 +25,9 @@ import gpusense as gs
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.selftest import scipy_squares
 from gpusense.evaluation.worlds import building
-from gpusense.tables.distances import empty_rectangles, packed, squared_distances
+from gpusense.tables.cells import packed
+from gpusense.tables.distances import squared_distances
+from gpusense.tables.rectangles import empty_rectangles
 
 RESOLUTION, CAP, EDIT = 0.05, 1601, 50
 SCANNER = gs.Scanner(np.linspace(-2, 2, 60), 10.0)

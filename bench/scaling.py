@@ -63,7 +63,7 @@ from speed import Recorder, best, command_line, machine
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.tables.distances import sectors_of
+from gpusense.tables.rectangles import sectors_of
 
 OPERATIONS = {"field": 17, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
 

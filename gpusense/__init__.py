@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.models.scan.several import log_likelihoods
     from gpusense.positions.bearings import triangulate, triangulate_triangle
-    from gpusense.positions.both import locate
+    from gpusense.positions.locate import locate
     from gpusense.positions.fix import PositionFix
     from gpusense.positions.ranges import trilaterate
     from gpusense.tables.distances import distance_transform
@@ -95,7 +95,7 @@ _HOME = {
     "fit_beam_parameters": "gpusense.learning.beam.fit",
     "fit_incidence_parameters": "gpusense.learning.beam.incidence",
     "fit_landmark_parameters": "gpusense.learning.landmark.fit",
-    "locate": "gpusense.positions.both",
+    "locate": "gpusense.positions.locate",
     "log_likelihoods": "gpusense.models.scan.several",
     "normalize_weights": "gpusense.localization.weights",
     "read_log": "gpusense.logs",

@@ -60,7 +60,7 @@ def read_mrclam(
     logged, _ = _table(base / f"Robot{robot}_Groundtruth.dat", ("time", "x", "y", "heading"), True)
     subjects = landmarks[:, 0].astype(np.int64)
     if len(np.unique(subjects)) < len(subjects):
-        raise ValueError(f"{_file(base / 'Landmark_Groundtruth.dat')}: every subject must stand there once")
+        raise ValueError(f"{_file(base / 'Landmark_Groundtruth.dat')}: every subject must occur once")
     known = _landmarks_by_code(subjects, codes, code_lines)
     for row, where in zip(readings, lines, strict=True):
         if row[2] < 0:
@@ -100,7 +100,7 @@ def _landmarks_by_code(subjects: Integers, codes: Floats, lines: list[str]) -> d
     known: dict[int, int] = {}
     for (subject, code), where in zip(codes, lines, strict=True):
         if int(code) in known:
-            raise ValueError(f"{where}: every barcode must stand there once, got {int(code)} again")
+            raise ValueError(f"{where}: every barcode must occur once, got {int(code)} again")
         known[int(code)] = index.get(int(subject), _ROBOT)
     return known
 

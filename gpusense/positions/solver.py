@@ -1,4 +1,4 @@
-"""Find the lowest minima of a problem's cost by least squares from several starts, none of which need be good."""
+"""Find the lowest minima of a problem's cost by least squares from several starts, good or bad."""
 
 from __future__ import annotations
 

@@ -150,9 +150,9 @@ def _spread_from(spread: Floats, bins: int, steps: Integers, rows: Integers) -> 
     The tail decreases ever faster, so a difference of two such sums is at least ``1 / bins`` of the larger one.
     """
     beyond = np.append(np.logaddexp.accumulate(spread[::-1])[::-1], -np.inf)
-    ahead = _log_difference(beyond[np.maximum(steps - rows, 0)], beyond[bins - rows])
-    behind = _log_difference(beyond[1], beyond[np.maximum(rows - steps, 0) + 1])
-    return np.logaddexp(ahead, np.where(steps < rows, behind, -np.inf))
+    above = _log_difference(beyond[np.maximum(steps - rows, 0)], beyond[bins - rows])
+    below = _log_difference(beyond[1], beyond[np.maximum(rows - steps, 0) + 1])
+    return np.logaddexp(above, np.where(steps < rows, below, -np.inf))
 
 
 def _log_difference(larger: Floats, smaller: Floats) -> Floats:

@@ -33,7 +33,7 @@ class DiscreteBeamModel(SensorTable):
       Far obstacles are hidden more often than near ones, and an empty map has no expected obstacle; or
     - :class:`BeamParameters`: at each step the causes trigger with probabilities that give them the mixture's shares of
       the readings. As bins shrink, probability over width tends to the mixture's density at first order in the width,
-      at every z* > 0 and z except z = z*, where p_short jumps; the limit is uniform where the mixture has mass left
+      at every z* > 0 and z except z = z*, where p_short jumps; convergence is uniform where the mixture has mass
       beyond z. The probability of no return tends to z_max. The remaining difference is due to two causes that trigger
       in the same step, which make one reading.
 

@@ -140,7 +140,7 @@ def _sightings(
     known = None if correspondence is None else check_correspondence(correspondence, len(full), len(landmarks))
     used = np.flatnonzero((~np.isnan(full)).any(axis=1))
     if not len(used):
-        raise ValueError(f"features: must have one that says something, got {len(full)} that say nothing")
+        raise ValueError(f"features: must hold one with a measured part, got {len(full)} without")
     signatures = np.concatenate(
         [full[:, 2][~np.isnan(full[:, 2])], np.zeros(0) if map_signatures is None else map_signatures]
     )

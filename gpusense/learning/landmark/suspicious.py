@@ -93,8 +93,8 @@ def suspicious_landmarks(
         >>> import gpusense as gs, numpy as np
         >>> landmarks, poses = gs.LandmarkMap([(5, 0), (0, 5)]), np.zeros((20, 3))
         >>> features, labels = [(5.0, 0.0), (5.0, np.pi / 2)] * 10, [1, 0] * 10
-        >>> found = gs.suspicious_landmarks(poses, features, landmarks, labels, gs.LandmarkParameters())
-        >>> [(pair.first, pair.second) for pair in found.exchanged]
+        >>> errors = gs.suspicious_landmarks(poses, features, landmarks, labels, gs.LandmarkParameters())
+        >>> [(pair.first, pair.second) for pair in errors.exchanged]
         [(0, 1)]
     """
     if not isinstance(landmarks, LandmarkMap):

@@ -50,7 +50,7 @@ class IncidenceFit:
         >>> z, expected, angles = [3.9, 4.1, 4.0, 4.3], [4.0] * 4, [0.1, 0.2, 0.3, 1.2]
         >>> fit = gs.fit_incidence_parameters(z, expected, angles, range_max=8.0, bins=2, backend="numpy")
         >>> fit
-        IncidenceFit(2 bins, counts=(3, 1), no_surface_count=0, strength=30, converged=True)
+        IncidenceFit(2 bins, 4 readings, no_surface_count=0, strength=30, converged=True)
     """
 
     parameters: IncidenceParameters
@@ -89,8 +89,8 @@ class IncidenceFit:
 
     def __repr__(self) -> str:
         return (
-            f"IncidenceFit({len(self.fits)} bins, counts={self.counts}, no_surface_count={self.no_surface_count}, "
-            f"strength={self.strength:g}, converged={self.converged})"
+            f"IncidenceFit({len(self.fits)} bins, {sum(self.counts)} readings, "
+            f"no_surface_count={self.no_surface_count}, strength={self.strength:g}, converged={self.converged})"
         )
 
     def __str__(self) -> str:

@@ -42,7 +42,7 @@ map ('global') and around the true pose ('tracking'). Errors are against the exa
 
 Scenes: 'building' and 'clutter' are generated. With GPUSENSE_DATA naming the folder of recorded data there are also
 'basement', 'spielberg', 'willow' and 'intel'; --map adds others. Outside candidates, such as numba's, come from
-bench/baselines.py of a checkout or from the file that --peers names, which is then executed.
+bench/speed/baselines.py of a checkout or from the file that --peers names, which is then executed.
 
 --output DIR gets report.json, report.md and the diagrams: time over error, a curve for each method traced by its knob,
 exact ones in the strip on the left, failed ones in that on the right. Failures are listed with their reasons.

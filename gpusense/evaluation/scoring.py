@@ -24,8 +24,8 @@ from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan, read_log
 from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.classed import choose_beams
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.models.scan.readings import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Reading, classify

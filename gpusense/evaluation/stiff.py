@@ -124,9 +124,10 @@ def density_grid(backend: Selection, precision: str) -> Densities:
             z = np.clip(np.concatenate([expected, bends]), 0, RANGE_MAX - ulp).astype(real)
             parts = device.empty(count * len(z), real)
             first_there = device.upload(np.array([0, len(z)], np.int32))
-            device.compile("score_beams", flags | model._components)(
+            mixture = model._pipeline.mixture
+            device.compile("score_beams", flags | mixture.flags)(
                 (count,), rectangles, none, cells, pose, ray, first_there, device.upload(z),
-                device.upload(model._terms), none, none, first_there, none, device.empty(count, real), parts, *world,
+                device.upload(mixture.terms), none, none, first_there, none, device.empty(count, real), parts, *world,
                 len(z), *laser, *exact, 0, 0.0, *limits, 0.0, 1.0, 1, 0,
             )  # fmt: skip
             found = device.download(parts, np.empty(count * len(z), real))

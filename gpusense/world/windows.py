@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpusense.world.frames import Mount
+from gpusense.world.frames import Cells, Mount
 from gpusense.world.grid import OccupancyGrid
 
 # Poses [m, m, rad] whose box holds all poses of a cloud.
@@ -103,7 +103,7 @@ def whole(grid: OccupancyGrid) -> Window:
     return Window(0, 0, *grid.shape)
 
 
-def extent(grid: OccupancyGrid, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
+def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
     """Return bounds of the sensor's position for poses within ``corners``.
 
     A call has four corners, for which Python's numbers are faster than arrays.

@@ -1,8 +1,8 @@
 """Outside candidates: other implementations, measured in the same run.
 
-They live in a Python file that is no part of the package: ``bench/baselines.py`` of a checkout, or one that the user
-names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set; their
-``make`` is called with the scene, None and the candidate's precision.
+They live in a Python file that is no part of the package: ``bench/speed/baselines.py`` of a checkout, or one that the
+user names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set;
+their ``make`` is called with the scene, None and the candidate's precision.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import gpusense
 from gpusense._util.checks import existing_file
 from gpusense.evaluation.benchmark.candidates import PROBLEMS, Candidate
 
-FILE = "bench/baselines.py"
+FILE = "bench/speed/baselines.py"
 _MODULE = "gpusense_bench_peers"
 
 

@@ -25,7 +25,8 @@ from support.kernel_scenes import (
 
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.rectangles import OCCUPIED, slope
-from gpusense.tables.distances import empty_rectangles, packed
+from gpusense.tables.cells import packed
+from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world.windows import Region
 
 # ---- distances

@@ -25,7 +25,7 @@ from gpusense.backends import get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.tables.casters import CASTERS, Lookup, March
 from gpusense.world.frames import frame_scalars
-from gpusense.tables.distances import empty_rectangles
+from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world.windows import Region
 
 rng = np.random.default_rng(0)

@@ -17,9 +17,10 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
-from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March, Window
+from gpusense.tables.caster_base import CasterInput
+from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
-from gpusense.tables.distances import sectors_of
+from gpusense.tables.rectangles import sectors_of
 from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "casters.md"
@@ -80,7 +81,9 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     flags = {kind.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
     flags |= {"OUTSIDE_OCCUPIED"} if scene.outside_occupied else set()
     flags |= {"ORIGINS_OUTSIDE"} if not ((scene.cell >= 0) & (scene.cell < (cols, rows))).all() else set()
-    table = kind.prepare(device, Window(scene.occupied, scene.limit, "occupied" if scene.outside_occupied else "free"))
+    table = kind.prepare(
+        device, CasterInput(scene.occupied, scene.limit, "occupied" if scene.outside_occupied else "free")
+    )
     flags |= table.flags
     pose, count = np.concatenate([scene.frac, scene.direction], axis=1), len(scene.cell)
     result = device.empty(count, real)

@@ -12,7 +12,7 @@ from support.raycast_scenes import FAMILIES, Scene, scenes_of
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, differing
-from gpusense.tables.distances import empty_rectangles
+from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world import windows
 
 # ---------------------------------------------------------------------------------------------------------- normals

@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface.casters import ENTRIES, CasterEntry
 from gpusense.world.windows import Window
 
 
@@ -47,13 +48,12 @@ class Caster(ABC):
     """A method of computing expected ranges.
 
     Attributes:
-        name: Name that selects the caster with its default knobs.
+        name: Name that selects the caster with its default knobs, and its entry in the registry.
         exact: Whether its ranges are exact.
         error: ``"exact"``, or the bound of its error.
         memory: Memory on the device, in words.
         precomputation: Work on the map before the first ray, in words.
         knobs: Parameters that trade error for time, in words.
-        flag: The kernels' flag; empty for the exact caster.
         whole: Whether the table needs the whole map at once.
         ring: Whether the table has a ring of cells that stands for space outside the grid.
     """
@@ -64,9 +64,13 @@ class Caster(ABC):
     memory: ClassVar[str]
     precomputation: ClassVar[str]
     knobs: ClassVar[str] = "none"
-    flag: ClassVar[str] = ""
     whole: ClassVar[bool] = False
     ring: ClassVar[bool] = True
+
+    @property
+    def entry(self) -> CasterEntry:
+        """The caster in the registry."""
+        return ENTRIES[self.name]
 
     @abstractmethod
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
@@ -85,10 +89,6 @@ class Caster(ABC):
             False if the caster cannot update its table, which must then be made again.
         """
         return False
-
-    def mend(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: Window) -> bool:
-        """Call :meth:`refresh`; the name that models still use."""
-        return self.refresh(backend, inputs, table, changed)
 
     def scalars(self) -> tuple[int, float, float]:
         """Return the kernels' arguments bins, slack [cells] and tolerance [cells]."""

@@ -22,13 +22,11 @@ from gpusense.tables.lookup_files import read_lookup
 from gpusense.tables.rectangles import empty_rectangles, sectors_of
 from gpusense.world import windows
 
-__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March", "Window", "choose"]
+__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March", "choose"]
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
 # Rays per launch that fills a look-up table, so that a launch takes about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
-# The name that models still import.
-Window = CasterInput
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,6 @@ class Dda(Caster):
     error = "exact: the same bits as 'exact'"
     memory = "1 byte per cell of the reachable map"
     precomputation = "none"
-    flag = "DDA"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
@@ -78,7 +75,6 @@ class Bresenham(Caster):
     error = "about a cell, from centre to centre; lines slip between walls that touch at a corner"
     memory = "1 byte per cell of the reachable map"
     precomputation = "none"
-    flag = "BRESENHAM"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
@@ -107,7 +103,6 @@ class March(Caster):
     memory = "4 bytes per cell of the reachable map"
     precomputation = "exact distance transform"
     knobs = "tolerance [cells], rule"
-    flag = "MARCH"
     ring = False
 
     def __post_init__(self) -> None:
@@ -150,7 +145,6 @@ class Cddt(Caster):
     memory = "4 bytes per bin, line and obstacle"
     precomputation = "for each bin, obstacles at free cells are projected and sorted (on the host)"
     knobs = "bins, pruned"
-    flag = "CDDT"
     whole = True
     ring = False
 
@@ -190,7 +184,6 @@ class Lookup(Caster):
     memory = "2 bytes per bin and cell of the whole map"
     precomputation = "a ray per bin and cell by the exact caster"
     knobs = "bins"
-    flag = "LOOKUP"
     whole = True
     ring = False
 

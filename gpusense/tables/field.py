@@ -106,10 +106,6 @@ class FieldTable:
         )  # fmt: skip
         return True
 
-    def mend(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
-        """Call :meth:`refresh`; the name that models still use."""
-        return self.refresh(backend, obstacles, table, changed)
-
     def _values(self, squared: np.ndarray) -> np.ndarray:
         """Convert squared distances [cells^2] to float64 cell values: log densities, distances [m] or cubes."""
         p = self._parameters

@@ -30,7 +30,7 @@ class ReachableMap:
         reach: Longest distance from a sensor that matters [cells].
         prepare: Function that makes the table of a window from its (rows, cols) obstacles.
         crop: Whether to prepare the reachable window only; False prepares the whole map.
-        mend: Function that updates a table in place after obstacles changed in a part of its window, and returns
+        refresh: Function that updates a table in place after obstacles changed in a part of its window, and returns
             whether it did; after False the table is made again.
 
     Attributes:
@@ -49,20 +49,15 @@ class ReachableMap:
         reach: float,
         prepare: Callable[[Backend, np.ndarray], Buffer],
         crop: bool,
-        mend: Callable[[Backend, np.ndarray, Buffer, Window], bool],
+        refresh: Callable[[Backend, np.ndarray, Buffer, Window], bool],
     ) -> None:
         self._backend, self._grid, self._mount, self._reach, self._crop = backend, grid, mount, reach, crop
-        self._prepare, self._mend, self._unknown, self._shared = prepare, mend, unknown, True
+        self._prepare, self._refresh, self._unknown, self._shared = prepare, refresh, unknown, True
         self.obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")
         self._table: Buffer = None
         self.window: Window | None = None
         self.preparations = 0
         self.version = 0
-
-    @property
-    def region(self) -> Window | None:
-        """Old name of ``window``."""
-        return self.window
 
     def ensure(self, corners: Corners | None) -> tuple[Buffer, Window]:
         """Return the table and its window; make both again if a sensor can reach beyond the window.
@@ -121,7 +116,9 @@ class ReachableMap:
         # The table is dropped first, so that an error leaves no outdated table behind.
         table, self._table = self._table, None
         try:
-            current = self._mend(self._backend, window.cut(self.obstacles), table, near.moved(-window.row, -window.col))
+            current = self._refresh(
+                self._backend, window.cut(self.obstacles), table, near.moved(-window.row, -window.col)
+            )
         except MemoryError:
             current = False
         self._table = table if current else None

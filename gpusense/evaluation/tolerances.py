@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS
 
 Floats = NDArray[np.floating]
 

@@ -11,12 +11,12 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.constants import FIELD_RING
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.models.point.base import PointModel
 from gpusense.models.point.pairs import DIGITS, exact, two_parts
 from gpusense.models.poses import Frame, Part, Poses, place
-from gpusense.reference.end_point import FIELD_RING
 from gpusense.tables.distances import squared_distances
 from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid

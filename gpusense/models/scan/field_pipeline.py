@@ -8,6 +8,7 @@ import numpy as np
 
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
@@ -16,7 +17,6 @@ from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
-from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import split

@@ -15,7 +15,6 @@ from support.selection import BACKENDS
 import gpusense as gs
 from gpusense.evaluation.tolerances import TOLERANCES, differing
 from gpusense.interface.launches import flags_of
-from gpusense.models import cloud as places
 from gpusense.models import run
 
 

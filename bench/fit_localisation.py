@@ -25,7 +25,7 @@ from speed import publish
 import gpusense as gs
 from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, Cloud, logged_scans, score_log
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, ParticleSampler, logged_scans, score_log
 
 LOGS = ("intel", "freiburg-079", "csail", "aces")
 TEMPERATURES = (1.0, 0.1)
@@ -46,7 +46,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
         "fitted": held_out.softened(fit.parameters, fit.hits + fit.max_readings), **held_out.peer_parameters(),
         "gpusense's defaults": gs.BeamParameters(), "gpusense score's": BEAM_PARAMETERS,
     }  # fmt: skip
-    cloud, rows = Cloud(arguments.particles), []
+    cloud, rows = ParticleSampler(arguments.particles), []
     for who, parameters in candidates.items():
         row: dict[str, Any] = {"parameters_of": who, "parameters": parameters.to_dict()}
         for temperature in TEMPERATURES:

@@ -25,7 +25,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.commands.score import summary
 from gpusense.evaluation import selftest
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, logged_scans, score_log
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, ParticleSampler, logged_scans, score_log
 
 MAPS = {
     Path(name).stem: name
@@ -85,7 +85,7 @@ def scores(data: Path, name: str, kind: str, arguments: argparse.Namespace) -> d
     }[kind]  # fmt: skip
     names = [device.selection for device in gs.devices() if device.available and device.kind != "simulator"]
     fast = [backend for backend in names if backend != "numpy"]
-    cloud = Cloud(arguments.particles)
+    cloud = ParticleSampler(arguments.particles)
 
     def score(backends: list[str], scans: list) -> tuple[list, list]:
         models = [make(grid, scanner, parameters, backend=b, temperature=arguments.temperature) for b in backends]

@@ -25,7 +25,8 @@ from gpusense.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.scoring import Agreement, BackendScore, Model, ScanScore
+    from gpusense.evaluation.agreement import Agreement, Model
+    from gpusense.evaluation.scoring import BackendScore, ScanScore
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.parameters import BeamParameters
     from gpusense.world.scanner import Scanner
@@ -101,15 +102,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print what came out."""
-    from gpusense.evaluation.scoring import Cloud, logged_scans, score_log
+    from gpusense.evaluation.scoring import ParticleSampler, logged_scans, score_log
     from gpusense.world.map_files import read_map
 
-    cloud = Cloud(args.particles, args.sigma_position, args.sigma_heading, args.seed)
+    sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
     models = make_models(args, grid, scans[0][1].scanner)
     with progress(len(scans)) as step:
-        scores, agreements = score_log(models, scans, cloud, step)
+        scores, agreements = score_log(models, scans, sampler, step)
     if args.json:
         print_json(_document(args, models, scores, agreements))
     else:

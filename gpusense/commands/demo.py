@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense import plots
 from gpusense._util.progress import progress
 from gpusense.backends import Backend, Selection
 from gpusense.commands import common
@@ -19,7 +20,6 @@ from gpusense.evaluation import worlds
 from gpusense.evaluation.scoring import evaluated_beams
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.plots import drawing as plots
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Scanner

@@ -23,8 +23,6 @@ from gpusense.evaluation.agreement import Agreement, Comparison, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan, read_log
-from gpusense.models.scan.beam import BeamModel
-from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.readings import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters

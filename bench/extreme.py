@@ -29,7 +29,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands.common import machine
+from gpusense.evaluation.machine import machine
 from gpusense.evaluation.replay import Recorder, replay
 from gpusense.evaluation.tolerances import differing, per_scan
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan

@@ -23,9 +23,15 @@ from speed import publish
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands.score import summary
 from gpusense.evaluation import selftest
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, ParticleSampler, logged_scans, score_log
+from gpusense.evaluation.scoring import (
+    BEAM_PARAMETERS,
+    FIELD_PARAMETERS,
+    ParticleSampler,
+    logged_scans,
+    score_log,
+    summary,
+)
 
 MAPS = {
     Path(name).stem: name

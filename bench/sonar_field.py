@@ -31,7 +31,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands.common import machine, machine_line
+from gpusense.evaluation.machine import machine, machine_line
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.plots import drawing as plots
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -146,6 +147,33 @@ def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: flo
         index, pose, 1 + better + equal / 2, 100 * (others - better - equal / 2) / others, mean, position, heading,
         effective, normalized.degenerate, beams, seconds,
     )  # fmt: skip
+
+
+def summary(score: BackendScore) -> dict[str, Any]:
+    """Return medians, 90 % quantiles and extremes over a backend's scans; None where no scan has a value."""
+
+    def over_scans(pick: Callable[[ScanScore], float | None], take: Callable[[Sequence[float]], float]) -> float | None:
+        values = [value for value in map(pick, score.scans) if value is not None]
+        return take(values) if values else None
+
+    def quantile_90(values: Sequence[float]) -> float:
+        return sorted(values)[min(math.ceil(0.9 * len(values)), len(values)) - 1]
+
+    middle = statistics.median
+    return {
+        "scans": len(score.scans),
+        "rank_median": over_scans(lambda s: s.rank, middle),
+        "percentile_median": over_scans(lambda s: s.percentile, middle),
+        "percentile_min": over_scans(lambda s: s.percentile, min),
+        "error_position_median": over_scans(lambda s: s.error_position, middle),
+        "error_position_90": over_scans(lambda s: s.error_position, quantile_90),
+        "error_position_max": over_scans(lambda s: s.error_position, max),
+        "error_heading_median": over_scans(lambda s: s.error_heading, middle),
+        "error_heading_90": over_scans(lambda s: s.error_heading, quantile_90),
+        "effective_median": over_scans(lambda s: s.effective, middle),
+        "degenerate": sum(s.degenerate for s in score.scans),
+        "particle_beams_per_second": score.particle_beams_per_second,
+    }
 
 
 def logged_scans(

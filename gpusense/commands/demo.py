@@ -57,7 +57,7 @@ Model = BeamModel | LikelihoodFieldModel
 
 @dataclass(frozen=True)
 class Scene:
-    """A map, a scan in it, the poses to score, of which the last is the true one, and the beams that models use."""
+    """A map, a scan in it, the poses to score with the true pose last, and the number of beams that models use."""
 
     grid: OccupancyGrid
     scanner: Scanner

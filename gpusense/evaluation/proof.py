@@ -31,7 +31,7 @@ _TIMED_SECONDS = 0.05
 
 
 class Scene:
-    """A room with pillars and an unknown corner, a scan, and poses of which some lie in walls."""
+    """A room with pillars and an unknown corner, a scan, and poses, some of them in walls."""
 
     def __init__(self) -> None:
         random = np.random.default_rng(0)

@@ -106,7 +106,13 @@ class ScanScore:
 
 @dataclass(frozen=True)
 class BackendScore:
-    """Scores of all scans on one backend."""
+    """Scores of all scans on one backend.
+
+    Attributes:
+        device: Description of the device.
+        particles: Particles per scan.
+        scans: Scores of the scans.
+    """
 
     device: BackendInfo
     particles: int

@@ -103,8 +103,8 @@ _ALL = (
         "exp, log, tanh and division within a few eps, erf within 16 eps (OpenCL), u^2 / 2 within 3 eps of itself",
     ),
     Tolerance("float64 beam", 1e-11, "1 + |log p_k|", "a few eps, with room for drivers whose erf or tanh is poor"),
-    Tolerance("float32 scan, K = 1000", 2e-3, "nats", "below what changes a particle's weight by 0.2 %"),
-    Tolerance("float32 scan, K = 10 000", 1e-2, "nats", "below what changes a particle's weight by 1 %"),
+    Tolerance("float32 scan, K = 1000", 2e-3, "nats", "changes a particle's weight by less than 0.2 %"),
+    Tolerance("float32 scan, K = 10 000", 1e-2, "nats", "changes a particle's weight by less than 1 %"),
     Tolerance("float64 scan", 1e-11, "1 + |log p|", "a few eps a beam, and a compensated sum"),
     Tolerance(
         "field look-ups", 0, "beams in another cell",

@@ -3,76 +3,45 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from map_files import yaml_text
 
-from gpusense.backends import Backend, get_backend
+from gpusense.backends import Backend, arrays, get_backend
+
+# Failed assertions of helpers show their values, as those of tests do.
+pytest.register_assert_rewrite("support")
+from support.array_libraries import Array, counted_copies, installed  # noqa: E402
+from support.map_files import yaml_text  # noqa: E402
+from support.selection import BACKENDS, present, skip_or_fail  # noqa: E402
 
 # JAX would take three quarters of a GPU's memory for each process that imports it.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
-# Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
-BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
-
-
-def required(feature: str) -> bool:
-    """Whether GPUSENSE_REQUIRE, a comma-separated list, says that a feature must not be skipped."""
-    return feature in [word.strip() for word in os.environ.get("GPUSENSE_REQUIRE", "").split(",")]
-
-
-def skip_or_fail(feature: str, reason: str) -> None:
-    """Skip the test, or fail it where the feature is required."""
-    if required(feature):
-        pytest.fail(reason)
-    pytest.skip(reason)
-
-
-def present(selection: str) -> str:
-    """The tested selection string of a backend's name or selection; the test is skipped where it is absent."""
-    chosen = next((name for name in BACKENDS if name.split(":")[0] == selection), selection)
-    try:
-        get_backend(chosen)
-    except ValueError as error:
-        skip_or_fail(chosen.split(":")[0], str(error))
-    return chosen
-
 
 @pytest.fixture
 def needs() -> Callable[[str], str]:
-    """``needs("opencl")`` returns the selection string to test, or skips."""
+    """Return a function: ``needs("opencl")`` is the selection string to test; it skips where the backend is absent."""
     return present
 
 
 @pytest.fixture(params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> str:
-    """The selection string of each tested backend in turn."""
+    """Return the selection string of each tested backend in turn."""
     return present(request.param)
-
-
-def on_every_backend(*, on_warp: Callable[..., bool], **cases: Iterable[object]) -> pytest.MarkDecorator:
-    """Parametrizes a test over backends and cases, on Warp only over some: it compiles each set of flags anew."""
-    chosen = [
-        (selection, *case)
-        for selection, case in itertools.product(BACKENDS, itertools.product(*cases.values()))
-        if not selection.startswith("warp") or on_warp(**dict(zip(cases, case, strict=True)))
-    ]
-    return pytest.mark.parametrize(("backend", *cases), chosen, indirect=["backend"])
 
 
 @pytest.fixture(params=["opencl", "warp"])
 def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backend:
-    """The backend of each kernel language in turn."""
+    """Return the backend of each kernel language in turn."""
     return get_backend(needs(request.param))
 
 
 @pytest.fixture
 def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
-    """Each tested backend in turn; called with True it pretends to be a GPU, with False to be a processor."""
+    """Return a function that makes each tested backend pretend to be a GPU (True) or a processor (False)."""
     device = get_backend(backend)
     before = device.info
 
@@ -88,7 +57,7 @@ def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of recorded data that GPUSENSE_DATA names; the test is skipped without it."""
+    """Return the folder of recorded data that GPUSENSE_DATA names; skip the test without it."""
     folder = os.environ.get("GPUSENSE_DATA", "")
     if folder and Path(folder).is_dir():
         return Path(folder)
@@ -101,13 +70,13 @@ def data_dir() -> Path:
 
 @pytest.fixture
 def no_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without recorded data, whatever the environment names."""
+    """Hide recorded data, whatever the environment names."""
     monkeypatch.delenv("GPUSENSE_DATA", raising=False)
 
 
 @pytest.fixture
 def place(tmp_path):
-    """Write an image (bytes, or something to save) and its YAML; give the YAML's path."""
+    """Return a function that writes an image (bytes, or an object with ``save``) and its YAML; it returns this path."""
 
     def write(content, image="map.pgm", save=None, **changes):
         if isinstance(content, bytes):
@@ -118,3 +87,26 @@ def place(tmp_path):
         return tmp_path / "map.yaml"
 
     return write
+
+
+@pytest.fixture
+def warp_as_gpu(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> Backend:
+    """Return Warp's processor as a GPU that holds Warp's arrays and those of ``fakelib`` in its own memory."""
+    needs("warp")
+    import warp as wp
+
+    installed(monkeypatch)
+    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
+    found = get_backend("warp:cpu")
+    monkeypatch.setattr(found, "info", dataclasses.replace(found.info, kind="gpu", lanes=1))
+    return found
+
+
+@pytest.fixture
+def warp_copies(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Record the bytes that models copy to Warp's device and back."""
+    import warp  # noqa: F401
+
+    from gpusense.backends.warp.backend import WarpBackend
+
+    return counted_copies(monkeypatch, WarpBackend)

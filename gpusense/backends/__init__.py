@@ -248,9 +248,9 @@ def open_device(info: BackendInfo) -> Backend:
 
 def take_drivers(drivers: Any) -> None:
     """Load the drivers that a parent names in this process, which is its child."""
-    from gpusense.backends.opencl import drivers
+    from gpusense.backends.opencl.drivers import take
 
-    drivers.take(drivers)
+    take(drivers)
 
 
 def _listed(selection: str) -> tuple[ModuleType, BackendInfo, Any]:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from gpusense._util.checks import check_gradients, shape_text, show
-from gpusense.backends.base import Adopted, Backend, Buffer, Sharing
+from gpusense.backends.base import Adopted, Backend, Buffer
 
 # DLPack's numbers for memory that the processor reads: its own, and that pinned for CUDA or ROCm.
 _HOST = (1, 3, 11)
@@ -61,11 +61,11 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 
     Raises:
         TypeError: the backend cannot read it.
-        ValueError: see Sharing.adopt.
+        ValueError: see Backend.adopt.
     """
     info, opencl = backend.info, _is_opencl(array)
     if info.backend == ("opencl" if opencl else "warp") and (opencl or info.kind == "gpu"):
-        return cast(Sharing, backend).adopt(array, name, in_place=in_place)
+        return backend.adopt(array, name, in_place=in_place)
     other = "backend=<the array's queue>" if opencl else "backend='warp:cuda:<n>'"
     raise TypeError(
         f"{name}: must be in host memory for {info.selection}, or the model made with {other}, got a "
@@ -118,12 +118,12 @@ def _check_numbers(found: Adopted, name: str) -> None:
 
 def blank(backend: Backend, count: int, real: np.dtype) -> Buffer:
     """A buffer on the device for a result of exactly so many numbers, or none."""
-    return cast(Sharing, backend).blank(count, real)
+    return backend.blank(count, real)
 
 
 def lent(given: object, backend: Backend, buffer: Buffer, shape: tuple[int, ...], real: np.dtype) -> object:
     """A result on the device as an array of the library that the poses came from."""
-    return _converted(given, cast(Sharing, backend).lend(buffer, shape, real))
+    return _converted(given, backend.lend(buffer, shape, real))
 
 
 def _converted(given: object, result: Any) -> object:

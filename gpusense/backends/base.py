@@ -1,17 +1,20 @@
-"""What a backend is: six verbs and no science.
+"""A backend: a device that holds buffers and runs programs, and no science.
 
-``upload``, ``empty``, ``download``, ``compile``, ``synchronize``, ``info``. A buffer is whatever the backend makes of
-it; models only pass buffers on. Kernels are asked for by name and flags, and are bound by the signature table.
+A buffer is whatever the backend makes of it; models only pass buffers on. Kernels are named by the signature table.
+Every backend has every method. Methods of an ability that it lacks do nothing, where nothing is right, or say so.
 """
 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+
+from gpusense.interface.launches import Program
 
 Buffer = Any
 
@@ -32,6 +35,7 @@ class BackendInfo:
         lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
         vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
         target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
+        graphs: Whether the launches and copies of a call are gathered, and replayed as one graph once they repeat.
     """
 
     selection: str
@@ -45,6 +49,7 @@ class BackendInfo:
     lanes: int = 1
     vector_loops: bool = False
     target: str = ""
+    graphs: bool = False
 
 
 class ProcessBound:
@@ -86,7 +91,7 @@ class Adopted:
         strides: Bytes from one number to the next along each axis.
         contiguous: Whether it is C-contiguous.
         to_host: Copies it, after all that was started before.
-        owner: What keeps the memory alive.
+        owner: The object that keeps the memory alive.
     """
 
     buffer: Buffer
@@ -98,117 +103,243 @@ class Adopted:
     owner: object
 
 
-class Sharing(Protocol):
-    """What a backend may have besides, where other libraries have arrays in its memory.
-
-    Attributes:
-        alignment: Parts of buffers begin at multiples of so many bytes.
-    """
-
-    alignment: int
-
-    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """An array of another library as it is; one that the device cannot begin with is copied unless ``in_place``.
-
-        Raises:
-            TypeError: it is not in this device's memory, or does not hold numbers.
-            ValueError: it must be used in place, and cannot.
-        """
-
-    def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """A buffer of ``count`` numbers, of any kind but shared with the host, that can be lent; it may hold none."""
-
-    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """Start to copy ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
-
-    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        """A buffer as an array of the library that the backend is made with."""
-
-
-class Replay(Protocol):
-    """Launches that are started again and again, with the same memory and numbers."""
+class Recording(Protocol):
+    """A program whose arguments are bound, to be started again and again with the same memory and numbers."""
 
     def __call__(self, stream: Any = None) -> None:
-        """Start them on a stream of the device, or on its current one."""
+        """Start it on a stream of the device, or on its current one."""
 
     def wait(self) -> None:
-        """Wait until all that was started has ended."""
+        """Wait until all starts have ended."""
 
 
-class Gathering(Protocol):
-    """What a backend may have besides, where to start things takes longer than small ones last."""
+class Backend(ABC):
+    """A device that holds buffers and runs programs.
 
-    def gather(self) -> None:
-        """From now on this thread's launches and copies may wait until ``synchronize``, and are done in their order.
+    Attributes:
+        info: The device behind this backend.
+        alignment: Parts of buffers begin at multiples of this number of bytes.
+    """
 
-        Nothing else changes: what must be done at once is done at once, after all before it.
-        """
+    info: BackendInfo
+    alignment: int = 1
 
-    def start(self) -> None:
-        """Start what still waits."""
+    # ---- buffers and copies
 
-    def scatter(self) -> None:
-        """Start what still waits, and gather no more."""
-
-    def mark(self) -> object | None:
-        """Where in what this thread gathers it is now; None where it does not."""
-
-    def kept(self, mark: object) -> object | None:
-        """The launches since a mark, to be repeated; None if there was anything else. It keeps no buffer alive."""
-
-    def repeat(self, kept: object) -> None:
-        """Gather such launches once more: with the same memory and numbers."""
-
-    def address(self, buffer: Buffer) -> int:
-        """Where a buffer lies."""
-
-
-class Recording(Protocol):
-    """What a backend has besides that can start launches again without binding their arguments anew."""
-
-    @property
-    def stages(self) -> bool:
-        """Whether calls of few particles gain by it although their arrays must be copied to the device and back."""
-
-    def record(self, run: Callable[[], None]) -> Replay:
-        """The launches of ``run``, which starts nothing else, kept and not started; buffers are kept by who calls."""
-
-
-class Backend(Protocol):
-    """A device that holds buffers and runs kernels."""
-
-    @property
-    def info(self) -> BackendInfo:
-        """The device behind this backend."""
-
+    @abstractmethod
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
-        """Copy a C-contiguous array to the device, into the head of ``out`` where given.
+        """Copy a C-contiguous array to the device, into the head of ``out`` if that is not None.
 
         Without ``wait`` the array must stay as it is until ``synchronize`` has returned.
         """
 
+    @abstractmethod
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """A new buffer of ``count`` numbers, cleared only where asked.
+        """Allocate a buffer of ``count`` numbers, cleared with ``zero``.
 
         Raises:
             MemoryError: the device cannot hold it.
         """
 
+    @abstractmethod
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """Copy the head of a buffer into a C-contiguous array, after all that was started before.
+        """Copy the head of a buffer into a C-contiguous array, after everything that was started before.
 
         Without ``wait`` the array must live, and is not filled, until ``synchronize`` has returned.
         """
 
+    @abstractmethod
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """``count`` numbers of a buffer, which may be of another type, from number ``first`` on, without a copy.
+        """Return ``count`` numbers of a buffer from number ``first`` on, without a copy, perhaps as another type.
 
         Raises:
-            ValueError: the device cannot begin there; see Sharing.alignment.
+            ValueError: parts cannot begin there; see ``alignment``.
         """
 
+    # ---- programs
+
+    @abstractmethod
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """The kernel of that name, specialised by flags; compiled once and kept."""
+        """Return the kernel of a name, specialised by flags; it is compiled once and kept."""
+
+    @abstractmethod
+    def synchronize(self) -> None:
+        """Wait until every launch and copy has ended."""
+
+    def run(self, program: Program) -> None:
+        """Start the launches of a program in their order."""
+        for one in program:
+            self.compile(one.kernel, one.flags)(one.size, *one.arguments)
+
+    def record(self, program: Program) -> Recording:
+        """Bind the arguments of a program and start nothing; the caller must keep its buffers alive."""
+        return _Repeated(self, program)
+
+    def replay(self, recording: Recording) -> None:
+        """Start a recording as part of the call that this thread gathers, or at once where it gathers none."""
+        recording()
+
+    @property
+    def replays(self) -> bool:
+        """Whether a bound call of few particles gains by a recording although its NumPy arrays must be copied."""
+        return False
+
+    # ---- calls: where starting takes longer than small work lasts, the work of a call is gathered and started at once
+
+    def gather(self) -> None:  # noqa: B027
+        """Let this thread's launches and copies wait from now on; ``start`` or ``synchronize`` starts them in order.
+
+        The order of all else is kept: a blocking copy first starts everything before it.
+        """
+
+    def start(self) -> None:  # noqa: B027
+        """Start the launches and copies that wait."""
+
+    def scatter(self) -> None:  # noqa: B027
+        """Start the launches and copies that wait, and gather no more."""
+
+    @property
+    def gathers(self) -> bool:
+        """Whether launches and copies of this thread wait now."""
+        return False
+
+    def address(self, buffer: Buffer) -> int:
+        """Return a number that tells a buffer's memory from any other that is alive."""
+        return id(buffer)
+
+    def check_process(self) -> None:  # noqa: B027
+        """Refuse to work in a forked child of the process that opened the device.
+
+        Raises:
+            RuntimeError: this process is such a child.
+        """
+
+    # ---- arrays of other libraries in the memory of the device
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """Return an array of another library as it is; a misaligned one is copied unless ``in_place``.
+
+        Raises:
+            TypeError: it is not in this device's memory, or does not hold numbers.
+            ValueError: it must be used in place, and cannot.
+        """
+        raise TypeError(f"{name}: must be in host memory for {self.info.selection}, got an array on a device")
+
+    def blank(self, count: int, dtype: np.dtype) -> Buffer:
+        """Allocate a buffer of ``count`` numbers, perhaps none, that can be lent: not memory shared with the host."""
+        return self.empty(count, dtype)
+
+    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """Start to copy ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
+        raise TypeError(f"{self.info.selection} does not copy between buffers")
+
+    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+        """Return a buffer as an array of the library that the backend is made with."""
+        raise TypeError(f"{self.info.selection} does not lend buffers")
+
+
+class _Repeated:
+    """A recording of backends that bind arguments anew each time."""
+
+    def __init__(self, backend: Backend, program: Program) -> None:
+        self._backend, self._program = backend, program
+
+    def __call__(self, stream: Any = None) -> None:
+        """See Recording.__call__."""
+        if stream is not None:
+            raise TypeError(f"stream: must be None on {self._backend.info.selection}, got {stream!r}")
+        self._backend.run(self._program)
+
+    def wait(self) -> None:
+        """See Recording.wait."""
+        self._backend.synchronize()
+
+
+class Proxy(Backend):
+    """A backend that passes everything on to another one: the base of those that watch or count.
+
+    Launches of programs and recordings all go through ``compile``, so that a subclass that overrides it sees each.
+    """
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+
+    @property
+    def info(self) -> BackendInfo:  # type: ignore[override]
+        """See Backend."""
+        return self._backend.info
+
+    @property
+    def alignment(self) -> int:  # type: ignore[override]
+        """See Backend."""
+        return self._backend.alignment
+
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
+        """See Backend.upload."""
+        return self._backend.upload(array, out, wait=wait)
+
+    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
+        """See Backend.empty."""
+        return self._backend.empty(count, dtype, zero=zero)
+
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download."""
+        return self._backend.download(buffer, out, wait=wait)
+
+    def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
+        """See Backend.part."""
+        return self._backend.part(buffer, first, count, dtype)
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+        """See Backend.compile."""
+        return self._backend.compile(kernel, flags)
 
     def synchronize(self) -> None:
-        """Wait until every launch has finished."""
+        """See Backend.synchronize."""
+        self._backend.synchronize()
+
+    def gather(self) -> None:
+        """See Backend.gather."""
+        self._backend.gather()
+
+    def start(self) -> None:
+        """See Backend.start."""
+        self._backend.start()
+
+    def scatter(self) -> None:
+        """See Backend.scatter."""
+        self._backend.scatter()
+
+    @property
+    def gathers(self) -> bool:
+        """See Backend.gathers."""
+        return self._backend.gathers
+
+    @property
+    def replays(self) -> bool:
+        """See Backend.replays."""
+        return self._backend.replays
+
+    def address(self, buffer: Buffer) -> int:
+        """See Backend.address."""
+        return self._backend.address(buffer)
+
+    def check_process(self) -> None:
+        """See Backend.check_process."""
+        self._backend.check_process()
+
+    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
+        """See Backend.adopt."""
+        return self._backend.adopt(array, name, in_place=in_place)
+
+    def blank(self, count: int, dtype: np.dtype) -> Buffer:
+        """See Backend.blank."""
+        return self._backend.blank(count, dtype)
+
+    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
+        """See Backend.copy."""
+        self._backend.copy(source, target, size, begin=begin, to=to)
+
+    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
+        """See Backend.lend."""
+        return self._backend.lend(buffer, shape, dtype)

@@ -1,92 +1,109 @@
-"""Device buffers of poses, scans and results, kept between calls: the steady state allocates nothing."""
+"""Device buffers of poses, readings and results, kept between calls: the steady state allocates nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import cast
+from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer, Gathering, Sharing
+from gpusense.backends.base import Backend, Buffer
+from gpusense.interface.launches import Program, flags_of
 
-# Calls whose launches are kept.
+# Programs that are kept.
 _MOST_KEPT = 64
 # Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
 _ALIGNED = 64
+# The non-finite flag of poses on the device.
+POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
 class Workspace:
-    """Named buffers that only grow."""
+    """Named buffers that only grow, and programs that use them."""
 
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that copies under way read or write.
         self._busy: list[np.ndarray] = []
-        self._gathering = cast(Gathering, backend) if hasattr(backend, "gather") else None
-        # Launches of earlier calls by all that they depend on, and that of which some have begun.
-        self._kept: dict[Hashable, object] = {}
-        self._begun: tuple[Hashable, object] | None = None
+        # Programs of earlier calls or their recordings, with their flags, by everything on which they depend.
+        self._programs: dict[Hashable, tuple[Any, frozenset[str]]] = {}
+        self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
 
     def __enter__(self) -> Workspace:
-        """Begin a call: where that is faster, the device may do all that it starts in one go."""
-        if self._gathering is not None:
-            self._gathering.gather()
+        """Begin a call: where that is faster, the device starts its launches and copies at once."""
+        self._backend.gather()
         return self
 
     def __exit__(self, kind: object, *error: object) -> None:
         try:
-            if self._gathering is not None:
-                self._gathering.scatter()
+            self._backend.scatter()
         finally:
-            # Not before: what was gathered may write there.
+            # Not before: gathered launches may write there.
             if kind is not None:
                 self.abandon()
 
     def abandon(self) -> None:
-        """After an error: what it left of the verdict on poses is not the next call's."""
-        if self._buffers.pop(("verdict", np.dtype(np.int32)), None) is not None:
+        """Forget the non-finite flag after an error: it is not the next call's."""
+        if self._buffers.pop(POSE_STATUS, None) is not None:
             self._forget()
 
     def start(self) -> None:
-        """Let the device begin with what the call has started so far."""
-        if self._gathering is not None:
-            self._gathering.start()
+        """Let the device begin with the work of the call so far."""
+        self._backend.start()
 
-    def again(self, buffers: Iterable[Buffer], *key: Hashable) -> bool:
-        """Repeat launches of an earlier call, if it has been seen; otherwise they follow, and ``keep``.
+    def run(
+        self, key: Hashable, buffers: Iterable[Buffer], make: Callable[[], Program], *, version: int, lasting: bool
+    ) -> frozenset[str]:
+        """Run a program of this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
 
         Args:
-            buffers: Those of the launches that are not of this workspace and may be others in another call.
-            key: All else that differs between calls: sizes, numbers, flags.
-        """
-        self._begun = None
-        gathering = self._gathering
-        if gathering is None or (mark := gathering.mark()) is None:
-            return False
-        key += tuple([gathering.address(buffer) for buffer in buffers])
-        kept = self._kept.get(key)
-        if kept is None:
-            self._begun = (key, mark)
-            return False
-        gathering.repeat(kept)
-        return True
+            key: All sizes, numbers and flags on which the program depends.
+            buffers: Its buffers that are not of this workspace.
+            make: Makes the program.
+            version: Of the map's table: programs of other versions are dropped.
+            lasting: Whether these buffers stay for later calls.
 
-    def keep(self) -> None:
-        """Keep the launches since ``again``."""
-        if self._begun is not None and self._gathering is not None:
-            key, mark = self._begun
-            kept = self._gathering.kept(mark)
-            if kept is not None:
-                if len(self._kept) >= _MOST_KEPT:
-                    del self._kept[next(iter(self._kept))]
-                self._kept[key] = kept
-        self._begun = None
+        Returns:
+            The flags of its launches.
+        """
+        backend = self._backend
+        records = backend.info.graphs and backend.gathers
+        if version != self._version:
+            self._version = version
+            self._programs.clear()
+        if not (records or lasting):
+            program = make()
+            backend.run(program)
+            return flags_of(program)
+        key = (records, key, *[backend.address(buffer) for buffer in buffers])
+        kept = self._programs.get(key)
+        if kept is None:
+            program = make()
+            # A recording keeps no buffer alive; addresses of buffers are in its key.
+            work: Any = backend.record(program) if records else program
+            kept = work, flags_of(program)
+            if len(self._programs) >= _MOST_KEPT:
+                del self._programs[next(iter(self._programs))]
+            self._programs[key] = kept
+        if records:
+            backend.replay(kept[0])
+        else:
+            backend.run(kept[0])
+        return kept[1]
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
-        """A buffer of at least ``count`` numbers; what it held is lost. A new one may be cleared, or one to be lent."""
+        """Return a buffer of at least ``count`` numbers; its old contents are lost.
+
+        Args:
+            name: Its name in this workspace.
+            count: Numbers.
+            dtype: Their type.
+            zero: Clear a new one.
+            lent: Allocate a new one such that it can be lent.
+        """
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
             self._forget()
@@ -94,25 +111,25 @@ class Workspace:
             capacity = max(count, capacity + capacity // 2, 1)
             buffer = None
             if lent:
-                buffer = cast(Sharing, self._backend).blank(capacity, dtype)
+                buffer = self._backend.blank(capacity, dtype)
             else:
                 buffer = self._backend.empty(capacity, dtype, zero=zero)
             self._buffers[name, dtype] = (capacity, buffer)
         return buffer
 
     def share(self, name: str, buffer: Buffer, count: int, dtype: np.dtype) -> None:
-        """Use a buffer of ``count`` cleared numbers that somebody else has."""
+        """Use a buffer of ``count`` cleared numbers of another owner."""
         self._buffers[name, dtype] = (count, buffer)
 
     def upload(self, name: str, array: np.ndarray) -> Buffer:
-        """Start to copy a host array, which nobody may change until ``wait``, into the head of a named buffer."""
+        """Start to copy a host array into the head of a named buffer; the array must not change until ``wait``."""
         array = np.ascontiguousarray(array)
         self._busy.append(array)
         return self._backend.upload(array, self.empty(name, array.size, array.dtype), wait=False)
 
     def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
-        """Upload arrays of one dtype, none of them empty: as one where the device does in one go what a call starts."""
-        if self._gathering is None or self._gathering.mark() is None:
+        """Upload arrays of one dtype, none of them empty; a gathered call copies them as one."""
+        if not self._backend.gathers:
             return [self.upload(f"{name} {i}", array) for i, array in enumerate(arrays)]
         sizes = tuple([array.size for array in arrays])
         firsts, total = [], 0
@@ -138,20 +155,20 @@ class Workspace:
     def result(
         self, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype
     ) -> Iterator[Buffer]:
-        """Where what is started within writes some numbers of a flat host array, or of a buffer that can be lent."""
+        """Yield the buffer in which launches write ``count`` numbers of a flat host array or a lent buffer."""
         if isinstance(target, np.ndarray):
             buffer = self.empty(name, count, dtype)
             yield buffer
             self.download(buffer, target[first : first + count])
             return
-        sharing, begin = cast(Sharing, self._backend), first * dtype.itemsize
-        if begin % sharing.alignment == 0:
+        begin = first * dtype.itemsize
+        if begin % self._backend.alignment == 0:
             yield self._backend.part(target, first, count, dtype)
             return
         # The device cannot begin there.
         buffer = self.empty(f"{name} lent", count, dtype, lent=True)
         yield buffer
-        sharing.copy(buffer, target, count * dtype.itemsize, to=begin)
+        self._backend.copy(buffer, target, count * dtype.itemsize, to=begin)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""
@@ -164,12 +181,12 @@ class Workspace:
         self._busy.clear()
 
     def _forget(self) -> None:
-        """What was kept of buffers is no longer right."""
-        self._kept.clear()
+        """Forget programs and parts: a buffer of theirs is replaced."""
+        self._programs.clear()
         self._parts.clear()
 
     def release(self, keep: str = "") -> None:
-        """Wait, and give the memory back, but for that of one name; the next call allocates anew."""
+        """Wait, and free all memory except the buffers named ``keep``; the next call allocates anew."""
         self.wait()
         self._forget()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}

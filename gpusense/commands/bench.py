@@ -34,7 +34,7 @@ whole map ('global') and around the true pose ('tracking'). Errors are against t
 
 Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folder of recorded data, 'basement',
 'spielberg', 'willow' and 'intel' are added; --map adds others. Outside candidates, such as numba's, come from
-bench/baselines.py of a checkout or from the file that --peers names; the file is executed.
+bench/speed/baselines.py of a checkout or from the file that --peers names; the file is executed.
 
 --output DIR receives report.json, report.md and the diagrams: time over error, with a curve for each method traced by
 its knob, exact points in the strip on the left, failed points in the strip on the right. Failures are listed with

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.backends.base import Launcher
+from gpusense.backends.base import Launcher, Proxy
 from gpusense.interface.signatures import KERNELS, Argument
 from gpusense.reference import field as field_kernels
 from gpusense.reference.beam import sum_terms
@@ -49,18 +49,15 @@ class Launch:
         return self.values["parts"].reshape(self.values["particles"], self.values["readings"])
 
 
-class Recorder:
+class Recorder(Proxy):
     """A backend that forwards every call to another one and records scoring launches.
 
     Pass it to a model as ``backend=``. Score with ``per_beam=True`` and few particles: every argument is copied.
     """
 
     def __init__(self, backend: Backend) -> None:
-        self._backend = backend
+        super().__init__(backend)
         self.launches: list[Launch] = []
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._backend, name)
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """See Backend.compile."""

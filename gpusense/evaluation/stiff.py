@@ -129,9 +129,10 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         z = _grid_readings(p, expected, ulp)
         parts = device.empty(count * len(z), real)
         first = device.upload(np.array([0, len(z)], np.int32))
-        device.compile("score_beams", flags | model._components)(
+        mixture = model._pipeline.mixture
+        device.compile("score_beams", flags | mixture.flags)(
             (count,), rectangles, none, cells, pose, ray, first, device.upload(z),
-            device.upload(model._terms), none, none, first, none, device.empty(count, real), parts, *world,
+            device.upload(mixture.terms), none, none, first, none, device.empty(count, real), parts, *world,
             len(z), *laser, *exact, 0, 0.0, *limits, 0.0, 1.0, 1, 0,
         )  # fmt: skip
         log_p = device.download(parts, np.empty(count * len(z), real))

@@ -36,17 +36,28 @@ def opencl_source(name: str) -> str:
     """Return the text of ``opencl/<name>.cl``.
 
     Args:
-        name: The file's name without its ending.
+        name: The file's name without its ending, with its folder if it lies in one: ``"beam"``, ``"lanes/beam"``.
 
     Raises:
-        FileNotFoundError: If there is no such file; the message lists the names there are.
+        FileNotFoundError: If there is no such file; the message lists the names of all files.
     """
     folder = kernel_root() / "opencl"
     try:
         return (folder / f"{name}.cl").read_text(encoding="utf-8")
     except FileNotFoundError:
-        names = ", ".join(sorted(path.stem for path in folder.glob("*.cl")))
+        names = ", ".join(opencl_names())
         raise FileNotFoundError(f"name must be an OpenCL kernel file ({names}), got {name!r}") from None
+
+
+def opencl_names() -> list[str]:
+    """Return the names of all OpenCL kernel files as ``opencl_source`` takes them, sorted."""
+    folder = kernel_root() / "opencl"
+    return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.cl"))
+
+
+def has_opencl_source(name: str) -> bool:
+    """Return whether there is a file ``opencl/<name>.cl``."""
+    return (kernel_root() / "opencl" / f"{name}.cl").is_file()
 
 
 def warp_module(name: str) -> ModuleType:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from gpusense.interface.kernel_files import opencl_source
+from gpusense.interface.kernel_files import has_opencl_source, opencl_source
 from gpusense.interface.signatures import CASTER_FLAGS, FLAGS
 
 _PRELUDE = """\
@@ -35,12 +35,25 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
 
 
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
-    """Kernel files that a file needs, itself last; ``caster`` stands for the caster that the flags mean."""
+    """List the files of a kernel file's program, the file itself last.
+
+    With ``WIDE``, ``lanes/<name>`` takes the place of ``<name>`` where there is such a file. Names in ``// requires:``
+    are taken as they stand, so a file in lanes names files of both folders; ``caster`` stands for the caster of the
+    flags.
+    """
+    return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)
+
+
+def _in_lanes(name: str, flags: frozenset[str]) -> bool:
+    return "WIDE" in flags and has_opencl_source(f"lanes/{name}")
+
+
+def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
     files: list[str] = []
     for needed in _requirements(name):
         if needed == "caster":
             needed = next((CASTER_FLAGS[flag] for flag in CASTER_FLAGS if flag in flags), "raycast")
-        files += [file for file in required_files(needed, flags) if file not in files]
+        files += [file for file in _with_requirements(needed, flags) if file not in files]
     return [*files, name]
 
 
@@ -119,6 +132,8 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
     if any("caster" in _requirements(needed) for needed in files):
         words |= CASTER_FLAGS.keys()
+    if _in_lanes(file, flags):
+        words.add("WIDE")
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")

@@ -1,9 +1,10 @@
 """Densities of sensors that know where they are: a position in the plane, and a heading.
 
-A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
-its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
-von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
-*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything (RAND): that is a uniform density.
+A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed up to sigma
+= 1.5 by its largest terms, beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q =
+exp(-sigma^2 / 2). Or a heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa
+sin^2(r / 2). Mardia and Jupp, *Directional Statistics* (2000), section 3.5. z_rand is the weight of a uniform density
+(RAND).
 """
 
 from __future__ import annotations
@@ -13,14 +14,14 @@ import numpy as np
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_sum
 from gpusense.reference.log_terms import bounded_square, either, log_one_plus
 
-# How a heading is distributed: sums of normals, their Fourier series, von Mises.
+# Distributions of a heading: sum of normals, its Fourier series, von Mises.
 NEARBY, SERIES, VON_MISES = 0, 1, 2
 WRAPS, WAVES = 3, 6
-# A heading's numbers: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part,
-# 2 pi / sigma^2, and from WAVE on 2 q^(n n).
+# Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
+# sigma^2, and from WAVE on 2 q^(n n).
 SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, DECAY, WAVE = range(7)
 HALF_TURN = 3.141592653589793
-# exp of minus this is below half an eps.
+# exp(-NEGLIGIBLE) is below half an eps.
 NEGLIGIBLE = 40.0
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
 SINE = (
@@ -31,7 +32,7 @@ SINE = (
 
 
 def half_sine(residual: Pair) -> Pair:
-    """``sin(r / 2)`` of an angle in [-pi, pi]."""
+    """Return ``sin(r / 2)`` of an angle in [-pi, pi]."""
     real = residual[0].dtype.type
     x, x_low = real(0.5) * residual[0], real(0.5) * residual[1]
     z, series = x * x, real(0)
@@ -41,7 +42,7 @@ def half_sine(residual: Pair) -> Pair:
 
 
 def log_other_turns(residual: Pair, decay: np.floating) -> np.ndarray:
-    """Log of all turns' normals over that of the nearest turn."""
+    """Return the log of the sum over all turns over the normal of the nearest turn."""
     real = residual[0].dtype.type
     half, size = real(HALF_TURN), np.abs(residual[0])
     low = np.where(residual[0] < 0, -residual[1], residual[1])
@@ -54,7 +55,7 @@ def log_other_turns(residual: Pair, decay: np.floating) -> np.ndarray:
 
 
 def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
-    """Log of the Fourier series over its first term, by Clenshaw's recurrence."""
+    """Return the log of the Fourier series over its first term, by Clenshaw's recurrence."""
     real = residual[0].dtype.type
     s = half_sine(residual)[0]
     cosine = 1 - 2 * s * s
@@ -72,19 +73,19 @@ def score_position(
     particles: int,
     temperature: np.floating,
 ) -> None:
-    """``terms`` = (a, b, c, peak), each followed by its low part, and the log of the uniform part.
+    """Score positions; ``terms`` are a, b, c and peak, each with its low part, and the log of the uniform part.
 
-    The exponent is ``(a x)^2 + (b x + c y)^2``, where (x, y) lies from the reading to the sensor.
+    The exponent is ``(a x)^2 + (b x + c y)^2``, where (x, y) is the offset from the reading to the sensor.
     """
     x, y = (place[:particles, 0], place[:particles, 1]), (place[:particles, 2], place[:particles, 3])
     a, b, c = ((np.asarray(terms[i]), np.asarray(terms[i + 1])) for i in (0, 2, 4))
     first = bounded_square(pair_product(x, a))
     second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)))
     exponent = pair_sum(first, second)
-    found = (terms[6] - exponent[0]) + (terms[7] - exponent[1])
+    log_density = (terms[6] - exponent[0]) + (terms[7] - exponent[1])
     if "RAND" in flags:
-        found = either(found, terms[8])
-    log_p[:particles] = temperature * found
+        log_density = either(log_density, terms[8])
+    log_p[:particles] = temperature * log_density
 
 
 def score_heading(
@@ -96,17 +97,17 @@ def score_heading(
     kind: int,
     temperature: np.floating,
 ) -> None:
-    """Residuals are headings minus the reading in [-pi, pi]."""
+    """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
     scale = np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])
     if kind == SERIES:
-        found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
     else:
         root = half_sine(r) if kind == VON_MISES else r
         exponent = bounded_square(pair_product(root, scale))
-        found = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
+        log_density = (terms[PEAK] - exponent[0]) + (terms[PEAK_LOW] - exponent[1])
         if kind == NEARBY:
-            found = found + log_other_turns(r, terms[DECAY])
+            log_density = log_density + log_other_turns(r, terms[DECAY])
     if "RAND" in flags:
-        found = either(found, terms[RANDOM])
-    log_p[:particles] = temperature * found
+        log_density = either(log_density, terms[RANDOM])
+    log_p[:particles] = temperature * log_density

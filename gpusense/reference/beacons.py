@@ -2,9 +2,9 @@
 
     p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
 
-d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or two normals of which one is
-wide; m is f's mass on [0, range_max], where d + bias is held to that interval. For a whole nu the mass of a t between 0
-and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
+d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or a sum of two normals, one of
+them wide. m is the mass of f on [0, range_max], with d + bias clamped to that interval. For an integer nu the mass of a
+t between 0 and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from gpusense.reference.log_terms import bounded_square, either
 from gpusense.reference.offsets import distance_pair, offset
 
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
-# A beacon is its place (x, its low part, y, its low part) and the reading minus the bias (and its low part).
+# A beacon has its place (x, its low part, y, its low part), and the reading minus the bias with its low part.
 BEACON = 6
-# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; then of two normals the wide
-# one's scale and peak. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and instead of
-# the wide normal 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the arc's factor, 1 for an odd nu.
+# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
+# peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
+# of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
 SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, RANGE_MAX, BIAS = range(7)
 WIDE_SCALE, WIDE_SCALE_LOW, WIDE_PEAK, WIDE_PEAK_LOW = range(7, 11)
 OFFSET, OFFSET_LOW, POWER, T_SCALE, ARC, ODD = range(7, 13)
 TERMS = 13
-# Above this an arc is a quarter turn to the last bit, and its tangent's square is finite.
+# From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
 STEEPEST = 1e18
 
 
 def log_normal(
     residual: Pair, near: np.ndarray, far: np.ndarray, terms: np.ndarray, first: int, peak: int
 ) -> np.ndarray:
-    """Log of a truncated normal; near and far are the distances of its mean from the interval's ends."""
+    """Return the log of a truncated normal; near and far are the distances of its mean from the ends."""
     scale = np.asarray(terms[first]), np.asarray(terms[first + 1])
     exponent = bounded_square(pair_product(residual, scale))
     mass = terms.dtype.type(0.5) * (erf(near * terms[first]) + erf(far * terms[first]))
@@ -41,7 +41,7 @@ def log_normal(
 
 
 def t_mass(t: np.ndarray, terms: np.ndarray, series: np.ndarray) -> np.ndarray:
-    """Mass of a Student t between -t and t, where t >= 0 is in units of its scale and sqrt(nu)."""
+    """Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu)."""
     real = terms.dtype.type
     t = np.minimum(t, real(STEEPEST))
     cosine = 1 / np.sqrt(1 + t * t)
@@ -55,7 +55,7 @@ def t_mass(t: np.ndarray, terms: np.ndarray, series: np.ndarray) -> np.ndarray:
 def log_student_t(
     residual: Pair, near: np.ndarray, far: np.ndarray, terms: np.ndarray, series: np.ndarray
 ) -> np.ndarray:
-    """Log of a truncated Student t: -(nu + 1) / 2 log of (1 + u^2 / nu) / k, two numbers that include the peak."""
+    """Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak."""
     squared = bounded_square(pair_product(residual, (np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW]))))
     x = pair_sum((np.asarray(terms[OFFSET]), np.asarray(terms[OFFSET_LOW])), squared)
     half = terms.dtype.type(0.5)
@@ -66,18 +66,18 @@ def log_student_t(
 def log_range(
     flags: frozenset[str], d: Pair, beacon: np.ndarray, terms: np.ndarray, series: np.ndarray, kind: int
 ) -> np.ndarray:
-    """Log p of one range at each distance."""
+    """Return log p of one range at each distance."""
     r = two_sum(d[0], -beacon[4])
     r = two_sum(r[0], r[1] + (d[1] - beacon[5]))
     near = np.clip(d[0] + terms[BIAS], 0, terms[RANGE_MAX])
     far = terms[RANGE_MAX] - near
     if kind == STUDENT_T:
-        found = log_student_t(r, near, far, terms, series)
+        log_p = log_student_t(r, near, far, terms, series)
     else:
-        found = log_normal(r, near, far, terms, SCALE, PEAK)
+        log_p = log_normal(r, near, far, terms, SCALE, PEAK)
     if kind == TWO_NORMALS:
-        found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
-    return either(found, terms[RANDOM]) if "RAND" in flags else found
+        log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
+    return either(log_p, terms[RANDOM]) if "RAND" in flags else log_p
 
 
 def score_beacons(
@@ -93,11 +93,11 @@ def score_beacons(
     kind: int,
     temperature: np.floating,
 ) -> None:
-    """Sum over beacons of log p of their ranges; the first ``count`` numbers of the series are a t's."""
-    own = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
+    """Sum log p of ranges over beacons; the first ``count`` numbers of the series belong to a t."""
+    sensor = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
     zero = np.zeros(particles, place.dtype)
     total: Pair = (zero, zero)
     for one in beacon.reshape(-1)[: BEACON * beacons].reshape(-1, BEACON):
-        d = distance_pair(offset(one[None, [0, 2, 1, 3]], own))
+        d = distance_pair(offset(one[None, [0, 2, 1, 3]], sensor))
         total = add_term(total, log_range(flags, d, one, terms, series[:count], kind))
     log_p[:particles] = np.where(np.isinf(total[0]), total[0], temperature * (total[0] + total[1]))

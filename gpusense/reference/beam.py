@@ -16,6 +16,34 @@ from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.sensor_table import tabulated_density
 
 
+def reading_term(
+    flags: frozenset[str],
+    z: np.ndarray,
+    expected: np.ndarray,
+    terms: np.ndarray,
+    sensor: np.ndarray,
+    cells: int,
+    per_metre: np.floating,
+    range_max: np.floating,
+) -> np.ndarray:
+    """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
+    if "CUBES" in flags:
+        term = compat_density(flags, z, expected, terms) ** 3
+    elif "SENSOR_TABLE" in flags:
+        term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+    else:
+        term = log_density(flags, z, expected, terms)
+    if "ALL_READINGS" in flags:
+        atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), terms[7], term)
+        term = np.where(np.isnan(z), 0, atom).astype(expected.dtype)
+    return term
+
+
+def scan_log(flags: frozenset[str], total: np.ndarray) -> np.ndarray:
+    """Return the scan's logarithm from its sum."""
+    return np.log(total) if "CUBES" in flags else total
+
+
 def score_beams(
     flags: frozenset[str],
     map_table: np.ndarray,
@@ -53,18 +81,18 @@ def score_beams(
     per_scan: int,
     ahead: int,
 ) -> None:
-    """Readings of ray r are first[r] to first[r + 1] - 1; what does not depend on the pose is fixed.
+    """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and fixed is the constant term.
 
-    Of several scans each has its rays from start on, and first counts the readings of all where rays are shared.
+    With SCANS, the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
     """
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, per_scan, ahead):
-            begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
+            begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
             score_beams(
-                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone_rays :], own_first,
-                own_reading, terms, edges, sensor, start, fixed_of, log_p[part], parts, rows, cols,
-                part.stop - part.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
-                cells, per_metre, limit, resolution, range_max, fixed_of[scan], temperature, per_scan, 0,
+                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone_rays :],
+                scan_first, scan_reading, terms, edges, sensor, start, fixed_of, log_p[part], parts, rows, cols,
+                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), kinds, cone_rays, critical, bins, slack,
+                tolerance, cells, per_metre, limit, resolution, range_max, fixed_of[scan], temperature, per_scan, 0,
             )  # fmt: skip
         return
     real = pose.dtype
@@ -72,7 +100,7 @@ def score_beams(
     ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
-        own = terms
+        bin_terms = terms
         if "ECHO" in flags:
             t, cosine, _ = echoes(
                 flags, map_table, normals, rows, cols, pose_cell[begin:end], pose[begin:end], ray, rays, cone_rays,
@@ -80,7 +108,7 @@ def score_beams(
             )  # fmt: skip
             ranges = expected_range(t, limit, resolution, range_max)
             if "INCIDENCE" in flags:
-                own = incidence_terms(terms, edges, kinds, cosine.reshape(end - begin, rays)[:, ray_of])
+                bin_terms = incidence_terms(terms, edges, kinds, cosine.reshape(end - begin, rays)[:, ray_of])
         else:
             ranges = np.empty((end - begin) * rays, real)
             cast_ranges(
@@ -89,15 +117,7 @@ def score_beams(
             )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        if "CUBES" in flags:
-            term = compat_density(flags, z, expected, own) ** 3
-        elif "SENSOR_TABLE" in flags:
-            term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
-        else:
-            term = log_density(flags, z, expected, own)
-        if "ALL_READINGS" in flags:
-            atom = term if "SENSOR_TABLE" in flags else np.where(np.isinf(z), own[7], term)
-            term = np.where(np.isnan(z), 0, atom).astype(real)
+        term = reading_term(flags, z, expected, bin_terms, sensor, cells, per_metre, range_max)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
         log_p[begin:end] = sum_terms(flags, term, fixed, temperature, strand_sums)
@@ -139,27 +159,27 @@ def beam_tiles(
     spread: int,
     per_scan: int,
 ) -> None:
-    """What each reading adds, at parts[place * across + k * along], which GPUs find in tiles of particles and rays.
+    """Write the term of reading k to parts[place * across + k * along]; GPUs do so in tiles of particles and rays.
 
-    With STRANDED it is the sum of each strand, in place of that of reading k.
+    With STRANDED the number there is the sum of strand k.
     """
     places = np.arange(particles)
     if "ORDERED" in flags:
         places[order[:particles]] = np.arange(particles)
     if "SCANS" in flags:
-        for scan, own in particles_of_scans(particles, per_scan):
-            begin, some, own_first, own_reading = readings_of_scan(flags, scan, start, first, reading)
-            each = int(own_first[some])
+        for scan, part in particles_of_scans(particles, per_scan):
+            begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
+            each = int(scan_first[scan_rays])
             each = strands_in(each) if "STRANDED" in flags else each
-            found = np.empty((own.stop - own.start) * each, pose.dtype)
+            scan_parts = np.empty((part.stop - part.start) * each, pose.dtype)
             beam_tiles(
-                flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[own], pose[own], order,
-                ray[begin * cone_rays :], own_first, own_reading, terms, edges, sensor, start, found, rows, cols,
-                own.stop - own.start, some, int(own_first[some]), kinds, cone_rays, critical, bins, slack, tolerance,
-                cells, per_metre, limit, resolution, range_max, each, 1, spread, per_scan,
+                flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[part], pose[part], order,
+                ray[begin * cone_rays :], scan_first, scan_reading, terms, edges, sensor, start, scan_parts, rows, cols,
+                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), kinds, cone_rays, critical, bins, slack,
+                tolerance, cells, per_metre, limit, resolution, range_max, each, 1, spread, per_scan,
             )  # fmt: skip
-            at = places[own, None] * across + np.arange(each) * along
-            parts[at] = found.reshape(at.shape)
+            at = places[part, None] * across + np.arange(each) * along
+            parts[at] = scan_parts.reshape(at.shape)
         return
     real, single = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
@@ -175,12 +195,12 @@ def beam_tiles(
 def readings_of_scan(
     flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
 ) -> tuple[int, int, np.ndarray, np.ndarray]:
-    """One of several scans: its first ray, how many it has, where their readings begin, and these."""
+    """Return one of several scans: its first ray, its number of rays, the first reading of each ray, its readings."""
     begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
     if "SHARED_RAYS" not in flags:
         return begin, rays, np.arange(rays + 1), reading[begin:]
-    own = first[begin : begin + rays + 1]
-    return begin, rays, own - own[0], reading[own[0] :]
+    scan_first = first[begin : begin + rays + 1]
+    return begin, rays, scan_first - scan_first[0], reading[scan_first[0] :]
 
 
 def sum_terms(
@@ -190,14 +210,12 @@ def sum_terms(
     temperature: np.floating,
     plainly: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Sum of (M, K) terms and a fixed one, in the order of the beams, or its logarithm; -inf where one term is.
+    """Sum (M, K) terms and a constant one in the order of the beams; -inf where one of them is -inf.
 
-    What is added plainly is block_sums or strand_sums; these go to a compensated total.
+    ``plainly`` is block_sums or strand_sums, whose results are added to a compensated total.
     """
     finite = np.where(np.isneginf(term), 0, term).astype(term.dtype)
     total = (np.full(len(term), fixed, term.dtype), np.zeros(len(term), term.dtype))
     for part in plainly(finite).T:
         total = add_term(total, part)
-    scan = total[0] + total[1]
-    scan = np.log(scan) if "CUBES" in flags else scan
-    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan)
+    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan_log(flags, total[0] + total[1]))

@@ -1,6 +1,6 @@
 """Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit.
 
-Devices look at 32 cells at a time; here all rows are unpacked and swept at once.
+Kernels read 32 cells at a time; the reference unpacks all rows and sweeps over them at once.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ NONE = np.iinfo(np.int32).max
 
 
 def unpacked(bits: np.ndarray, rows: int, cols: int, words: int) -> np.ndarray:
-    """(rows, cols) bool."""
+    """Unpack words to a (rows, cols) array of bool."""
     whole = np.unpackbits(bits[: rows * words].astype("<i4").view(np.uint8), bitorder="little")
     return whole.reshape(rows, 32 * words)[:, :cols].astype(bool)
 
 
 def cells_right(cells: np.ndarray) -> np.ndarray:
-    """Cells from each cell to the first occupied one to its right, itself included; NONE without one."""
+    """Count the cells from each cell to the first occupied one to its right, itself included; NONE without one."""
     index = np.arange(cells.shape[1], dtype=np.int32)
-    found = np.minimum.accumulate(np.where(cells, index, NONE)[:, ::-1], axis=1)[:, ::-1]
-    return np.where(found == NONE, NONE, found - index)
+    nearest = np.minimum.accumulate(np.where(cells, index, NONE)[:, ::-1], axis=1)[:, ::-1]
+    return np.where(nearest == NONE, NONE, nearest - index)
 
 
 def cells_left(cells: np.ndarray) -> np.ndarray:
-    """The same to its left."""
+    """Count the cells to the first occupied one to its left."""
     return cells_right(cells[:, ::-1])[:, ::-1]

@@ -1,7 +1,7 @@
 """Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end.
 
-So cast nav2_amcl and Beluga: distances are from cell centre to cell centre, and a line may pass between two cells that
-touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+nav2_amcl and Beluga cast in this manner. Distances are from cell centre to cell centre, and a line may pass between two
+cells that touch at a corner. The table holds 1 for occupied cells in a ring of twos.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.ray import make_ray, start_casts
+from gpusense.reference.rectangles import padded
 
 
 def cast_ray(
@@ -24,7 +25,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+    """Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
 
     Args:
         flags: Flags of the signature table.
@@ -40,7 +41,7 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     first = origin + r.step * k.astype(np.int64)
     end = origin + np.floor(pose[:, :2].T + limit * r.direction).astype(np.int64)
     far = np.abs(end - first)
@@ -52,10 +53,10 @@ def cast_ray(
         x = np.where(flat[active], along, aside[active])
         y = np.where(flat[active], aside[active], along)
         at = first[:, active] + sign[:, active] * np.stack([x, y])
-        state = map_table[(at[1] + 1) * (cols + 2) + at[0] + 1]
+        state = map_table[padded(at[1], at[0], cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
         i, j = x[hit].astype(pose.dtype), y[hit].astype(pose.dtype)
-        found[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)
+        ranges[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)
         active = active[state == 0]
         error[active] += shorter[active]
         over = active[2 * error[active] >= longer[active]]
@@ -63,4 +64,4 @@ def cast_ray(
         error[over] -= longer[over]
         along += 1
         active = active[along <= longer[active]]
-    return found
+    return ranges

@@ -1,10 +1,11 @@
 """Expected range by a compressed directional distance transform (Walsh and Karaman 2018).
 
-For each angle bin the map is cut into lines of one cell's width along the bin's direction, and each line keeps in order
-where its obstacles begin. A ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins.
+For each angle bin the map is cut into lines of one cell's width along the bin's direction. Each line has the sorted
+positions at which obstacles begin. A ray takes the line of its origin in the nearest bin, so errors grow as range * pi
+/ bins.
 
-Table of integers: number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from place
-1 + 3 bins where each line's obstacles begin in the table (bins * lines + 1 numbers); then a bit for each cell, set
+Table of integers: number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from index 1
++ 3 bins on, the index of the first obstacle of each line (bins * lines + 1 numbers); then a bit for each cell, set
 where it is occupied; then the obstacles in 2^-10 cells.
 """
 
@@ -32,7 +33,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to the first obstacle of the line, or limit where there is none nearer.
+    """Return the distance in cells to the first obstacle of the line, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.

@@ -1,7 +1,7 @@
-"""What nav2_amcl and Beluga sum over the beams of a scan, the cube of a density, for migration.
+"""Cubes of densities, which nav2_amcl and Beluga sum over the beams of a scan; for migration.
 
-terms[10] are those of the mixture in the linear domain, but that terms[0] is z_hit alone for amcl and terms[7] is
-z_max, not its logarithm.
+terms[10] are those of the mixture in the linear domain, with two exceptions: terms[0] is z_hit alone for amcl, and
+terms[7] is z_max, not its logarithm.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from gpusense.reference.mixture import hit_mass, short_factor
 
 
 def compat_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """The density that is cubed: amcl's without normalisers, Beluga's with both (book table 6.1).
+    """Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1).
 
     A reading of range_max is a max reading.
     """

@@ -1,7 +1,7 @@
 """Probability of contact from the distance of a robot's outline to the nearest obstacle.
 
-The outline's points lie in cells of a table of squared distances to the nearest obstacle's centre; the nearest point of
-a segment counts. An obstacle begins half a cell before its centre. Outline and map are off by a normal error, so
+Each point of the outline lies in a cell of a table of squared distances to the nearest obstacle's centre; the nearest
+point of a segment counts. An obstacle begins half a cell before its centre. The error of outline and map is normal, so
 
     P(touching) = Phi(-gap / sigma),    P(pressed) = p_contact P(touching) + p_false (1 - P(touching))
 """
@@ -16,16 +16,17 @@ from gpusense.reference.error_free import Pair, pair_product, two_product, two_s
 from gpusense.reference.log_terms import bounded_square, either
 
 NO_OBSTACLE = (1 << 31) - 1
-# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact, p_false and of 1 minus these.
+# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false, and of 1 minus each
+# of them.
 SCALE, SCALE_LOW, REACH, REACH_LOW, SIDE, SIDE_LOW, HIT_TERM, FALSE_TERM, MISS_TERM, NO_HIT_TERM = range(10)
-# Without an obstacle the gap has as many cells.
+# Gap in cells where there is no obstacle.
 FAR_CELLS = 1e9
 LOG_TWO_ROOT_PI = 1.2655121234846454
 SERIES = 12
 
 
 def gap(squared: np.ndarray, terms: np.ndarray) -> Pair:
-    """From outlines to obstacles, negative where they overlap; squared distances are in cells."""
+    """Return gaps between outlines and obstacles, negative where they overlap; squared distances are in cells."""
     real = terms.dtype.type
     whole = two_sum((squared >> 12).astype(real) * real(4096), (squared & 4095).astype(real))
     d = np.sqrt(whole[0])
@@ -39,7 +40,7 @@ def gap(squared: np.ndarray, terms: np.ndarray) -> Pair:
 
 
 def log_above(x: Pair) -> np.ndarray:
-    """``log(erfc(x) / 2)``, by an asymptotic series where erfc is about to vanish."""
+    """Return ``log(erfc(x) / 2)``, by an asymptotic series where erfc nearly underflows."""
     real = x[0].dtype.type
     large = x[0] > (10 if real is np.float64 else 6)
     inside = np.where(large, 0, x[0])
@@ -53,7 +54,7 @@ def log_above(x: Pair) -> np.ndarray:
 
 
 def log_bump(squared: np.ndarray, pressed: int, terms: np.ndarray) -> np.ndarray:
-    """Log probability that a segment is pressed, or that it is not."""
+    """Return the log probability that a segment is pressed, or that it is not."""
     x = pair_product(gap(squared, terms), (np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])))
     touching, clear = log_above(x), log_above((-x[0], -x[1]))
     hit, no_hit = (HIT_TERM, FALSE_TERM) if pressed else (MISS_TERM, NO_HIT_TERM)
@@ -79,13 +80,13 @@ def score_contact(
     guard: float,
     temperature: np.floating,
 ) -> None:
-    """Sum over segments; points start[s] to start[s + 1] - 1 belong to segment s, which is pressed if that is not 0."""
+    """Sum log p over segments; segment s has the points start[s] to start[s + 1] - 1."""
     total = np.zeros(particles, terms.dtype)
-    own, low = pose[:particles, None], pose_low[: particles if "CAREFUL" in flags else 1, None]
+    sensor_pose, low = pose[:particles, None], pose_low[: particles if "CAREFUL" in flags else 1, None]
     for s in range(segments):
         nearest = np.full(particles, NO_OBSTACLE, np.int32)
         for i in range(start[s], start[s + 1]):
-            end = end_point(flags, own, low, point[None, i : i + 1], point_low[None, i : i + 1])
+            end = end_point(flags, sensor_pose, low, point[None, i : i + 1], point_low[None, i : i + 1])
             col, row = pose_cell[:particles, 0] + end.col[:, 0], pose_cell[:particles, 1] + end.row[:, 0]
             nearest = np.minimum(nearest, table.reshape(-1)[field_cell(col, row, rows, cols)])
         total = total + log_bump(nearest, pressed[s], terms)

@@ -1,6 +1,6 @@
 """Expected range by the plain walk of Amanatides and Woo (1987), cell by cell.
 
-Exact, and the same bits as the exact caster's. The table holds 1 for occupied cells in a ring of twos.
+It is exact, with the same bits as the exact caster. The table holds 1 for occupied cells in a ring of twos.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.ray import make_ray, start_casts
+from gpusense.reference.rectangles import padded
 
 
 def cast_ray(
@@ -23,7 +24,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to the first occupied cell, or limit where there is none nearer.
+    """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
@@ -39,12 +40,12 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        state = map_table[(at[1] + 1) * (cols + 2) + at[0] + 1]
+        state = map_table[padded(at[1], at[0], cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
-        found[active[hit]] = t[active[hit]]
+        ranges[active[hit]] = t[active[hit]]
         active = active[state == 0]
         t_x, t_y = (k[:, active] + r.a[:, active]) * r.inv[:, active]
         by_x = t_x <= t_y
@@ -52,4 +53,4 @@ def cast_ray(
         k[0, active] += by_x
         k[1, active] += ~by_x
         active = active[t[active] < limit]
-    return found
+    return ranges

@@ -1,7 +1,7 @@
-"""Exact squared Euclidean distance transform in cells: all integers.
+"""Exact squared Euclidean distance transform in cells, in integers.
 
-The device kernels follow Meijster, Roerdink and Hesselink (2000); here the second pass looks at every row in turn,
-which is plain to read and bounded by the farthest obstacle.
+The device kernels follow Meijster, Roerdink and Hesselink (2000). Here the second pass visits every row in turn: it is
+plain to read, and the farthest obstacle bounds it.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from gpusense.reference.bits import cells_left, cells_right, unpacked
 
 NO_OBSTACLE = -1
 UNREACHABLE = np.iinfo(np.int32).max
-# Above every squared distance; another square added to it still fits into 32 bits.
+# Larger than every squared distance; its sum with another square still fits into 32 bits.
 FAR = np.uint32(1 << 31)
 BLOCK = 32
-# Beyond all distances, as the first pass of a work-item a cell writes it, and its rows a block.
+# The value of the first pass for cells without an obstacle within reach, and the rows of a block.
 FAR_CELLS = 46341
 BLOCK_ROWS = 32
 
 
 def _lines(array: np.ndarray, lines: int, length: int, line_stride: int, step: int) -> np.ndarray:
-    """View of a flat array as (lines, length), whichever way the lines run."""
+    """Return a view of a flat array as (lines, length), along rows or columns."""
     size = array.itemsize
     return np.lib.stride_tricks.as_strided(array, (lines, length), (line_stride * size, step * size))
 
@@ -35,7 +35,7 @@ def distance_lines(
     line_stride: int,
     step: int,
 ) -> None:
-    """First pass: cells to the nearest occupied cell of the same line, NO_OBSTACLE without one."""
+    """Count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one (first pass)."""
     cells = _lines(occupied, lines, length, line_stride, step)
     index = np.arange(length, dtype=np.int32)
     far = np.int32(2 * length + 1)
@@ -46,7 +46,7 @@ def distance_lines(
 
 
 def parabola(i: np.ndarray, j: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Squared distance from cell i to the obstacle nearest to cell j across the lines."""
+    """Return the squared distance from cell i to the obstacle nearest to cell j across the lines."""
     return (i - j) * (i - j) + across * across
 
 
@@ -60,7 +60,7 @@ def distance_envelope(
     line_stride: int,
     step: int,
 ) -> None:
-    """Second pass: at each cell the lowest of all parabolas of its line."""
+    """Find the lowest of all parabolas of its line at each cell (second pass)."""
     across = _lines(along, lines, length, line_stride, step)
     out = _lines(squared, lines, length, line_stride, step)
     for block in range(0, lines, BLOCK):
@@ -69,7 +69,7 @@ def distance_envelope(
 
 
 def _lowest(start: np.ndarray) -> np.ndarray:
-    """Least ``start[:, j] + (i - j)^2`` at each i; UNREACHABLE where all are beyond."""
+    """Return the least ``start[:, j] + (i - j)^2`` at each i, UNREACHABLE where all are beyond."""
     best = start.copy()
     for offset in range(1, start.shape[1]):
         square = np.uint32(offset * offset)
@@ -83,22 +83,22 @@ def _lowest(start: np.ndarray) -> np.ndarray:
 def distance_bits(
     flags: frozenset[str], bits: np.ndarray, nearest: np.ndarray, rows: int, cols: int, words: int, reach: int
 ) -> None:
-    """First pass: cells to the nearest occupied cell of the same row, FAR_CELLS if it is over reach."""
+    """Count the cells to the nearest occupied cell of the same row, FAR_CELLS where it is over reach (first pass)."""
     cells = unpacked(bits, rows, cols, words)
-    found = np.minimum(cells_left(cells), cells_right(cells))
-    nearest[: rows * cols] = np.where(found > reach, FAR_CELLS, found).ravel()
+    nearest_cells = np.minimum(cells_left(cells), cells_right(cells))
+    nearest[: rows * cols] = np.where(nearest_cells > reach, FAR_CELLS, nearest_cells).ravel()
 
 
 def distance_blocks(
     flags: frozenset[str], nearest: np.ndarray, blocks: np.ndarray, rows: int, cols: int, count: int
 ) -> None:
-    """The least number of each column of a block of rows."""
+    """Find the minimum of each column of a block of rows."""
     least = np.minimum.reduceat(nearest[: rows * cols].reshape(rows, cols), np.arange(count) * BLOCK_ROWS, axis=0)
     blocks[: count * cols] = least.ravel()
 
 
 def squares_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Sum of two squares."""
+    """Return the sum of two squares."""
     return a * a + b * b
 
 
@@ -112,7 +112,7 @@ def distance_search(
     count: int,
     most: int,
 ) -> None:
-    """Second pass: the least sum of squares along each column, UNREACHABLE if it is over most."""
+    """Find the least sum of squares along each column, UNREACHABLE where it is over most (second pass)."""
     columns = nearest[: rows * cols].reshape(rows, cols).astype(np.uint32).T
     out = squared[: rows * cols].reshape(rows, cols)
     for begin in range(0, cols, BLOCK):

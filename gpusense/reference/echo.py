@@ -1,8 +1,8 @@
-"""What a sensor hears: the nearest return among the rays of its cone, one ray for a laser, and the angle there.
+"""The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence.
 
-The angle of incidence lies between the ray and the normal of the surface that it hits. Normals of cells are made
-beforehand, in a ring of cells around the map: 0 for free cells, NaN for cells without a normal, which count as met
-head-on.
+The angle of incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring
+of cells around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine
+counts as 1.
 """
 
 from __future__ import annotations
@@ -14,40 +14,42 @@ from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_g
 
 
 def is_wall(normal: np.ndarray) -> np.ndarray:
-    """Whether (M, 2) normals are those of obstacles."""
+    """Return whether (M, 2) normals belong to obstacles."""
     return (normal != 0).any(axis=1)
 
 
 def normal_at(
     flags: frozenset[str], normals: np.ndarray, rows: int, cols: int, col: np.ndarray, row: np.ndarray
 ) -> np.ndarray:
-    """(M, 2) normals of cells."""
+    """Return (M, 2) normals of cells."""
     beyond = off_grid(np.stack([col + 1, row + 1]), rows + 2, cols + 2)
-    found = normals[np.where(beyond, 0, (row + 1) * (cols + 2) + col + 1)]
-    found[beyond] = np.nan if "OUTSIDE_OCCUPIED" in flags else 0
-    return found
+    normal = normals[np.where(beyond, 0, (row + 1) * (cols + 2) + col + 1)]
+    normal[beyond] = np.nan if "OUTSIDE_OCCUPIED" in flags else 0
+    return normal
 
 
 def hit_normal(
     flags: frozenset[str], normals: np.ndarray, rows: int, cols: int, cell: np.ndarray, r: Ray, t: np.ndarray
 ) -> np.ndarray:
-    """Normals of the cells in which M rays end at distances t, which tell where the exact walk was.
+    """Return the normals of the cells in which M rays end at distances t.
 
-    It was across all boundaries in x up to t and those in y before t, or, after a step in y, up to t as well. A corner
-    is passed in x first.
+    The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and those in y
+    before t or, after a step in y, up to t as well. At a corner it steps in x first.
     """
     x, y = cell.T.astype(np.int64)
     col = x + r.step[0] * crossed(t, r.speed[0], r.a[0], r.inv[0], True).astype(np.int64)
     before, until = (
         y + r.step[1] * crossed(t, r.speed[1], r.a[1], r.inv[1], upto).astype(np.int64) for upto in (False, True)
     )
-    own, first, second = (normal_at(flags, normals, rows, cols, *at) for at in ((x, y), (col, before), (col, until)))
+    start_normal, first, second = (
+        normal_at(flags, normals, rows, cols, *at) for at in ((x, y), (col, before), (col, until))
+    )
     later = np.where(is_wall(first)[:, None], first, second)
-    return np.where(((t == 0) & is_wall(own))[:, None], own, later)
+    return np.where(((t == 0) & is_wall(start_normal))[:, None], start_normal, later)
 
 
 def incidence_terms(terms: np.ndarray, edges: np.ndarray, kinds: int, cosine: np.ndarray) -> np.ndarray:
-    """(10, ...) terms of the mixture for the bins of angles of incidence, by the cosines of the bins' upper edges."""
+    """Return (10, ...) terms of the mixture for angles of incidence; edges are cosines of the bins' upper ends."""
     bins = (cosine[..., None] <= edges[: kinds - 1]).sum(axis=-1)
     return np.moveaxis(terms[: 10 * kinds].reshape(kinds, 10)[bins], -1, 0)
 
@@ -67,9 +69,9 @@ def nearest_echo(
     slack: np.floating,
     tolerance: np.floating,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nearest returns of M cones.
+    """Return the nearest returns of M cones.
 
-    A ray whose angle of incidence has a cosine below critical has no return: the surface is a mirror to it.
+    A ray whose angle of incidence has a cosine below critical has no return: the surface reflects it like a mirror.
 
     Args:
         flags: Flags of the signature table.
@@ -132,18 +134,18 @@ def cast_echoes(
     resolution: np.floating,
     range_max: np.floating,
 ) -> None:
-    """Expected ranges of all particles' cones, and the angles of incidence there, NaN where nothing returns."""
+    """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return."""
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
-        some = slice(first, min(first + block, particles))
-        own = slice(some.start * rays, some.stop * rays)
+        part = slice(first, min(first + block, particles))
+        entries = slice(part.start * rays, part.stop * rays)
         t, cosine, sine = echoes(
-            flags, map_table, normals, rows, cols, pose_cell[some], pose[some], ray, rays, cone_rays, critical, limit,
+            flags, map_table, normals, rows, cols, pose_cell[part], pose[part], ray, rays, cone_rays, critical, limit,
             bins, slack, tolerance,
         )  # fmt: skip
-        ranges[own] = expected_range(t, limit, resolution, range_max)
+        ranges[entries] = expected_range(t, limit, resolution, range_max)
         if "INCIDENCE" in flags:
-            incidence[own] = np.where(t < limit, np.arctan2(sine, cosine), np.nan)
+            incidence[entries] = np.where(t < limit, np.arctan2(sine, cosine), np.nan)
 
 
 def echoes(
@@ -159,7 +161,7 @@ def echoes(
     cone_rays: int,
     *rest: np.floating | int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``nearest_echo`` of all cones at all poses, (N * rays,) each."""
+    """Return ``nearest_echo`` of all cones at all poses, (N * rays,) each."""
     lanes = (np.repeat(cell, rays, axis=0), np.repeat(pose, rays, axis=0))
     cones = np.tile(ray[: rays * cone_rays].reshape(rays, cone_rays, 2), (len(pose), 1, 1))
     return nearest_echo(flags, map_table, normals, rows, cols, *lanes, cones, *rest)  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
-"""The cell of the likelihood field's table that a beam's end point falls into, and its place within that cell.
+"""The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
 
-Cells must be the same on every device and in every precision. Kernels find end points that are near an edge again with
-twice the digits; here all are found so.
+Cells must be the same on every device and in every precision. Kernels compute end points near an edge again with twice
+the digits; the reference computes all of them so.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ EDGE = 2.0**-33
 
 
 def field_cell(col: np.ndarray, row: np.ndarray, rows: int, cols: int) -> np.ndarray:
-    """Index of a cell of the padded table; far cells become ring cells."""
+    """Return the index of a cell of the padded table; far cells become ring cells."""
     c = np.clip(col, -FIELD_RING, cols + FIELD_RING - 1)
     r = np.clip(row, -FIELD_RING, rows + FIELD_RING - 1)
     return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
 
 
 def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) -> Pair:
-    """``frac + a b + sign c d`` where every factor is a sum of two reals; to about twice the working precision."""
+    """Return ``frac + a b + sign c d`` to about twice the working precision; every factor is a sum of two numbers."""
     ab, cd = two_product(a[0], b[0]), two_product(c[0], d[0])
     products = two_sum(ab[0], sign * cd[0])
     total = two_sum(products[0], frac[0])
@@ -33,10 +33,10 @@ def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) ->
 
 
 def whole_cells(flags: frozenset[str], offset: Pair) -> tuple[np.ndarray, Pair, Pair]:
-    """Whole cells below an offset of two parts, what is left of it in [0, 1), and what is missing to 1.
+    """Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it.
 
-    Both are found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or less
-    short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
+    Both are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below
+    an edge counts as on it, so that end points on edges fall into the same cell in every precision.
     """
     real = offset[0].dtype.type
     nearest = np.floor(np.where(np.isfinite(offset[0]), offset[0], 0) + real(0.5))
@@ -56,7 +56,7 @@ def whole_cells(flags: frozenset[str], offset: Pair) -> tuple[np.ndarray, Pair, 
 
 @dataclass(frozen=True)
 class EndPoint:
-    """Where end points lie: cells as offsets from the pose's cell, and the places between those cells' edges."""
+    """End points: cells as offsets from the pose's cell, and places between the edges of these cells."""
 
     col: np.ndarray
     row: np.ndarray
@@ -69,7 +69,7 @@ class EndPoint:
 def end_point(
     flags: frozenset[str], pose: np.ndarray, pose_low: np.ndarray, point: np.ndarray, point_low: np.ndarray
 ) -> EndPoint:
-    """Poses are (M, 1, 4), points (1, K, 2): the reading times the beam's (cos, sin), in cells."""
+    """Return the end points of (M, 1, 4) poses and (1, K, 2) points, readings times the beams' (cos, sin) in cells."""
     real = pose.dtype.type
     shift = real(0.5) if "BILINEAR" in flags else real(0)
     cos, sin = pose[..., 2], pose[..., 3]
@@ -77,9 +77,9 @@ def end_point(
     if "CAREFUL" in flags:
         c, s = (cos, pose_low[..., 2]), (sin, pose_low[..., 3])
         u, v = (p, point_low[..., 0]), (q, point_low[..., 1])
-        (frac_x, lost_x), (frac_y, lost_y) = two_sum(pose[..., 0], -shift), two_sum(pose[..., 1], -shift)
-        x = careful_offset((frac_x, lost_x + pose_low[..., 0]), c, u, s, v, -1)
-        y = careful_offset((frac_y, lost_y + pose_low[..., 1]), s, u, c, v, 1)
+        (frac_x, low_x), (frac_y, low_y) = two_sum(pose[..., 0], -shift), two_sum(pose[..., 1], -shift)
+        x = careful_offset((frac_x, low_x + pose_low[..., 0]), c, u, s, v, -1)
+        y = careful_offset((frac_y, low_y + pose_low[..., 1]), s, u, c, v, 1)
     else:
         x_plain = (pose[..., 0] - shift) + (cos * p - sin * q)
         y_plain = (pose[..., 1] - shift) + (sin * p + cos * q)

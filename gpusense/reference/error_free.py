@@ -1,4 +1,4 @@
-"""Error-free transformations: what a rounded operation leaves behind is kept in a second number.
+"""Error-free transformations: the rounding error of an operation is kept in a second number.
 
 Source: Knuth (``two_sum``), Dekker and Veltkamp (``two_product``).
 """
@@ -16,21 +16,21 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 def two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``a + b = sum + error`` exactly."""
+    """Return ``a + b = sum + error`` exactly."""
     total = a + b
     shift = total - a
     return total, (a - (total - shift)) + (b - shift)
 
 
 def high_half(a: np.ndarray) -> np.ndarray:
-    """Leading bits of a float, few enough that a product of two such halves is exact."""
+    """Return the leading bits of a float, few enough that a product of two such halves is exact."""
     splitter = a.dtype.type(134217729 if a.dtype == np.float64 else 4097)
     scaled = splitter * a
     return scaled - (scaled - a)
 
 
 def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``a * b = product + error`` exactly, short of overflow and underflow."""
+    """Return ``a * b = product + error`` exactly, short of overflow and underflow."""
     product = a * b
     a_high, b_high = high_half(a), high_half(b)
     a_low, b_low = a - a_high, b - b_high
@@ -38,35 +38,40 @@ def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pair_sum(a: Pair, b: Pair) -> Pair:
-    """Sum of two numbers of two parts each, to about twice the working precision."""
+    """Add two numbers of two parts each, to about twice the working precision."""
     total, error = two_sum(a[0], b[0])
     return two_sum(total, error + (a[1] + b[1]))
 
 
 def pair_product(a: Pair, b: Pair) -> Pair:
-    """Product of two numbers of two parts each, to about twice the working precision."""
+    """Multiply two numbers of two parts each, to about twice the working precision."""
     product, error = two_product(a[0], b[0])
     return two_sum(product, error + (a[0] * b[1] + a[1] * b[0]))
 
 
 def add_term(total: tuple[np.ndarray, np.ndarray], term: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One more term in a compensated sum: the running sum, and what its roundings lost."""
+    """Add a term to a compensated sum: the running sum, and the sum of its rounding errors."""
     head, lost = two_sum(total[0], term)
     return head, total[1] + lost
 
 
+def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
+    """Choose between two numbers of two parts each, element by element."""
+    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
+
+
 def strands_in(terms: Any) -> Any:
-    """How many strands so many terms have: STRANDS in each whole block, of what is left as many as there are terms."""
+    """Return the number of strands of a number of terms: STRANDS per whole block, at most one per remaining term."""
     return terms // BLOCK_TERMS * STRANDS + np.minimum(terms % BLOCK_TERMS, STRANDS)
 
 
 def block_sums(term: np.ndarray) -> np.ndarray:
-    """Plain sums of the terms of each block, of (M, K) terms."""
+    """Return plain sums of the terms of each block, of (M, K) terms."""
     return _sums(term, 1)
 
 
 def strand_sums(term: np.ndarray) -> np.ndarray:
-    """(M, strands_in(K)) plain sums of every STRANDS-th of the terms of each block, of (M, K) terms."""
+    """Return (M, strands_in(K)) plain sums of the strands of each block, of (M, K) terms."""
     return _sums(term, STRANDS)[:, : strands_in(term.shape[1])]
 
 

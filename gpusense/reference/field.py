@@ -1,6 +1,6 @@
 """Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 
-The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
+The table is padded by a ring of two cells for everything outside the grid, so no look-up needs a bounds test.
 """
 
 from __future__ import annotations
@@ -13,6 +13,75 @@ from gpusense.reference.error_free import Pair, block_sums, pair_product, pair_s
 from gpusense.reference.scans import particles_of_scans
 
 BLOCK = 1 << 18
+
+
+def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
+    """Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits."""
+    if "SHARP" in flags:
+        return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
+    return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
+
+
+def bilinear(
+    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, rows: int, cols: int
+) -> Pair:
+    """Interpolate the distance between the four cell centres around an end point, in two parts."""
+    zero = np.zeros_like(end.rest_x[0])
+    a = table[field_cell(col, row, rows, cols)], zero
+    b = table[field_cell(col + 1, row, rows, cols)], zero
+    c = table[field_cell(col, row + 1, rows, cols)], zero
+    d = table[field_cell(col + 1, row + 1, rows, cols)], zero
+    low = between(flags, end.to_next_x, a, end.rest_x, b)
+    high = between(flags, end.to_next_x, c, end.rest_x, d)
+    return between(flags, end.to_next_y, low, end.rest_y, high)
+
+
+def field_exponent(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
+    """Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+
+    ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1). hit is z_hit / (sigma
+    sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
+    """
+    if "SHARP" in flags:
+        return pair_product(pair_product(distance, distance), (terms[1], terms[5]))
+    return distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
+
+
+def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:
+    """Return log p of distances from end points to the nearest obstacle."""
+    exponent, low = field_exponent(flags, distance, terms)
+    if "LINEAR" not in flags:
+        return np.logaddexp((terms[0] - exponent) + (terms[4] - low), terms[2])
+    p = np.full(exponent.shape, terms[2])
+    if "HIT" in flags:
+        p += terms[0] * np.exp(-exponent) * (1 - low)
+    return np.log(p)
+
+
+def reading_value(
+    flags: frozenset[str],
+    table: np.ndarray,
+    origin: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    point: np.ndarray,
+    point_low: np.ndarray,
+    terms: np.ndarray,
+    rows: int,
+    cols: int,
+) -> np.ndarray:
+    """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
+    end = end_point(flags, pose, pose_low, point, point_low)
+    col, row = end.col + origin[..., 0], end.row + origin[..., 1]
+    if "BILINEAR" in flags:
+        term = log_field(flags, bilinear(flags, table, col, row, end, rows, cols), terms)
+    else:
+        term = table[field_cell(col, row, rows, cols)]
+        term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
+    if "ALL_READINGS" in flags:
+        x = point[..., 0]
+        term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
+    return term
 
 
 def fill_field(
@@ -31,10 +100,10 @@ def fill_field(
     begin: int,
     stride: int,
 ) -> None:
-    """Values of cells of the table, from squared distances by a table of all squared distances up to the cap.
+    """Fill cells of the table from squared distances; density has a value for each squared distance up to the cap.
 
-    They are height x width cells, the first of them at begin, for squared distances from (from_row, from_col) on; what
-    lies beyond these is beyond.
+    They are height x width cells, the first of them at begin. The first cell is (from_row, from_col) of the grid; cells
+    outside the grid get beyond.
     """
     size = table.itemsize
     out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
@@ -43,45 +112,6 @@ def fill_field(
     known = squared[: rows * cols].reshape(rows, cols)[top:bottom, left:right]
     out[...] = beyond
     out[top - from_row : bottom - from_row, left - from_col : right - from_col] = density[np.minimum(known, cap)]
-
-
-def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
-    """a and b weighed by numbers of two parts; the terms are not negative, so small values keep their digits."""
-    if "SHARP" in flags:
-        return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
-    return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
-
-
-def bilinear(
-    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, rows: int, cols: int
-) -> Pair:
-    """Smooth distance between the four cell centres around an end point, in two parts."""
-    zero = np.zeros_like(end.rest_x[0])
-    a = table[field_cell(col, row, rows, cols)], zero
-    b = table[field_cell(col + 1, row, rows, cols)], zero
-    c = table[field_cell(col, row + 1, rows, cols)], zero
-    d = table[field_cell(col + 1, row + 1, rows, cols)], zero
-    low = between(flags, end.to_next_x, a, end.rest_x, b)
-    high = between(flags, end.to_next_x, c, end.rest_x, d)
-    return between(flags, end.to_next_y, low, end.rest_y, high)
-
-
-def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:
-    """terms = (hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1).
-
-    hit and rand are z_hit / (sigma sqrt(2 pi)) and z_rand / range_max, or logs. Where the peak is high, exponent and
-    log peak nearly cancel.
-    """
-    if "SHARP" in flags:
-        exponent, low = pair_product(pair_product(distance, distance), (terms[1], terms[5]))
-    else:
-        exponent, low = distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
-    if "LINEAR" not in flags:
-        return np.logaddexp((terms[0] - exponent) + (terms[4] - low), terms[2])
-    p = np.full(exponent.shape, terms[2])
-    if "HIT" in flags:
-        p += terms[0] * np.exp(-exponent) * (1 - low)
-    return np.log(p)
 
 
 def score_field(
@@ -107,34 +137,28 @@ def score_field(
     per_scan: int,
     ahead: int,
 ) -> None:
-    """The table holds log densities, or capped distances in metres where it is interpolated."""
+    """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
-        for scan, own in particles_of_scans(particles, per_scan, ahead):
+        for scan, part in particles_of_scans(particles, per_scan, ahead):
             first, last = start[scan], start[scan + 1]
             score_field(
-                flags - {"SCANS"}, table, pose_cell[own], pose[own], pose_low[own], point[first:last],
-                point_low[first:last], terms, start, fixed_of, log_p[own], parts, rows, cols, own.stop - own.start,
+                flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
+                point_low[first:last], terms, start, fixed_of, log_p[part], parts, rows, cols, part.stop - part.start,
                 int(last - first), guard, fixed_of[scan], temperature, per_scan, 0,
             )  # fmt: skip
         return
     block = max(BLOCK // max(readings, 1), 1)
     points = point[None, :readings]
     for begin in range(0, particles, block):
-        some = slice(begin, min(begin + block, particles))
-        low = pose_low[some, None] if "CAREFUL" in flags else pose_low[None, :1]
-        end = end_point(flags, pose[some, None], low, points, point_low[None, :readings])
-        col, row = end.col + pose_cell[some, None, 0], end.row + pose_cell[some, None, 1]
-        if "BILINEAR" in flags:
-            term = log_field(flags, bilinear(flags, table, col, row, end, rows, cols), terms)
-        else:
-            term = table[field_cell(col, row, rows, cols)]
-            term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
-        if "ALL_READINGS" in flags:
-            x = points[..., 0]
-            term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
+        part = slice(begin, min(begin + block, particles))
+        low = pose_low[part, None] if "CAREFUL" in flags else pose_low[None, :1]
+        term = reading_value(
+            flags, table, pose_cell[part, None], pose[part, None], low, points, point_low[None, :readings], terms, rows,
+            cols,
+        )  # fmt: skip
         if "PER_BEAM" in flags:
-            parts[begin * readings : some.stop * readings] = term.ravel()
-        log_p[some] = sum_terms(flags, term, fixed, temperature, block_sums)
+            parts[begin * readings : part.stop * readings] = term.ravel()
+        log_p[part] = sum_terms(flags, term, fixed, temperature, block_sums)
 
 
 def field_blocks(
@@ -158,14 +182,14 @@ def field_blocks(
     spread: int,
     per_scan: int,
 ) -> None:
-    """Sums of blocks of readings, at parts[n * across + block * along], which GPUs find one by one."""
+    """Write the sums of blocks of readings to parts[n * across + block * along]; GPUs compute them one by one."""
     if "SCANS" in flags:
-        for scan, own in particles_of_scans(particles, per_scan):
+        for scan, part in particles_of_scans(particles, per_scan):
             first, last = start[scan], start[scan + 1]
             field_blocks(
-                flags - {"SCANS"}, table, pose_cell[own], pose[own], pose_low[own], point[first:last],
-                point_low[first:last], terms, guard, start, parts[own.start * across :], rows, cols,
-                own.stop - own.start, int(last - first), across, along, spread, per_scan,
+                flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
+                point_low[first:last], terms, guard, start, parts[part.start * across :], rows, cols,
+                part.stop - part.start, int(last - first), across, along, spread, per_scan,
             )  # fmt: skip
         return
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)

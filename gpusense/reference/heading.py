@@ -1,9 +1,9 @@
 """Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits.
 
 A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
-count times pi/2 in four parts (Cody and Waite), beyond by the product with as many bits of 2/pi as matter, in integers
-(Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. ``bench/heading_constants.py``
-derives the constants.
+count times pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in
+integers (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
+``bench/derive/heading_constants.py`` derives the constants.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gpusense.reference.error_free import Pair, pair_product, two_sum
 # Up to this heading the counts of quarter turns have 20 bits.
 LIMIT = 1048576.0
 TWO_OVER_PI = 0.6366197723675814
-# 1.5 * 2^52: a sum with it is rounded to a whole number.
+# 1.5 * 2^52: a sum with it is rounded to an integer.
 ROUNDER = 6755399441055744.0
 # pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
 QUARTER_1, QUARTER_2 = 1.5707963267341256, 6.077100506303966e-11
@@ -39,7 +39,7 @@ WORDS = np.array([
 
 
 def reduce_ordinary(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
-    """Quarter turns modulo 4 and the rest as a sum of two numbers, for headings of at most LIMIT."""
+    """Reduce headings of at most LIMIT to quarter turns modulo 4 and the sum of two numbers."""
     count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
     # The first product and difference are exact, and so are the next two products.
     rest, lost_1 = two_sum(theta - count * QUARTER_1, -(count * QUARTER_2))
@@ -49,12 +49,12 @@ def reduce_ordinary(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
 
 
 def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
-    """As :func:`reduce_ordinary` for headings above LIMIT, up to the largest there is."""
+    """Reduce headings above LIMIT, up to the largest number, as :func:`reduce_ordinary` does."""
     bits = np.abs(theta).view(np.uint64)
     mantissa = (bits & np.uint64(0xFFFFFFFFFFFFF)) | np.uint64(0x10000000000000)
     low_half, high_half = mantissa & np.uint64(0xFFFFFFFF), mantissa >> np.uint64(32)
-    # Bits of 2/pi that make whole turns are left out: the window's first bit is worth half a turn in the mantissa's
-    # last place.
+    # Bits of 2/pi that make whole turns are left out: times the last bit of the mantissa, the window's first bit is
+    # half a turn.
     first = (bits >> np.uint64(52)).astype(np.int64) - (1075 - 62)
     word, shift = first >> 5, (first & 31).astype(np.uint64)
     # turns = mantissa * window modulo 2^192, of which the upper four words stay.
@@ -66,7 +66,8 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
         sum_2 = high_half * below + (sum_1 & np.uint64(0xFFFFFFFF)) + carry_2
         carry_1, carry_2, below = sum_1 >> np.uint64(32), sum_2 >> np.uint64(32), here
         turn_4, turn_3, turn_2, turn_1 = turn_3, turn_2, turn_1, sum_2 & np.uint64(0xFFFFFFFF)
-    # To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.
+    # Round to the nearest quarter. The rest, in units of 2^-62 quarters, is cut into pieces that convert without
+    # rounding.
     turn_high = (turn_1 << np.uint64(32) | turn_2) + np.uint64(0x2000000000000000)
     turn_low = turn_3 << np.uint64(32) | turn_4
     quadrant = (turn_high >> np.uint64(62)).astype(np.int32)
@@ -82,7 +83,7 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
 
 
 def cos_sin(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines and sines of float64 headings; of no meaning, but not NaN, where a heading is not finite."""
+    """Return cosines and sines of float64 headings; where one is not finite they have no meaning but are not NaN."""
     huge = ~(np.abs(theta) <= LIMIT)
     any_huge = huge.any()
     quadrant, (r, low) = reduce_ordinary(np.where(huge, 0.0, theta) if any_huge else theta)

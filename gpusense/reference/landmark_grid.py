@@ -1,7 +1,8 @@
-"""Likelihood of features by the landmarks near to where each of them points, book table 6.5.
+"""Search for the landmarks near the end point of a feature, book table 6.5.
 
-Landmarks lie in square buckets, row by row; ``start`` has the first of each bucket. A feature looks into the buckets
-that a disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
+Landmarks lie in square buckets, row by row; ``start[i]`` is the first landmark of bucket i. A search visits the buckets
+that a disc around the feature's end point touches, and evaluates the landmarks within the disc; others have a
+negligible density.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ BLOCK_PAIRS = 1 << 18
 
 
 def bucket_at(position: np.ndarray, size: np.floating, count: int) -> np.ndarray:
-    """Row or column of the bucket at a position; the nearest one outside."""
+    """Return the row or column of the bucket at a position, the nearest one for positions outside."""
     return np.clip(np.floor(position / size), 0, count - 1).astype(np.int64)
 
 
 def candidates(
     start: np.ndarray, place: Quad, turned: Quad, feature: np.ndarray, rows: int, cols: int, size: np.floating
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Runs of landmarks in the buckets that each particle's disc touches: (P, rows of buckets) first and last + 1."""
+    """Return runs of landmarks in the buckets that discs touch: (P, rows of buckets) first and last + 1."""
     reach, radius = feature[REACH], feature[RADIUS]
     x, y = place[0] + reach * turned[0], place[2] + reach * turned[2]
     left, right = bucket_at(x - radius, size, cols), bucket_at(x + radius, size, cols)
@@ -44,7 +45,7 @@ def candidates(
 
 
 def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
-    """Whether landmarks lie in a feature's disc, and within the limits of the sensor that it does not measure."""
+    """Return whether landmarks lie in a feature's disc, and within the limits of what the feature does not measure."""
     reach, radius, hole = feature[REACH], feature[RADIUS], feature[HOLE]
     x, y = off[0] - reach * turned[0], off[2] - reach * turned[2]
     squared = off[0] * off[0] + off[2] * off[2]
@@ -67,22 +68,25 @@ def search(
     cols: int,
     size: np.floating,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per particle the log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place."""
+    """Return per particle the log density, that of the likeliest landmark, and the index of that landmark.
+
+    The log density is that of the likeliest landmark, or with MARGINAL of all landmarks.
+    """
     real, particles = terms.dtype, len(place[0])
     best, chosen = np.full(particles, -np.inf, real), np.full(particles, -1, np.int32)
     if feature[RADIUS] < 0:
         return best, best, chosen
-    found = best.copy()
+    log_p = best.copy()
     first, last = candidates(start, place, turned, feature, rows, cols, size)
-    own = (last - first).sum(axis=1)
-    ends = np.cumsum(own)
+    counts = (last - first).sum(axis=1)
+    ends = np.cumsum(counts)
     begin = 0
     while begin < particles:
-        # As many particles as have BLOCK_PAIRS candidates, one at least.
+        # Take as many particles as have BLOCK_PAIRS candidates, at least one.
         base = ends[begin - 1] if begin else 0
         end = max(int(np.searchsorted(ends, base + BLOCK_PAIRS, side="right")), begin + 1)
         runs_first, runs = first[begin:end].ravel(), (last - first)[begin:end].ravel()
-        n = np.repeat(np.arange(begin, end), own[begin:end])
+        n = np.repeat(np.arange(begin, end), counts[begin:end])
         j = np.arange(runs.sum()) + np.repeat(runs_first - (np.cumsum(runs) - runs), runs)
         placed, rotated = at_places(place, n), at_places(turned, n)
         off = offset(landmark[j], placed)
@@ -92,15 +96,15 @@ def search(
             off, rotated = at_places(off, kept), at_places(rotated, kept)
             value = log_detection(flags, off, rotated, feature, signature[j], terms, arcs)
             heads = np.flatnonzero(np.append(True, n[1:] != n[:-1]))
-            who, sizes = n[heads], np.diff(np.append(heads, len(n)))
+            holder, sizes = n[heads], np.diff(np.append(heads, len(n)))
             most = np.maximum.reduceat(value, heads)
-            best[who] = found[who] = most
+            best[holder] = log_p[holder] = most
             # The first of equals.
             at_most = np.where(value == np.repeat(most, sizes), np.arange(len(n)), len(n))
-            chosen[who] = j[np.minimum.reduceat(at_most, heads)]
+            chosen[holder] = j[np.minimum.reduceat(at_most, heads)]
             if "MARGINAL" in flags:
                 relative = np.where(np.isneginf(most), 0, most)
-                summed = np.add.reduceat(np.exp(value - np.repeat(relative, sizes)), heads, dtype=np.float64)
-                found[who] = np.where(np.isneginf(most), most, relative + np.log(np.maximum(summed, 1))).astype(real)
+                total = np.add.reduceat(np.exp(value - np.repeat(relative, sizes)), heads, dtype=np.float64)
+                log_p[holder] = np.where(np.isneginf(most), most, relative + np.log(np.maximum(total, 1))).astype(real)
         begin = end
-    return found, best, np.where(np.isneginf(best), -1, chosen)
+    return log_p, best, np.where(np.isneginf(best), -1, chosen)

@@ -1,8 +1,8 @@
-"""The likeliest joint association of a few features, in which no two of them are the same landmark.
+"""The likeliest joint association of a few features, in which no two features have the same landmark.
 
-Features without a landmark are false positives. Landmarks are taken one after the other; ``best[s]`` is the largest sum
-of log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may
-join one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+Features without a landmark are false positives. Landmarks are processed one after the other. A set s of features is a
+bit mask; ``best[s]`` is the largest sum of log p over the features of s when all of them have landmarks that were
+processed. A landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
 """
 
 from __future__ import annotations
@@ -46,26 +46,29 @@ def joint_features(
     fixed: np.floating,
     temperature: np.floating,
 ) -> None:
-    """``choice[s]`` has the landmark of each feature of a set, and its log p at ``value``; ``sets`` is 2^features."""
+    """Find the best joint association of each particle.
+
+    ``choice[s]`` has the landmark of each feature of set s, and ``value[s]`` its log p; ``sets`` is 2^features.
+    """
     real = pose.dtype
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], size)
     turned = [direction(pose[:particles], pose_low[:particles], one) for one in numbers[:features]]
     sums = best[: particles * sets].reshape(particles, sets)
-    who = choice[: particles * sets * features].reshape(particles, sets, features)
+    partners = choice[: particles * sets * features].reshape(particles, sets, features)
     each = value[: particles * sets * features].reshape(particles, sets, features)
-    sums[:], who[:], each[:] = -np.inf, -1, -np.inf
+    sums[:], partners[:], each[:] = -np.inf, -1, -np.inf
     sums[:, 0] = 0
     for j in range(landmarks):
         off = offset(landmark[j : j + 1], place)
-        own = signature[np.full(particles, j)]
+        signatures = signature[np.full(particles, j)]
         log_each = np.full((features, particles), -np.inf, real)
         for k in range(features):
             if numbers[k, RADIUS] >= 0:
-                found = log_detection(flags, off, turned[k], numbers[k], own, terms, arcs)
-                found = either(found, numbers[k, FALSE_POSITIVE])
-                log_each[k] = np.where(near(off, turned[k], numbers[k]), found, -np.inf)
-        # From the full set down: the smaller sets do not have this landmark yet.
+                detected = log_detection(flags, off, turned[k], numbers[k], signatures, terms, arcs)
+                detected = either(detected, numbers[k, FALSE_POSITIVE])
+                log_each[k] = np.where(near(off, turned[k], numbers[k]), detected, -np.inf)
+        # From the full set down, since smaller sets must not yet contain this landmark.
         for s in range(sets - 1, 0, -1):
             for k in range(features):
                 if s >> k & 1:
@@ -73,8 +76,8 @@ def joint_features(
                     joined = sums[:, less] + log_each[k]
                     better = joined > sums[:, s]
                     sums[better, s] = joined[better]
-                    who[better, s], each[better, s] = who[better, less], each[better, less]
-                    who[better, s, k], each[better, s, k] = j, log_each[k, better]
+                    partners[better, s], each[better, s] = partners[better, less], each[better, less]
+                    partners[better, s, k], each[better, s, k] = j, log_each[k, better]
     most, chosen = np.full(particles, -np.inf, real), np.zeros(particles, np.int64)
     for s in range(sets):
         total = sums[:, s].copy()
@@ -86,7 +89,7 @@ def joint_features(
     log_p[:particles] = np.where(np.isneginf(most), most, temperature * (fixed + most))
     if "PER_BEAM" in flags:
         n = np.arange(particles)
-        found, values = who[n, chosen], each[n, chosen]
-        which[: particles * features] = found.ravel()
+        detected, values = partners[n, chosen], each[n, chosen]
+        which[: particles * features] = detected.ravel()
         false = numbers[:features, FALSE_POSITIVE]
-        parts[: particles * features] = np.where(found >= 0, values, false).ravel()
+        parts[: particles * features] = np.where(detected >= 0, values, false).ravel()

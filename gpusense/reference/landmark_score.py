@@ -16,7 +16,7 @@ from gpusense.reference.landmarks import (
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
 
-# Particles that are scored at once.
+# Particles per block.
 BLOCK = 1 << 14
 
 
@@ -45,10 +45,10 @@ def score_features(
     fixed: np.floating,
     temperature: np.floating,
 ) -> None:
-    """Sum of log p over features: with the partner that is KNOWN, of all (MARGINAL), or of the likeliest landmark.
+    """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
 
-    With PER_BEAM also what each feature adds, and its likeliest landmark's place in the buckets, -1 where a false
-    positive is likelier. ``share`` is log(1 / landmarks), the prior of each one with MARGINAL and else 0.
+    With PER_BEAM, ``parts`` has the term of each feature, and ``which`` the index of its likeliest landmark, -1 where a
+    false positive is likelier. With MARGINAL ``share`` is log(1 / landmarks), the prior of a landmark, else 0.
     """
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     for begin in range(0, particles, BLOCK):
@@ -56,25 +56,25 @@ def score_features(
         place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)
         count = len(place[0])
         total = (np.full(count, fixed, pose.dtype), np.zeros(count, pose.dtype))
-        lost = np.zeros(count, bool)
+        impossible = np.zeros(count, bool)
         for k in range(0, features, BLOCK_TERMS):
             block = np.zeros(count, pose.dtype)
             for i in range(k, min(k + BLOCK_TERMS, features)):
                 one, turned = numbers[i], direction(pose[part], pose_low[part], numbers[i])
                 if "KNOWN" in flags:
                     j = np.full(count, partner[i])
-                    found = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
-                    best, chosen = found, j
+                    detected = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
+                    best, chosen = detected, j
                 else:
-                    found, best, chosen = search(
+                    detected, best, chosen = search(
                         flags, landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size
                     )
-                value = either(found + share, one[FALSE_POSITIVE])
-                lost |= np.isneginf(value)
+                value = either(detected + share, one[FALSE_POSITIVE])
+                impossible |= np.isneginf(value)
                 block += np.where(np.isneginf(value), 0, value)
                 if "PER_BEAM" in flags:
                     at = np.arange(part.start, part.stop) * features + i
                     parts[at] = value
                     which[at] = np.where(best + share >= one[FALSE_POSITIVE], chosen, -1)
             total = add_term(total, block)
-        log_p[part] = np.where(lost, -np.inf, temperature * (total[0] + total[1]))
+        log_p[part] = np.where(impossible, -np.inf, temperature * (total[0] + total[1]))

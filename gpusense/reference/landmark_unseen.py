@@ -1,4 +1,4 @@
-"""Negative information: landmarks that the sensor should see from a pose, and that no feature is."""
+"""Negative information: landmarks that the sensor should see from a pose, but that belong to no feature."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gpusense.reference.offsets import Quad, offset
 
 
 def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: np.floating, least: np.floating) -> np.ndarray:
-    """Whether landmarks are within range, and their angle to the sensor's axis has a cosine of at least ``least``."""
+    """Return whether landmarks are within range, with a cosine of the angle to the sensor's axis >= ``least``."""
     d = np.sqrt(off[0] * off[0] + off[2] * off[2])
     return (d <= range_max) & (cosine * off[0] + sine * off[2] >= least * d)
 
@@ -35,7 +35,7 @@ def count_unseen(
     least: np.floating,
     log_missed: np.floating,
 ) -> None:
-    """Add ``log_missed`` to log_p for every landmark in view that none of a particle's features is."""
+    """Add ``log_missed`` to log_p for every landmark in view that belongs to no feature."""
     block = max(BLOCK_PAIRS // max(int(start[rows * cols]), 1), 1)
     for begin in range(0, particles, block):
         part = slice(begin, min(begin + block, particles))
@@ -45,8 +45,8 @@ def count_unseen(
         low, high = bucket_at(place[2] - range_max, size, rows), bucket_at(place[2] + range_max, size, rows)
         first, last = int(start[low.min() * cols]), int(start[(high.max() + 1) * cols])
         for n in range(len(low)):
-            own = at_places(place, slice(n, n + 1))
-            seen = in_view(offset(landmark[first:last], own), cosine[n], sine[n], range_max, least)
+            sensor = at_places(place, slice(n, n + 1))
+            seen = in_view(offset(landmark[first:last], sensor), cosine[n], sine[n], range_max, least)
             at = (begin + n) * features
             taken = np.unique(which[at : at + features])
             taken = taken[(taken >= first) & (taken < last)] - first

@@ -3,12 +3,12 @@
     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
 
 d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
-is the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A
-part that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an
-error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
+Components that were not measured are left out. Positions, directions and quantities derived from them are sums of two
+numbers, since a relative error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
 
-A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
-(x, its low part, y, its low part), and so are an offset and a direction.
+A feature is FEATURE numbers, which are named below, in the same order in all three languages. A place is (x, its low
+part, y, its low part), and so are an offset and a direction.
 """
 
 from __future__ import annotations
@@ -16,23 +16,24 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
-from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
+from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum, where_pair
 from gpusense.reference.offsets import Quad, distance_pair
 
 # Range; cosine and sine of the bearing on the robot; signature.
 RANGE_AT, RANGE_LOW, COSINE, SINE, COSINE_LOW, SINE_LOW, SIGNATURE_AT, SIGNATURE_LOW = range(8)
-# 1 / (sigma sqrt 2), 0 for what was not measured; logs of z_detect and the components' peaks, of the false positive.
+# 1 / (sigma sqrt 2), 0 for components that were not measured; logs of z_detect and the components' peaks, of the false
+# positive.
 RANGE_SCALE, RANGE_SCALE_LOW, BEARING_SCALE, BEARING_SCALE_LOW, SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = range(8, 14)
 PEAK, PEAK_LOW, FALSE_POSITIVE = 14, 15, 16
 # From the bearing to the upper end of the field of view.
 UPPER, UPPER_LOW = 17, 18
-# Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, can matter; RADIUS is
-# negative where none can.
+# Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is not
+# negligible; RADIUS is negative where none has.
 REACH, RADIUS, HOLE = 19, 20, 21
-# What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
+# The sensor's limits for components that a feature does not measure: the distance, the cosine of the angle to the axis.
 FARTHEST, AXIS = 22, 23
-# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be;
-# and what squares of distances are off at most.
+# sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
+# density; and the largest error of squared distances.
 RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = 24, 25, 26, 27
 FEATURE = 28
 
@@ -51,36 +52,31 @@ ARCS = (
     (1.5707963267948966, 6.123233995736766e-17),
     (3.141592653589793, 1.2246467991473532e-16),
 )
-# Nearer than a micrometre every bearing is as likely.
+# Below this distance [m] all bearings are equally likely.
 ZERO_RANGE = 1e-6
 # arctan t = t + t^3 A(t^2), |t| <= 1 / 16, by its power series.
 ARC_POWERS = tuple((-1.0) ** (i + 1) / (2 * i + 3) for i in range(7))
 
 
-def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
-    """Of each pair of numbers the first or the second one."""
-    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
-
-
 def negative_where(when: np.ndarray, a: Pair) -> Pair:
-    """Pairs of numbers, some of them negated."""
+    """Negate pairs of numbers where ``when`` holds."""
     return where_pair(when, (-a[0], -a[1]), a)
 
 
 def at_places(quad: Quad, places: np.ndarray | slice) -> Quad:
-    """Some of many offsets, places or directions."""
+    """Select some of many offsets, places or directions."""
     return quad[0][places], quad[1][places], quad[2][places], quad[3][places]
 
 
 def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, size: np.floating) -> Quad:
-    """Sensors in metres from the origin of the buckets, whose side, a power of two, is ``size``."""
+    """Return the places of sensors in metres from the origin of the buckets; ``size`` is the side of a bucket."""
     x = two_sum(pose_cell[:, 0].astype(pose.dtype), pose[:, 0])
     y = two_sum(pose_cell[:, 1].astype(pose.dtype), pose[:, 1])
     return size * x[0], size * (x[1] + pose_low[:, 0]), size * y[0], size * (y[1] + pose_low[:, 1])
 
 
 def direction(pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray) -> Quad:
-    """Direction in the world in which a feature was seen: the heading, turned by the bearing."""
+    """Return the direction of a feature in the world: the heading, turned by the bearing."""
     (cosine, sine), (cosine_low, sine_low) = pose[:, 2:].T, pose_low[:, 2:].T
     c, s, c_low, s_low = feature[COSINE], feature[SINE], feature[COSINE_LOW], feature[SINE_LOW]
     cc, ss, cs, sc = (two_product(a, b) for a, b in ((cosine, c), (sine, s), (cosine, s), (sine, c)))
@@ -91,7 +87,7 @@ def direction(pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray) -> Qu
 
 
 def across(off: Quad, turned: Quad) -> Pair:
-    """Part of an offset to the left of a direction."""
+    """Return the component of an offset to the left of a direction."""
     right, left = two_product(turned[0], off[2]), two_product(turned[2], off[0])
     total = two_sum(right[0], -left[0])
     low = (turned[0] * off[3] + turned[1] * off[2]) - (turned[2] * off[1] + turned[3] * off[0])
@@ -99,15 +95,24 @@ def across(off: Quad, turned: Quad) -> Pair:
 
 
 def along(off: Quad, turned: Quad) -> Pair:
-    """Part of an offset along a direction."""
+    """Return the component of an offset along a direction."""
     x, y = two_product(turned[0], off[0]), two_product(turned[2], off[2])
     total = two_sum(x[0], y[0])
     low = (turned[0] * off[1] + turned[1] * off[0]) + (turned[2] * off[3] + turned[3] * off[2])
     return total[0], total[1] + ((x[1] + y[1]) + low)
 
 
+def arc_series(t: np.ndarray) -> np.ndarray:
+    """Return ``arctan t / t - 1`` for |t| <= 1 / 16 by its power series in t^2."""
+    real = t.dtype.type
+    square, series = t * t, real(0)
+    for power in ARC_POWERS[::-1]:
+        series = series * square + real(power)
+    return square * series
+
+
 def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
-    """Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series."""
+    """Return the angle of an offset in (-pi, pi]: the arc of the nearest slope i / 8, and a series for the rest."""
     real = arcs.dtype.type
     a, b = negative_where(np.signbit(ahead[0]), ahead), negative_where(np.signbit(side[0]), side)
     steep = b[0] > a[0]
@@ -122,28 +127,26 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     t = top[0] / bottom[0]
     back = two_product(t, bottom[0])
     t_low = (((top[0] - back[0]) - back[1]) + (top[1] - t * bottom_low)) / bottom[0]
-    square, series = t * t, real(0)
-    for power in ARC_POWERS[::-1]:
-        series = series * square + real(power)
     base = arcs[step.astype(np.int32)]
     total = two_sum(base[:, 0], t)
-    arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * (square * series))))
+    arc = two_sum(total[0], total[1] + (base[:, 1] + (t_low + t * arc_series(t))))
     for when, whole in ((steep, arcs[ARC_STEPS + 1]), (np.signbit(ahead[0]), arcs[ARC_STEPS + 2])):
         arc = where_pair(when, pair_sum((whole[0], whole[1]), (-arc[0], -arc[1])), arc)
     return negative_where(np.signbit(side[0]), arc)
 
 
 def range_mass(d: Pair, scale: np.floating, terms: np.ndarray) -> np.ndarray:
-    """Mass of the normal around d on [0, range_max]; that of range_max itself where d is beyond."""
+    """Return the mass of the normal around d on [0, range_max]; d is clamped to range_max."""
     above = np.maximum((terms[0] - d[0]) + (terms[1] - d[1]), 0)
     return d[0].dtype.type(0.5) * (erf(np.minimum(d[0], terms[0]) * scale) + erf(above * scale))
 
 
 def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: np.floating, terms: np.ndarray,
                arcs: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Mass of the normal around a landmark's bearing on the field of view; at its end where the landmark is beyond.
+    """Return the mass of the normal around a landmark's bearing on the field of view.
 
-    A part of the field more than half a turn away from the landmark is nearer the other way round.
+    The bearing is clamped to the ends of the field. Parts of the field more than half a turn away from the landmark are
+    nearer in the other direction.
     """
     half, whole = arcs[ARC_STEPS + 2, 0], 2 * arcs[ARC_STEPS + 2, 0]
     left = (upper - angle[0]) + (upper_low - angle[1])
@@ -158,10 +161,10 @@ def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: n
 
 
 def add_square(total: Pair, residual: Pair, scale: np.floating, scale_low: np.floating) -> Pair:
-    """An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel."""
+    """Add (residual * scale)^2 to an exponent, in two parts, since exponents and peaks may nearly cancel."""
     u = pair_product(residual, (np.asarray(scale), np.asarray(scale_low)))
     more = pair_sum(total, pair_product(u, u))
-    # What overflows has no low part.
+    # After an overflow there is no low part.
     return more[0], np.where(np.isfinite(more[1]), more[1], 0).astype(more[1].dtype)
 
 
@@ -174,7 +177,7 @@ def log_detection(
     terms: np.ndarray,
     arcs: np.ndarray,
 ) -> np.ndarray:
-    """``log(z_detect p(f | j))`` of one feature at each offset; signature is (s_j, low part, -log m_s, 0)."""
+    """Return ``log(z_detect p(f | j))`` of one feature at each offset; signature is (s_j, low part, -log m_s, 0)."""
     real = terms.dtype
     zero = np.zeros(len(off[0]), real)
     exponent, mass, norm = (zero, zero), np.ones(len(zero), real), zero
@@ -187,13 +190,13 @@ def log_detection(
     if "BEARING" in flags and feature[BEARING_SCALE] > 0:
         angle = angle_pair(across(off, turned), along(off, turned), arcs)
         squared = add_square(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW])
-        # At zero range the density is 1 / field, which is the peak over that.
-        there = d[0] > real.type(ZERO_RANGE)
-        exponent = where_pair(there, squared, exponent)
-        own = real.type(1)
+        # At zero range the density is 1 / field: the peak times terms[3] and the scale.
+        has_bearing = d[0] > real.type(ZERO_RANGE)
+        exponent = where_pair(has_bearing, squared, exponent)
+        mass_in_field = real.type(1)
         if "FIELD" in flags:
-            own = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
-        mass = mass * np.where(there, own, terms[3] * feature[BEARING_SCALE])
+            mass_in_field = field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs)
+        mass = mass * np.where(has_bearing, mass_in_field, terms[3] * feature[BEARING_SCALE])
     if "SIGNATURE" in flags and feature[SIGNATURE_SCALE] > 0:
         s = two_sum(feature[SIGNATURE_AT], -signature[:, 0])
         s = two_sum(s[0], s[1] + (feature[SIGNATURE_LOW] - signature[:, 1]))

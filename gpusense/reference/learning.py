@@ -1,9 +1,9 @@
 """Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
 
-``terms`` (12,) are the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN only
-fills up a block. p_hit has its mean at z* + range_bias, held within [0, range_max]; p_short's obstacles lie before z*.
-r are the responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances
-x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+``terms`` (12,) are the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is
+padding. The mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
+responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
+and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
 
     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
     Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
@@ -30,14 +30,14 @@ ROOT_2PI = math.sqrt(2 * math.pi)
 
 
 def hit_mean(expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Where p_hit has its mean."""
+    """Return the mean of p_hit."""
     return np.minimum(np.maximum(expected + terms[10], 0), terms[6])
 
 
 def responsibilities(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """log p(z | z*) and the responsibilities of hit, short and rand for it: 0 where the density is 0."""
+    """Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0."""
     hit, shorter = log_hit(flags, z, hit_mean(expected, terms), terms), log_short(z, expected, terms)
     largest = np.maximum(np.maximum(hit, shorter), terms[5])
     shift = np.where(np.isinf(largest), 0, largest)
@@ -47,12 +47,11 @@ def responsibilities(
 
 
 def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray) -> None:
-    """What pairs add to their sums, (S, pairs).
+    """Return the terms of pairs in the sums, (S, pairs).
 
     log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit (z - z*)^2,
-    r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with
-    y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2,
-    r_short s_l^2.
+    r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y =
+    (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
     """
     real = terms.dtype.type
     log_p, r_hit, r_short, r_rand = responsibilities(flags, z, expected, terms)
@@ -67,7 +66,7 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
     q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + p * t
     w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1
     hit = r_hit > 0
-    # A mean that is held does not move with the bias.
+    # A mean that is clamped does not move with the bias.
     moved = hit & (mean == expected + terms[10])
     h_s = np.where(hit, u * u - 1 + t, 0)
     h_m = np.where(moved, u + p, 0)
@@ -106,7 +105,7 @@ def e_step(
     along: int,
     width: int,
 ) -> None:
-    """Of each block its pairs' sums; a pair lies along farther than the last, from number block * across on."""
+    """Sum over blocks of pairs; pair k of a block is pair block * across + k * along."""
     count = 40 if "INFORMATION" in flags else 14
     total = (np.zeros((count, blocks), terms.dtype), np.zeros((count, blocks), terms.dtype))
     starts = np.arange(blocks) * across
@@ -130,9 +129,9 @@ def pair_causes(
     across: int,
     along: int,
 ) -> None:
-    """Of each pair log p and the responsibilities; NaN for what only fills up."""
+    """Write log p and the responsibilities of each pair, NaN for padding."""
     starts = np.arange(blocks) * across
     for k in range(readings):
         pairs = starts + k * along
-        found = np.stack(responsibilities(flags, reading[pairs], expected[pairs], terms), axis=-1)
-        causes[pairs] = np.where(np.isnan(reading[pairs])[:, None], np.nan, found)
+        stacked = np.stack(responsibilities(flags, reading[pairs], expected[pairs], terms), axis=-1)
+        causes[pairs] = np.where(np.isnan(reading[pairs])[:, None], np.nan, stacked)

@@ -1,6 +1,7 @@
 """Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed").
 
-For each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+The table has, for each cell and bin, the range from the cell's centre in the bin's direction, in units of limit / 65
+535.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells as the table has it, or limit where there is no obstacle nearer.
+    """Return the distance in cells from the table, limit where no obstacle is nearer.
 
     Args:
         flags: Flags of the signature table.
@@ -39,9 +40,9 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
     part = map_table[(at[1] * cols + at[0]) * bins + angle_bin(r.direction[:, active], bins)]
     far = t[active] + part.astype(pose.dtype) * (limit / pose.dtype.type(65535))
-    found[active] = np.where(part == 65535, limit, np.minimum(far, limit))
-    return found
+    ranges[active] = np.where(part == 65535, limit, np.minimum(far, limit))
+    return ranges

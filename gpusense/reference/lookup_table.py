@@ -21,7 +21,7 @@ def fill_lookup(
     count: int,
     limit: np.floating,
 ) -> None:
-    """A hit is 65 534 parts of the limit at most."""
+    """Fill rows of the table; a hit is at most 65 534, and 65 535 means no hit."""
     real = ray.dtype.type
     block = max(BLOCK // bins, 1)
     none = real(0)

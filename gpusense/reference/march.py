@@ -1,9 +1,9 @@
 """Expected range by marching through the distance field (sphere tracing).
 
-At each place the ray steps by the distance from the cell's centre to the nearest obstacle's centre, less slack, and by
-tolerance at least. With slack sqrt(2) no step passes an obstacle but the least one, so a range is too long by at most
-tolerance, and an obstacle is missed only where the ray's way through it is shorter than that. With slack 0 (what other
-programs do) a step may pass obstacles.
+Each step is the distance from the current cell's centre to the nearest obstacle's centre less slack, and at least
+tolerance. With slack sqrt(2) only steps of length tolerance may pass an obstacle: a range is too long by at most
+tolerance, and an obstacle is missed only where the ray's path through it is shorter than that. With slack 0, as in
+other programs, any step may pass obstacles.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to a place in an occupied cell, or limit where none is found nearer.
+    """Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
@@ -46,10 +46,10 @@ def cast_ray(
     real = pose.dtype.type
     r = make_ray(pose, ray)
     origin = cell.T.astype(np.int64)
-    found = np.full(len(cell), limit, pose.dtype)
+    ranges = np.full(len(cell), limit, pose.dtype)
     outside = off_grid(origin, rows, cols)
     if "OUTSIDE_OCCUPIED" in flags:
-        found[outside] = 0
+        ranges[outside] = 0
         t = np.where(outside, limit, real(0))
     else:
         t = start_walk(flags, r, cell, rows, cols, limit)[1]
@@ -60,12 +60,12 @@ def cast_ray(
         at = origin[:, active] + np.floor(place).astype(np.int64)
         off = off_grid(at, rows, cols)
         if "OUTSIDE_OCCUPIED" in flags:
-            found[active[off]] = t[active[off]]
+            ranges[active[off]] = t[active[off]]
         active, at = active[~off], at[:, ~off]
         distance = map_table[at[1] * cols + at[0]].astype(pose.dtype)
         hit = distance == 0
-        found[active[hit]] = t[active[hit]]
+        ranges[active[hit]] = t[active[hit]]
         active, distance = active[~hit], distance[~hit]
         t[active] += np.maximum(distance - slack, tolerance + t[active] * real(LEAST_STEP))
         active = active[t[active] < limit]
-    return found
+    return ranges

@@ -1,8 +1,8 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding took
-from terms 0 and 1). In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
-z_rand / range_max; in the log domain their logarithms.
+``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of
+terms 0 and 1). In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max;
+in the log domain they are the logarithms of these.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ SMALLEST_RANGE = 1e-37
 
 
 def hit_mass(expected: np.ndarray, erf_scale: np.floating, range_max: np.floating) -> np.ndarray:
-    """Mass of the normal around z* on [0, range_max]: a sum of positive terms, so nothing cancels."""
+    """Return the mass of the normal around z* on [0, range_max], a sum of positive terms, so nothing cancels."""
     half = expected.dtype.type(0.5)
     return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
 
@@ -25,10 +25,10 @@ def hit_mass(expected: np.ndarray, erf_scale: np.floating, range_max: np.floatin
 def hit_exponent(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``(z - z*)^2 / (2 sigma^2)`` as a sum of two numbers.
+    """Return ``(z - z*)^2 / (2 sigma^2)`` as a sum of two numbers.
 
-    Where the density's peak is high, exponent and log peak are large and nearly cancel, and the second part keeps the
-    digits that are left.
+    Where the density's peak is high, exponent and log peak are large and nearly cancel; the second part keeps the
+    digits that remain.
     """
     off = z - expected
     if "SHARP" not in flags:
@@ -39,21 +39,21 @@ def hit_exponent(
 
 
 def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Terms of the log domain: log of ``z_hit p_hit(z | z*)``."""
+    """Return ``log(z_hit p_hit(z | z*))``; terms are those of the log domain."""
     exponent = hit_exponent(flags, z, expected, terms)
     log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
     return log_p - np.log(hit_mass(expected, terms[2], terms[6]))
 
 
 def short_factor(x: np.ndarray) -> np.ndarray:
-    """``x / (1 - exp(-x))`` for x >= 0 as h / tanh(h) + h with h = x / 2."""
+    """Return ``x / (1 - exp(-x))`` for x >= 0 as h / tanh(h) + h with h = x / 2."""
     h = x.dtype.type(0.5) * x
     safe = np.where(h > TINY, h, 1)
     return np.where(h > TINY, safe / np.tanh(safe) + h, x.dtype.type(1))
 
 
 def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Terms of the log domain: log of ``z_short p_short(z | z*)``."""
+    """Return ``log(z_short p_short(z | z*))``; terms are those of the log domain."""
     inside = (z <= expected) & (expected > 0)
     x = terms[4] * expected
     log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
@@ -61,16 +61,24 @@ def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndar
 
 
 def short_peak(decay: np.floating, expected: np.ndarray) -> np.ndarray:
-    """``lambda / (1 - exp(-2 h))`` as lambda (1 + t) / (2 t) with h = lambda z* / 2 and t = tanh(h); 1 / z* at 0."""
+    """Return ``lambda / (1 - exp(-2 h))`` as lambda (1 + t) / (2 t), h = lambda z* / 2 and t = tanh(h); 1 / z* at 0."""
     h = expected.dtype.type(0.5) * (decay * expected)
     t = np.tanh(np.where(h > TINY, h, 1))
     return np.where(h > TINY, decay * (1 + t), 1) / np.where(h > TINY, 2 * t, np.maximum(expected, SMALLEST_RANGE))
 
 
 def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
+    """Return log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
-        return _linear(flags, z, expected, terms)
+        # p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is enough.
+        p = np.zeros(z.shape, terms.dtype)
+        if "HIT" in flags:
+            exponent = hit_exponent(flags, z, expected, terms)
+            p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
+        if "SHORT" in flags:
+            density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
+            p += np.where((z <= expected) & (expected > 0), density, 0)
+        return np.log(p + terms[5])
     parts = []
     if "HIT" in flags:
         parts.append(log_hit(flags, z, expected, terms))
@@ -81,14 +89,3 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
     if len(parts) == 1:
         return parts[0].astype(terms.dtype)
     return np.logaddexp.reduce(parts, axis=0).astype(terms.dtype)
-
-
-def _linear(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    p = np.zeros(z.shape, terms.dtype)
-    if "HIT" in flags:
-        exponent = hit_exponent(flags, z, expected, terms)
-        p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
-    if "SHORT" in flags:
-        density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
-        p += np.where((z <= expected) & (expected > 0), density, 0)
-    return np.log(p + terms[5])

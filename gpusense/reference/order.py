@@ -1,6 +1,6 @@
-"""An order of particles in which neighbours have much the same position and heading.
+"""An order of particles in which neighbours have similar positions and headings.
 
-Their rays meet the same cells then, and none waits long for another on a GPU. Which order it is changes no result.
+Their rays then meet the same cells, and on a GPU none waits long for another. The order changes no result.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from gpusense.reference.ray import turn_of
 
-# Samples of the particles; bins of rows, of columns and of headings; work-items that count starts; parts of a turn.
+# Sampled particles; bins per axis (rows, columns, headings); bins per work-item of order_starts; units of a turn.
 SAMPLES = 256
 BINS = 32
 ALL_BINS = BINS**3
@@ -18,7 +18,7 @@ TURN = 65536
 
 
 def relative_turn(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Headings of (M, 4) poses relative to another's, from -TURN / 2 to TURN / 2."""
+    """Return headings of (M, 4) poses relative to that of another, from -TURN / 2 to TURN / 2."""
     cos, sin = pose[:, 2], pose[:, 3]
     turn = turn_of(np.stack([cos * other[2] + sin * other[3], sin * other[2] - cos * other[3]]))
     whole = (turn * pose.dtype.type(TURN)).astype(np.int64)
@@ -28,18 +28,18 @@ def relative_turn(pose: np.ndarray, other: np.ndarray) -> np.ndarray:
 def order_bounds(
     flags: frozenset[str], pose_cell: np.ndarray, pose: np.ndarray, bounds: np.ndarray, bins: np.ndarray, particles: int
 ) -> None:
-    """Empty the bins; bounds become the largest of minus the smallest and the largest row, column and heading."""
+    """Clear the bins; bounds become the negated smallest and the largest row, column and heading."""
     bins[:ALL_BINS] = 0
-    some = np.arange(SAMPLES) * particles // SAMPLES
-    turn = relative_turn(pose[some], pose[0])
-    for i, value in enumerate((pose_cell[some, 1], pose_cell[some, 0], turn)):
+    sample = np.arange(SAMPLES) * particles // SAMPLES
+    turn = relative_turn(pose[sample], pose[0])
+    for i, value in enumerate((pose_cell[sample, 1], pose_cell[sample, 0], turn)):
         bounds[2 * i] = max(bounds[2 * i], -value.min())
         bounds[2 * i + 1] = max(bounds[2 * i + 1], value.max())
     bounds[6] = 0
 
 
 def part_of(value: np.ndarray, least: int, most: int, real: np.dtype) -> np.ndarray:
-    """Which of BINS equal parts of the bounds; what is beyond them belongs to the outermost."""
+    """Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost."""
     part = (value.astype(real) - real.type(least)) * (real.type(BINS) / (real.type(most) - real.type(least) + 1))
     return np.clip(part.astype(np.int64), 0, BINS - 1)
 
@@ -53,7 +53,7 @@ def order_count(
     bin_of: np.ndarray,
     particles: int,
 ) -> None:
-    """The bin of each particle, which counts it."""
+    """Find the bin of each particle, and count it there."""
     turn = relative_turn(pose[:particles], pose[0])
     values = (pose_cell[:particles, 1], pose_cell[:particles, 0], turn)
     row, col, way = (
@@ -64,12 +64,12 @@ def order_count(
 
 
 def order_starts(flags: frozenset[str], bounds: np.ndarray, bins: np.ndarray) -> None:
-    """From how many particles each bin has to where they begin."""
+    """Replace the counts of bins by the indices at which they begin."""
     counts = bins[:ALL_BINS].copy()
     bins[:ALL_BINS] = np.cumsum(counts) - counts
     bounds[6] = counts.sum()
 
 
 def order_fill(flags: frozenset[str], bin_of: np.ndarray, bins: np.ndarray, order: np.ndarray, particles: int) -> None:
-    """Each particle takes the next place of its bin."""
+    """Put each particle at the next index of its bin."""
     order[:particles] = np.argsort(bin_of[:particles], kind="stable")

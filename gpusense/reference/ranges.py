@@ -14,7 +14,7 @@ CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LO
 
 
 def caster_of(flags: frozenset[str]) -> ModuleType:
-    """The module whose ``cast_ray`` a set of flags means."""
+    """Return the module of the caster of a set of flags."""
     return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
 
 
@@ -36,16 +36,16 @@ def cast_ranges(
     resolution: np.floating,
     range_max: np.floating,
 ) -> None:
-    """The expected ranges of all particles and rays."""
+    """Cast all rays of all particles."""
     cast_ray = caster_of(flags).cast_ray
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
-        some = slice(first, min(first + block, particles))
-        count = some.stop - first
-        lanes = (np.repeat(pose_cell[some], rays, axis=0), np.repeat(pose[some], rays, axis=0))
+        part = slice(first, min(first + block, particles))
+        count = part.stop - first
+        lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
         beams = np.tile(ray[:rays], (count, 1))
         t = cast_ray(flags, map_table, rows, cols, *lanes, beams, limit, bins, slack, tolerance)
-        ranges[first * rays : some.stop * rays] = expected_range(t, limit, resolution, range_max)
+        ranges[first * rays : part.stop * rays] = expected_range(t, limit, resolution, range_max)
 
 
 def cast_tiles(
@@ -68,7 +68,7 @@ def cast_tiles(
     range_max: np.floating,
     spread: int,
 ) -> None:
-    """The same, which GPUs do in tiles of particles and rays."""
+    """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
     cast_ranges(
         flags, map_table, pose_cell, pose, ray, ranges, rows, cols, particles, rays, bins, slack, tolerance, limit,
         resolution, range_max,

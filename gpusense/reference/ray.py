@@ -1,7 +1,7 @@
 """A ray on the grid and the walk along it, which all casters share.
 
-Crossing distances are ``(k + a) * inv`` with an integer count k of boundaries, never accumulated. Every operation is
-rounded as on the devices, so float32 ranges are theirs to the bit.
+Distances of boundaries are ``(k + a) * inv`` with an integer count k of boundaries; they are never accumulated. Every
+operation is rounded as on devices, so float32 ranges have the same bits.
 """
 
 from __future__ import annotations
@@ -29,8 +29,14 @@ class Ray:
     a: np.ndarray
 
 
+def off_grid(at: np.ndarray, rows: int, cols: int) -> np.ndarray:
+    """Return whether cells, (2, M) columns and rows, lie outside the grid."""
+    col, row = at
+    return (col < 0) | (col >= cols) | (row < 0) | (row >= rows)
+
+
 def ray_direction(pose: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit direction in the grid's frame: pose (..., 4) = (frac x, frac y, cos, sin) turned by ray (..., 2)."""
+    """Return unit directions in the grid's frame: pose (..., 4) = (frac x, frac y, cos, sin) turned by ray (..., 2)."""
     cos, sin = pose[..., 2], pose[..., 3]
     dx = cos * ray[..., 0] - sin * ray[..., 1]
     dy = sin * ray[..., 0] + cos * ray[..., 1]
@@ -39,7 +45,7 @@ def ray_direction(pose: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def make_ray(pose: np.ndarray, ray: np.ndarray) -> Ray:
-    """Rays of (M, 4) poses and (M, 2) beams."""
+    """Make the rays of (M, 4) poses and (M, 2) beams."""
     direction = np.stack(ray_direction(pose, ray))
     ahead = direction >= 0
     speed = np.abs(direction)
@@ -48,27 +54,21 @@ def make_ray(pose: np.ndarray, ray: np.ndarray) -> Ray:
 
 
 def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, until: np.ndarray | bool) -> np.ndarray:
-    """Number of boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
+    """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t.
 
-    Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
+    The coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
     """
     k = np.maximum(np.rint(t * speed - a), 0)
     here = (k + a) * inv
     return k + np.where(until, here <= t, here < t)
 
 
-def off_grid(at: np.ndarray, rows: int, cols: int) -> np.ndarray:
-    """Whether cells, (2, M) columns and rows, are none of the grid's."""
-    col, row = at
-    return (col < 0) | (col >= cols) | (row < 0) | (row >= rows)
-
-
 def start_walk(
     flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
+    """Return boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
 
-    The distance is limit where a ray from outside meets the grid no nearer.
+    The distance is limit where a ray from outside does not meet the grid before limit.
     """
     real = r.direction.dtype
     k, t = np.zeros(r.direction.shape, real), np.zeros(len(cell), real)
@@ -94,7 +94,7 @@ def start_walk(
 def start_casts(
     flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where all rays' walks start, and what is known of their ranges before a cell is read.
+    """Return the start of all walks, and the ranges that are known before any cell is read.
 
     Returns:
         Cells of the origins (2, M); boundaries crossed (2, M) and distances (M,) as of ``start_walk``; ranges found so
@@ -103,16 +103,16 @@ def start_casts(
     """
     origin = cell.T.astype(np.int64)
     k, t = start_walk(flags, r, cell, rows, cols, limit)
-    found = np.full(len(cell), limit, t.dtype)
+    ranges = np.full(len(cell), limit, t.dtype)
     if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
         outside = off_grid(origin, rows, cols)
-        found[outside] = 0
-        return origin, k, t, found, np.flatnonzero(~outside)
-    return origin, k, t, found, np.flatnonzero(t < limit)
+        ranges[outside] = 0
+        return origin, k, t, ranges, np.flatnonzero(~outside)
+    return origin, k, t, ranges, np.flatnonzero(t < limit)
 
 
 def turn_of(direction: np.ndarray) -> np.ndarray:
-    """(2, M) directions as parts of a full turn in [0, 1], to 2e-6."""
+    """Return (2, M) directions as parts of a full turn in [0, 1], within 2e-6."""
     real = direction.dtype.type
     x, y = np.abs(direction)
     a = np.where(x > y, y / x, x / y)
@@ -125,12 +125,12 @@ def turn_of(direction: np.ndarray) -> np.ndarray:
 
 
 def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
-    """Angle bins whose centres are nearest; centres are at 0, 1 / bins, ... of a turn."""
+    """Return the angle bins with the nearest centres; centres are at 0, 1 / bins, ... of a turn."""
     real = direction.dtype.type
-    found = (turn_of(direction) * real(bins) + real(0.5)).astype(np.int64)
-    return np.where(found >= bins, found - bins, found)
+    index = (turn_of(direction) * real(bins) + real(0.5)).astype(np.int64)
+    return np.where(index >= bins, index - bins, index)
 
 
 def expected_range(t: np.ndarray, limit: np.floating, resolution: np.floating, range_max: np.floating) -> np.ndarray:
-    """Metres from cells: exactly range_max where nothing is nearer."""
+    """Convert a distance in cells to metres, exactly range_max where nothing is nearer."""
     return np.where(t >= limit, range_max, np.minimum(t * resolution, range_max))

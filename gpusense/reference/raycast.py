@@ -1,7 +1,7 @@
-"""Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
+"""Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3).
 
-An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step in
-x first.
+It is an Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it
+steps in x first.
 """
 
 from __future__ import annotations
@@ -9,11 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.ray import crossed, make_ray, start_casts
-from gpusense.reference.rectangles import OCCUPIED
+from gpusense.reference.rectangles import OCCUPIED, padded
 
 
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
-    """Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps."""
+    """Return the sector of a direction within its quadrant, from flat to steep.
+
+    A wrong sector would cost steps, not change the result.
+    """
     if sectors == 1:
         return np.zeros(len(speed_x), np.intp)
     steep = speed_y > speed_x
@@ -36,7 +39,7 @@ def cast_ray(
     slack: np.floating,
     tolerance: np.floating,
 ) -> np.ndarray:
-    """Distance in cells to the first occupied cell, or limit where there is none nearer.
+    """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
@@ -52,18 +55,18 @@ def cast_ray(
         tolerance: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, found, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
     quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
     sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
     plane = quadrant * sectors + sector_of(sectors, *r.speed)
-    table = plane * ((rows + 2) * (cols + 2)) + (cols + 3)
+    table = plane * ((rows + 2) * (cols + 2))
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        sides = map_table[table[active] + at[1] * (cols + 2) + at[0]]
+        sides = map_table[table[active] + padded(at[1], at[0], cols)]
         stopped = sides <= OCCUPIED
         if stopped.any():
             hit = stopped if "OUTSIDE_OCCUPIED" in flags else sides == OCCUPIED
-            found[active[hit]] = t[active[hit]]
+            ranges[active[hit]] = t[active[hit]]
             active, sides = active[~stopped], sides[~stopped]
         speed, a, inv = r.speed[:, active], r.a[:, active], r.inv[:, active]
         far = k[:, active] + (np.stack([sides & 255, sides >> 8]).astype(pose.dtype) - 1)
@@ -71,11 +74,11 @@ def cast_ray(
         by_x = t_x <= t_y
         now = np.where(by_x, t_x, t_y)
         other = by_x.astype(np.intp)
-        own, lane = 1 - other, np.arange(len(active))
-        aside = crossed(now, speed[other, lane], a[other, lane], inv[other, lane], ~by_x)
-        far[own, lane] += 1
-        far[other, lane] = aside
+        axis, index = 1 - other, np.arange(len(active))
+        aside = crossed(now, speed[other, index], a[other, index], inv[other, index], ~by_x)
+        far[axis, index] += 1
+        far[other, index] = aside
         k[:, active] = far
         t[active] = now
         active = active[now < limit]
-    return found
+    return ranges

@@ -1,13 +1,13 @@
 """Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells there.
 
 The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one
-step without missing an obstacle; it is the one that the ray in the middle of the sector stays in longest. After
+step without missing an obstacle; it is the one in which the ray in the middle of the sector stays longest. After
 anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares. Planes are padded by a ring of
-zeros; quadrant q grows to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from
+zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from
 flat to steep.
 
-Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
-only cells whose rectangles can hold one of these are. Occupied cells are known of a band of rows from row first on.
+Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
+whose rectangles can contain one of these are computed. The input has a band of rows, from row first on.
 """
 
 from __future__ import annotations
@@ -19,38 +19,43 @@ import numpy as np
 from gpusense.reference.bits import cells_left, cells_right, unpacked
 
 LONGEST = 255
-# Of a cell that is no rectangle's; the ring has 0.
+# The entry of an occupied cell; the ring has 0.
 OCCUPIED = 1
 RECTANGLE_REACH = 254
 STACK = 256
 
 
+def padded(row: np.ndarray, col: np.ndarray, cols: int) -> np.ndarray:
+    """Return the index of a cell in a padded plane."""
+    return (row + 1) * (cols + 2) + col + 1
+
+
 def reach_begin(way: int, low: int) -> int:
-    """First of the cells whose rectangles, growing that way, can hold the cell low or one beyond it."""
+    """Return the first cell whose rectangle, extending that way, can contain the cell low or one beyond it."""
     return max(low - RECTANGLE_REACH, 0) if way > 0 else low
 
 
 def reach_end(way: int, high: int, size: int) -> int:
-    """One beyond the last of the cells whose rectangles, growing that way, can hold one before the cell high."""
+    """Return one beyond the last cell whose rectangle, extending that way, can contain one before the cell high."""
     return high if way > 0 else min(high + RECTANGLE_REACH, size)
 
 
 def reached(way: int, part: slice, size: int) -> slice:
-    """What the rectangles of a part can hold, growing that way."""
+    """Return the cells that rectangles of a part can contain, extending that way."""
     if way > 0:
         return slice(part.start, min(part.stop + RECTANGLE_REACH, size))
     return slice(max(part.start - RECTANGLE_REACH, 0), part.stop)
 
 
 def slope(sectors: int, sector: int) -> tuple[int, int]:
-    """Height and width in the proportion of the ray in the middle of a sector."""
+    """Return height and width in the proportion of the ray in the middle of a sector."""
     return {1: [(1, 1)], 2: [(5, 12), (12, 5)], 4: [(1, 5), (2, 3), (3, 2), (5, 1)]}[sectors][sector]
 
 
 def free_columns(
     flags: frozenset[str], occupied: np.ndarray, runs: np.ndarray, band: int, cols: int, begin: int, end: int
 ) -> None:
-    """Free cells of the band in the column, to larger (first plane) or smaller rows, at columns from begin to end."""
+    """Count the free cells along columns of the band, to larger rows (first plane) or smaller rows (second plane)."""
     cells = occupied[: band * cols].reshape(band, cols)[:, begin:end].astype(bool)
     up, down = _runs(np.ascontiguousarray(cells.T))
     out = runs[: 2 * band * cols].reshape(2, band, cols)
@@ -58,14 +63,14 @@ def free_columns(
 
 
 def _runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Free cells to the right and to the left in rows of bool."""
+    """Count the free cells to the right and to the left in rows of bool."""
     room = np.arange(1, cells.shape[1] + 1, dtype=np.int32)
     right, left = np.minimum(cells_right(cells), room[::-1]), np.minimum(cells_left(cells), room)
     return np.minimum(right, LONGEST), np.minimum(left, LONGEST)
 
 
 def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
-    """The rectangles of a quadrant and sector that begin at each number of rows of runs and grow to the right.
+    """Find the rectangles of a quadrant and sector that begin at each cell of rows of runs and extend to the right.
 
     Args:
         runs: (lines, length) free cells across the lines, at most LONGEST.
@@ -98,7 +103,7 @@ def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
 def _quadrants(
     rectangles: np.ndarray, rows: int, cols: int, sectors: int, top: int, left: int, bottom: int, right: int
 ) -> Iterator[tuple[int, tuple[int, int], tuple[slice, slice], np.ndarray]]:
-    """For each quadrant its ways along x and y, the rows and columns that a change reaches, and their planes."""
+    """Yield quadrants, with directions along x and y, the rows and columns that a change reaches, and planes."""
     planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
     for quadrant in range(4):
         dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
@@ -123,7 +128,7 @@ def rectangles_rows(
     bottom: int,
     right: int,
 ) -> None:
-    """From free cells in columns: along the rows the widest rectangles of enough height."""
+    """Find the widest rectangles of sufficient height along rows, from free cells in columns."""
     free = runs[: 2 * band * cols].reshape(2, band, cols)
     for quadrant, (dx, _), (row, col), planes in _quadrants(rectangles, rows, cols, sectors, top, left, bottom, right):
         seen = reached(dx, col, cols)
@@ -138,7 +143,7 @@ def rectangles_rows(
 def free_rows(
     flags: frozenset[str], bits: np.ndarray, runs: np.ndarray, band: int, cols: int, words: int, begin: int, end: int
 ) -> None:
-    """Free cells of the row, to the right (first plane) or left (second plane), at columns from begin to end."""
+    """Count the free cells along rows, to the right (first plane) and to the left (second plane)."""
     out = runs[: 2 * band * cols].reshape(2, band, cols)
     for direction, run in enumerate(_runs(unpacked(bits, band, cols, words))):
         out[direction, :, begin:end] = run[:, begin:end]
@@ -158,7 +163,7 @@ def rectangles_scan(
     bottom: int,
     right: int,
 ) -> None:
-    """From free cells in rows: along the columns the highest rectangles of enough width."""
+    """Find the highest rectangles of sufficient width along columns, from free cells in rows."""
     free = runs[: 2 * band * cols].reshape(2, band, cols)
     for quadrant, (_, dy), (row, col), planes in _quadrants(rectangles, rows, cols, sectors, top, left, bottom, right):
         seen = reached(dy, row, rows)

@@ -1,36 +1,39 @@
 """Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded.
 
-What is left of a large coordinate or of many turns is small, and small numbers keep their digits in any precision.
+The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any precision.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.error_free import Pair, pair_sum, two_sum
+from gpusense.reference.error_free import Pair, pair_sum, two_sum, where_pair
 from gpusense.reference.heading import LIMIT, QUARTER, QUARTER_LOW, cos_sin, reduce_huge, reduce_ordinary
 
-# Farther off than this is as good as here; squares of it are finite in float32.
+# Coordinates are clamped to this; its square is finite in float32.
 FARTHEST = float(1 << 60)
 
 
-def where_pair(when: np.ndarray, a: Pair, b: Pair) -> Pair:
-    """Of each pair of numbers the first or the second one."""
-    return np.where(when, a[0], b[0]), np.where(when, a[1], b[1])
-
-
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:
-    """``theta - target`` in [-pi, pi]; the target is in there already."""
+    """Return ``theta - target`` in [-pi, pi]; the target is in that interval."""
     huge = np.abs(theta) > LIMIT
     quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
     if huge.any():
         quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])
-    # Up to three quarters are exact: the last bits of one are 0.
+    # Up to three quarters are exact: the last bits of QUARTER are 0.
     quarters = quadrant.astype(np.float64)
     angle = pair_sum((quarters * QUARTER, quarters * QUARTER_LOW), rest)
     angle = pair_sum(angle, (-np.asarray(target[0]), -np.asarray(target[1])))
     turns = np.where(angle[0] > 2 * QUARTER, -4.0, np.where(angle[0] < -2 * QUARTER, 4.0, 0.0))
     return pair_sum(angle, (turns * QUARTER, turns * QUARTER_LOW))
+
+
+def rounded_place(at: Pair, real: np.dtype) -> Pair:
+    """Round coordinates to sums of two numbers in the model's precision."""
+    high = np.fmin(np.fmax(at[0], -FARTHEST), FARTHEST)
+    low = np.where(high == at[0], at[1], 0.0)
+    rounded = high.astype(real)
+    return rounded, ((high - rounded.astype(np.float64)) + low).astype(real)
 
 
 def place_relative(
@@ -44,26 +47,23 @@ def place_relative(
     mount_y: float,
     particles: int,
 ) -> None:
-    """Places of sensors relative to an origin: x, its low part, y, its low part.
+    """Place sensors relative to an origin: x, its low part, y, its low part.
 
-    ``verdict``, which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
+    ``verdict``, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
     """
-    given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
-    finite: np.ndarray = np.asarray(np.isfinite(given).all(axis=1))
+    all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
+    finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():
         verdict[0] = 1
-    x_y = two_sum(given[:, :2], -np.array([origin_x, origin_y]))
+    x_y = two_sum(all_poses[:, :2], -np.array([origin_x, origin_y]))
     if (mount_x, mount_y) != (0.0, 0.0):
-        cos, sin = cos_sin(np.ascontiguousarray(given[:, 2]))
+        cos, sin = cos_sin(np.ascontiguousarray(all_poses[:, 2]))
         arm = np.stack([cos * mount_x - sin * mount_y, sin * mount_x + cos * mount_y], axis=1)
         moved = two_sum(x_y[0], arm)
         near = (np.abs(x_y[0]) <= FARTHEST).all(axis=1, keepdims=True)
         x_y = where_pair(near, two_sum(moved[0], moved[1] + x_y[1]), x_y)
-    near = finite[:, np.newaxis] & (np.abs(x_y[0]) <= FARTHEST)
-    high = np.where(finite[:, None], np.fmin(np.fmax(x_y[0], -FARTHEST), FARTHEST), 0.0)
-    low = np.where(near, x_y[1], 0.0)
-    place[:particles, 0::2] = high
-    place[:particles, 1::2] = (high - place[:particles, 0::2].astype(np.float64)) + low
+    x_y = where_pair(finite[:, np.newaxis], x_y, (np.zeros_like(x_y[0]), np.zeros_like(x_y[0])))
+    place[:particles, 0::2], place[:particles, 1::2] = rounded_place(x_y, place.dtype)
 
 
 def wrap_headings(
@@ -75,11 +75,11 @@ def wrap_headings(
     target_low: float,
     particles: int,
 ) -> None:
-    """Headings minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict as for places."""
-    given = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
-    finite: np.ndarray = np.asarray(np.isfinite(given).all(axis=1))
+    """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers; verdict as for places."""
+    all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
+    finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():
         verdict[0] = 1
-    high, low = wrapped_difference(np.where(finite, given[:, 2], 0.0), (target, target_low))
+    high, low = wrapped_difference(np.where(finite, all_poses[:, 2], 0.0), (target, target_low))
     residual[:particles, 0] = high
     residual[:particles, 1] = (high - residual[:particles, 0].astype(np.float64)) + low

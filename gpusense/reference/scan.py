@@ -1,8 +1,8 @@
-"""Poses and readings that are on the device.
+"""Placement of poses and readings that lie on the device.
 
-Which readings count and where they go is as ``gpusense.models.scan.readings`` finds it on the host.
-Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
-is left at the end are missing readings (nan), which add nothing.
+Readings are selected and placed as ``gpusense.models.scan.classed`` does it on the host. Readings without information
+are left out and the others move up, so that sums over blocks of readings have the same bits. The places that remain at
+the end get missing readings (nan), which add nothing.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.reference.placement import place_poses
 
-# What max readings are: left out, in the constant, or evaluated like others.
+# Max readings are left out, part of the constant term, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
 
 
@@ -70,11 +70,11 @@ def place_reading(
     value[used & far & (max_readings == MAX_PLACED)] = np.inf
     column = np.arange(beams) if "ALL_READINGS" in flags else np.flatnonzero(~np.isnan(value))
     count = len(column)
-    own = vector[: 2 * each * beams].reshape(beams, each, 2)[column]
+    vectors = vector[: 2 * each * beams].reshape(beams, each, 2)[column]
     if "END_POINTS" in flags:
         cells = value[column] / resolution
         length = np.where(np.isfinite(cells), cells, 0.0)
-        exact = own[:, 0] * length[:, None]
+        exact = vectors[:, 0] * length[:, None]
         point[:count] = exact
         point_low[:count] = exact - point[:count]
         point[:count][~np.isfinite(cells)] = cells[~np.isfinite(cells), None]
@@ -84,7 +84,7 @@ def place_reading(
             longest = np.max(length[first : first + BLOCK_TERMS], initial=0.0)
             guard[block] = guard_scale * (longest + 2)
     else:
-        point[: count * each] = own.reshape(-1, 2)
+        point[: count * each] = vectors.reshape(-1, 2)
         point[count * each : places * each] = (1, 0)
         rounded = value[column].astype(reading.dtype)
         reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, top))

@@ -1,4 +1,4 @@
-"""Several scans of one launch, each with particles of its own, which lie one after the other."""
+"""Several scans of one launch; the particles of each scan are contiguous."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 
 def particles_of_scans(particles: int, per_scan: int, ahead: int = 0) -> Iterator[tuple[int, slice]]:
-    """The number of each scan and its particles, of a launch that has some of all scans' particles.
+    """Yield the index of each scan and its particles, of a launch that has a part of all particles.
 
     Args:
         particles: Particles of the launch.

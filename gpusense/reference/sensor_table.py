@@ -1,7 +1,7 @@
-"""The density of one reading from a table of log p over bins of readings and expected ranges, instead of a formula.
+"""Density of one reading from a table of log p over bins of readings and expected ranges.
 
-Row i is a bin of readings, the last row for max readings (log probabilities); column j a bin of expected ranges, the
-last column for rays without an obstacle.
+Row i is a bin of readings; the last row is for max readings (log probabilities). Column j is a bin of expected ranges;
+the last column is for rays without an obstacle.
 """
 
 from __future__ import annotations

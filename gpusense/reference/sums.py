@@ -1,4 +1,4 @@
-"""Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings."""
+"""Sums of the terms of readings, or of blocks of readings, in the order of the readings."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def sum_parts(
     to a compensated total. Of several scans each has a count of its own, with STRANDED of readings, whose strands are
     added; what lies beyond it counts as 0, which changes no sum.
     """
-    places, own = np.arange(particles) * across, order[:particles] if "ORDERED" in flags else np.arange(particles)
-    counted, lead = np.full(particles, count), np.full(particles, fixed, parts.dtype)
+    places, particle = np.arange(particles) * across, order[:particles] if "ORDERED" in flags else np.arange(particles)
+    counted, constant_term = np.full(particles, count), np.full(particles, fixed, parts.dtype)
     if "SCANS" in flags:
-        counted, lead = counts[own // per_scan], fixed_of[own // per_scan]
+        counted, constant_term = counts[particle // per_scan], fixed_of[particle // per_scan]
         counted = strands_in(counted) if "STRANDED" in flags else counted
-    total = (lead, np.zeros(particles, parts.dtype))
+    total = (constant_term, np.zeros(particles, parts.dtype))
     k = np.arange(count)
     term = np.where(k < counted[:, None], parts[places[:, None] + k * along], parts.dtype.type(0))
     for part in (term if block == 1 else strand_sums(term)).T:
         total = add_term(total, part)
     scan = total[0] + total[1]
     scan = np.log(scan) if "CUBES" in flags else scan
-    found = temperature * scan
+    log_sum = temperature * scan
     if "CUBES" not in flags:
-        found = np.where(np.isinf(total[0]), total[0], found)
-    log_p[own] = found
+        log_sum = np.where(np.isinf(total[0]), total[0], log_sum)
+    log_p[particle] = log_sum

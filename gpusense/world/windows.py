@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpusense.world.frames import Mount
+from gpusense.world.frames import Cells, Mount
 from gpusense.world.grid import OccupancyGrid
 
 # Poses that enclose others.
@@ -68,6 +68,9 @@ class Region:
         return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
 
 
+Window = Region
+
+
 def box(cells: np.ndarray) -> Region | None:
     """The smallest window of all that is True in a (H, W) array; None where nothing is."""
     rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
@@ -82,7 +85,7 @@ def whole(grid: OccupancyGrid) -> Region:
     return Region(0, 0, *grid.shape)
 
 
-def extent(grid: OccupancyGrid, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
+def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
     """Least and largest column and row, in cells, that a sensor of poses within these corners can have.
 
     A call has four corners: numbers of Python's are faster than arrays of four.

@@ -1,18 +1,18 @@
-// Densities of sensors that know where they are: a position in the plane, and a heading.
-// A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
-// its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
-// von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
-// Directional Statistics (2000), section 3.5. With z_rand a reading may be anything (RAND): that is a uniform density.
+// Densities of sensors that know where they are: a position in the plane, and a heading. A position is normal around
+// the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed up to sigma = 1.5 by its largest
+// terms, beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2). Or a
+// heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and
+// Jupp, Directional Statistics (2000), section 3.5. z_rand is the weight of a uniform density (RAND).
 // requires: error_free log_terms
 
-// How a heading is distributed: sums of normals, their Fourier series, von Mises.
+// Distributions of a heading: sum of normals, its Fourier series, von Mises.
 #define NEARBY 0
 #define SERIES 1
 #define VON_MISES 2
 #define WRAPS 3
 #define WAVES 6
-// A heading's numbers: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part,
-// 2 pi / sigma^2, and from WAVE on 2 q^(n n).
+// Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
+// sigma^2, and from WAVE on 2 q^(n n).
 #define SCALE 0
 #define SCALE_LOW 1
 #define PEAK 2
@@ -20,7 +20,7 @@
 #define RANDOM 4
 #define DECAY 5
 #define WAVE 6
-// exp of minus this is below half an eps.
+// exp(-NEGLIGIBLE) is below half an eps.
 #define NEGLIGIBLE 40
 #define HALF_TURN ((real)3.141592653589793)
 #define HALF_TURN_LOW ((real)(FLOAT64 ? 0.0 : -8.742277657347586e-08))
@@ -31,7 +31,7 @@ constant real SINE[10] = {
     (real)-8.22063524662433e-18, (real)1.9572941063391263e-20,
 };
 
-// sin(r / 2) of an angle in [-pi, pi].
+// Return sin(r / 2) of an angle in [-pi, pi].
 real2 half_sine(const real2 residual) {
     const real2 x = (real)0.5 * residual;
     const real z = x.x * x.x;
@@ -40,11 +40,11 @@ real2 half_sine(const real2 residual) {
     return two_sum(x.x, x.y + x.x * (z * series));
 }
 
-// Log of all turns' normals over that of the nearest turn.
+// Return the log of the sum over all turns over the normal of the nearest turn.
 real log_other_turns(const real2 residual, const real decay) {
     const real size = fabs(residual.x), low = residual.x < 0 ? -residual.y : residual.y;
     const real rest = fmax((HALF_TURN - size) + (HALF_TURN_LOW - low), (real)0);
-    // Mostly nothing is to be added.
+    // For most headings the other turns add nothing.
     if (decay * rest > NEGLIGIBLE) return 0;
     real others = 0;
     for (int k = 1; k <= WRAPS; ++k) {
@@ -54,7 +54,7 @@ real log_other_turns(const real2 residual, const real decay) {
     return log_one_plus(others);
 }
 
-// Log of the Fourier series over its first term, by Clenshaw's recurrence.
+// Return the log of the Fourier series over its first term, by Clenshaw's recurrence.
 real log_waves(const real2 residual, global const real *terms) {
     const real s = half_sine(residual).x, cosine = 1 - 2 * s * s;
     real newer = 0, older = 0;
@@ -66,8 +66,9 @@ real log_waves(const real2 residual, global const real *terms) {
     return log_one_plus(cosine * newer - older);
 }
 
-// One work-item a particle. terms = {a, b, c, peak}, each followed by its low part, and the log of the uniform part. The
-// exponent is (a x)^2 + (b x + c y)^2, where (x, y) lies from the reading to the sensor.
+// Score positions: one work-item takes a particle. terms = {a, b, c, peak}, each followed by its low part, and the log
+// of the uniform part. The exponent is (a x)^2 + (b x + c y)^2, where (x, y) is the offset from the reading to the
+// sensor.
 kernel void score_position(global const real4 *place, global const real *terms, global real *log_p, const int particles,
                            const real temperature) {
     const int n = get_global_id(0);
@@ -77,30 +78,30 @@ kernel void score_position(global const real4 *place, global const real *terms, 
     const real2 first = bounded_square(pair_product(x, a));
     const real2 second = bounded_square(pair_sum(pair_product(x, b), pair_product(y, c)));
     const real2 exponent = pair_sum(first, second);
-    real found = (terms[6] - exponent.x) + (terms[7] - exponent.y);
+    real log_density = (terms[6] - exponent.x) + (terms[7] - exponent.y);
 #if RAND
-    found = either(found, terms[8]);
+    log_density = either(log_density, terms[8]);
 #endif
-    log_p[n] = temperature * found;
+    log_p[n] = temperature * log_density;
 }
 
-// One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
-kernel void score_heading(global const real2 *residual, global const real *terms, global real *log_p, const int particles,
-                          const int kind, const real temperature) {
+// Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
+kernel void score_heading(global const real2 *residual, global const real *terms, global real *log_p,
+                          const int particles, const int kind, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 r = residual[n];
-    real found;
+    real log_density;
     if (kind == SERIES) {
-        found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms));
+        log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms));
     } else {
         const real2 root = kind == VON_MISES ? half_sine(r) : r;
         const real2 exponent = bounded_square(pair_product(root, (real2)(terms[SCALE], terms[SCALE_LOW])));
-        found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y);
-        if (kind == NEARBY) found += log_other_turns(r, terms[DECAY]);
+        log_density = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y);
+        if (kind == NEARBY) log_density += log_other_turns(r, terms[DECAY]);
     }
 #if RAND
-    found = either(found, terms[RANDOM]);
+    log_density = either(log_density, terms[RANDOM]);
 #endif
-    log_p[n] = temperature * found;
+    log_p[n] = temperature * log_density;
 }

@@ -1,18 +1,18 @@
 // Density of ranges to known beacons, each truncated to [0, range_max] and mixed with a uniform one (RAND).
 //     p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
-// d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or two normals of which one is
-// wide; m is f's mass on [0, range_max], where d + bias is held to that interval. For a whole nu the mass of a t between 0
-// and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
+// d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or a sum of two normals, one of
+// them wide. m is the mass of f on [0, range_max], with d + bias clamped to that interval. For an integer nu the mass
+// of a t between 0 and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
 // requires: error_free log_terms offsets
 
 #define NORMAL 0
 #define STUDENT_T 1
 #define TWO_NORMALS 2
-// A beacon is its place (x, its low part, y, its low part) and the reading minus the bias (and its low part).
+// A beacon has its place (x, its low part, y, its low part), and the reading minus the bias with its low part.
 #define BEACON 6
-// 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; then of two normals the wide
-// one's scale and peak. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and instead of
-// the wide normal 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the arc's factor, 1 for an odd nu.
+// 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
+// peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
+// of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
 #define SCALE 0
 #define SCALE_LOW 1
 #define PEAK 2
@@ -30,22 +30,22 @@
 #define T_SCALE 10
 #define ARC 11
 #define ODD 12
-// Above this an arc is a quarter turn to the last bit, and its tangent's square is finite.
+// From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
 #define STEEPEST ((real)1e18)
-// Above this the error function is 1 to the last bit.
+// From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 
-// Log of a truncated normal; near and far are the distances of its mean from the interval's ends.
+// Return the log of a truncated normal; near and far are the distances of its mean from the ends.
 real log_normal(const real2 residual, const real near, const real far, global const real *terms, const int first,
                 const int peak) {
     const real scale = terms[first], below = near * scale, above = far * scale;
     const real2 exponent = bounded_square(pair_product(residual, (real2)(scale, terms[first + 1])));
-    const real found = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y);
-    if (below > ERF_ONE && above > ERF_ONE) return found;
-    return found - log((real)0.5 * (erf(below) + erf(above)));
+    const real untruncated = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y);
+    if (below > ERF_ONE && above > ERF_ONE) return untruncated;
+    return untruncated - log((real)0.5 * (erf(below) + erf(above)));
 }
 
-// Mass of a Student t between -t and t, where t >= 0 is in units of its scale and sqrt(nu).
+// Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu).
 real t_mass(const real any_t, global const real *terms, global const real *series, const int count) {
     const real t = fmin(any_t, STEEPEST), cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
     real sum = 0;
@@ -54,7 +54,8 @@ real t_mass(const real any_t, global const real *terms, global const real *serie
     return terms[ARC] * atan(t) + factor * sum;
 }
 
-// Log of a truncated Student t: -(nu + 1) / 2 log of (1 + u^2 / nu) / k, a sum of two numbers that includes the peak.
+// Return the log of a truncated Student t. Its argument, (1 + u^2 / nu) / k, includes the peak and is a sum of two
+// numbers; -(nu + 1) / 2 is the factor of its log.
 real log_student_t(const real2 residual, const real near, const real far, global const real *terms,
                    global const real *series, const int count) {
     const real2 squared = bounded_square(pair_product(residual, (real2)(terms[SCALE], terms[SCALE_LOW])));
@@ -64,36 +65,37 @@ real log_student_t(const real2 residual, const real near, const real far, global
     return (terms[PEAK] - terms[POWER] * (log(x.x) + x.y / x.x)) - log((real)0.5 * (below + above));
 }
 
-// Log p of one range at a distance.
+// Return log p of one range at a distance.
 real log_range(const real2 d, global const real *beacon, global const real *terms, global const real *series,
                const int count, const int kind) {
     const real2 first = two_sum(d.x, -beacon[4]), r = two_sum(first.x, first.y + (d.y - beacon[5]));
     const real near = clamp(d.x + terms[BIAS], (real)0, terms[RANGE_MAX]), far = terms[RANGE_MAX] - near;
-    real found;
+    real log_p;
     if (kind == STUDENT_T)
-        found = log_student_t(r, near, far, terms, series, count);
+        log_p = log_student_t(r, near, far, terms, series, count);
     else
-        found = log_normal(r, near, far, terms, SCALE, PEAK);
-    if (kind == TWO_NORMALS) found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
+        log_p = log_normal(r, near, far, terms, SCALE, PEAK);
+    if (kind == TWO_NORMALS) log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
 #if RAND
-    return either(found, terms[RANDOM]);
+    return either(log_p, terms[RANDOM]);
 #else
-    return found;
+    return log_p;
 #endif
 }
 
-// One work-item a particle: the sum over beacons of log p of their ranges; the first count numbers of the series are a t's.
+// Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong to
+// a t.
 kernel void score_beacons(global const real4 *place, global const real *beacon, global const real *terms,
                           global const real *series, global real *log_p, const int particles, const int beacons,
                           const int count, const int kind, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = place[n];
+    const real4 sensor = place[n];
     real2 total = 0;
     for (int i = 0; i < beacons; ++i) {
-        global const real *one = beacon + BEACON * i;
-        const real2 d = distance_pair(offset((real4)(one[0], one[2], one[1], one[3]), own));
-        total = add_term(total, log_range(d, one, terms, series, count, kind));
+        global const real *numbers = beacon + BEACON * i;
+        const real2 d = distance_pair(offset((real4)(numbers[0], numbers[2], numbers[1], numbers[3]), sensor));
+        total = add_term(total, log_range(d, numbers, terms, series, count, kind));
     }
     log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
 }

@@ -1,9 +1,8 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
-// Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
+// Readings whose density does not depend on the pose are not passed in: their sum is the constant term fixed.
 // requires: error_free caster echo tiles mixture sensor_table compat
 
-#if !WIDE
-// What one reading adds to the sum.
+// Return the term of one reading in the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const int cells, const real per_metre, const real range_max) {
 #if ALL_READINGS
@@ -24,7 +23,7 @@ real reading_term(const real z, const real expected, global const real *terms, g
 #endif
 }
 
-// The scan's logarithm from its sum.
+// Return the logarithm of a scan from its sum.
 real scan_log(const real sum) {
 #if CUBES
     return log(sum);
@@ -32,10 +31,9 @@ real scan_log(const real sum) {
     return sum;
 #endif
 }
-#endif
 
-#if WIDE
-// One work-item a particle, LANES rays at a time, a block, each with one reading. Sums are those of the scalar kernel.
+// Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings from first[r] on, up to
+// first[r + 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
@@ -49,59 +47,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     if (n >= particles) return;
 #if SCANS
     const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real lead = fixed_of[scan];
-    ray += start[scan];
-    reading += start[scan];
-#else
-    const int size = readings;
-    const real lead = fixed;
-#endif
-    real2 total = (real2)(lead, 0);
-    real one[LANES];
-    for (int k = 0; k < size; k += LANES) {
-        lanes x, y;
-        load_rays(ray, k, size, &x, &y);
-        const lanes expected = expected_ranges(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit, resolution,
-                                               range_max);
-        const int count = min(size - k, LANES);
-        lanes z;
-        if (count == LANES) {
-            z = load_lanes(0, reading + k);
-        } else {
-            for (int i = 0; i < LANES; ++i) one[i] = reading[k + min(i, count - 1)];
-            z = load_lanes(0, one);
-        }
-        lanes term = log_density(z, expected, terms);
-#if PER_BEAM
-        store_lanes(term, 0, one);
-        for (int i = 0; i < count; ++i) parts[(long)n * readings + k + i] = one[i];
-#endif
-        if (count < LANES) {
-            store_lanes(term, 0, one);
-            for (int i = count; i < LANES; ++i) one[i] = 0;
-            term = load_lanes(0, one);
-        }
-        total = add_strands(total, ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi);
-    }
-    log_p[n] = temperature * (total.x + total.y);
-}
-#else
-// One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several scans
-// each has its rays from start on, and first counts the readings of all.
-kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                        global const real4 *pose, global const real2 *ray, global const int *first,
-                        global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global const int *start, global const real *fixed_of,
-                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
-                        const int rays, const int readings, const int kinds, const int cone_rays, const real critical,
-                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
-                        const real limit, const real resolution, const real range_max, const real fixed,
-                        const real temperature, const int per_scan, const int ahead) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-#if SCANS
-    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real lead = fixed_of[scan];
+    const real constant_term = fixed_of[scan];
     ray += start[scan] * cone_rays;
 #if SHARED_RAYS
     first += start[scan];
@@ -112,9 +58,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     reading += begin;
 #else
     const int size = rays, begin = 0;
-    const real lead = fixed;
+    const real constant_term = fixed;
 #endif
-    real2 total = (real2)(lead, 0);
+    real2 total = (real2)(constant_term, 0);
     real strands[STRANDS] = {0, 0, 0, 0};
 #if !LINEAR
     int impossible = 0;
@@ -129,9 +75,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
         const real expected = expected_range(t, limit, resolution, range_max);
 #if INCIDENCE
-        global const real *own = incidence_terms(terms, edges, kinds, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, kinds, echo.cosine);
 #else
-        global const real *own = terms;
+        global const real *bin_terms = terms;
 #endif
 #if SHARED_RAYS
         for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
@@ -139,7 +85,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, bin_terms, sensor, cells, per_metre, range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -165,9 +111,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
 }
 
-// For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], or with the flag
-// STRANDED the sum of each strand in place of that of reading k; fewer than 2^31 numbers. A work-item then takes whole
-// strands. What is told not to overlap need not be read again after each of them is written.
+// Write the term of reading k to parts[place * across + k * along], in tiles of particles and rays, for GPUs. With
+// STRANDED the number there is the sum of strand k, and a work-item takes whole strands. There are fewer than 2^31
+// numbers. With restrict the compiler need not read arguments again after a write.
 kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
                        global const int2 *restrict pose_cell, global const real4 *restrict pose,
                        global const int *restrict order, global const real2 *restrict ray,
@@ -187,7 +133,7 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     const int n = place;
 #endif
     const int2 cell = pose_cell[n];
-    const real4 own_pose = pose[n];
+    const real4 sensor_pose = pose[n];
 #if SCANS
     const int scan = n / per_scan, size = start[scan + 1] - start[scan];
     ray += start[scan] * cone_rays;
@@ -208,17 +154,17 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
 #if ECHO
-        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, own_pose, ray + r * cone_rays,
+        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, sensor_pose, ray + r * cone_rays,
                                        cone_rays, critical, limit, bins, slack, tolerance);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, rows, cols, cell, own_pose, ray[r], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray[r], limit, bins, slack, tolerance);
 #endif
         const real expected = expected_range(t, limit, resolution, range_max);
 #if INCIDENCE
-        global const real *own = incidence_terms(terms, edges, kinds, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, kinds, echo.cosine);
 #else
-        global const real *own = terms;
+        global const real *bin_terms = terms;
 #endif
 #if SHARED_RAYS
         for (int k = first[r] - begin; k < first[r + 1] - begin; ++k) {
@@ -226,12 +172,12 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, own, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, bin_terms, sensor, cells, per_metre, range_max);
 #if STRANDED
             sum += term;
             r += STRANDS;
             if (r >= size || (r & (BLOCK_TERMS - STRANDS)) == 0) {
-                // Past a block's or the scan's end.
+                // The end of a block or of the scan.
                 const int block = (r - STRANDS) / BLOCK_TERMS;
                 parts[place * across + (block * STRANDS + (r & (STRANDS - 1))) * along] = sum;
                 sum = 0;
@@ -243,4 +189,3 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         }
     }
 }
-#endif

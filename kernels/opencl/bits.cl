@@ -1,14 +1,16 @@
-// Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit; what a row lacks
-// to a whole word is 0. A look at a word is a look at 32 cells.
+// Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit. The unused bits
+// of the last word of a row are 0. One read of a word gives 32 cells.
 
 #define NONE 0x7fffffff
 
-// Places of the lowest and highest 1 of a word that is not 0.
+// Return the index of the lowest 1 of a word that is not 0.
 int lowest_bit(const uint word) { return 31 - (int)clz(word & (~word + 1)); }
+
+// Return the index of the highest 1 of a word that is not 0.
 int highest_bit(const uint word) { return 31 - (int)clz(word); }
 
-// Cells from a cell to the first occupied one to its right, itself included; NONE if none is within most cells. What is
-// farther may be found, too.
+// Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
+// cells. An occupied cell beyond most cells may be returned, too.
 int cells_right(global const int *row, const int words, const int col, const int most) {
     const int last = min((col + most) >> 5, words - 1);
     int i = col >> 5;
@@ -17,7 +19,7 @@ int cells_right(global const int *row, const int words, const int col, const int
     return word == 0 ? NONE : 32 * i + lowest_bit(word) - col;
 }
 
-// The same to its left.
+// Count the cells to the first occupied one to its left.
 int cells_left(global const int *row, const int col, const int most) {
     const int last = max(col - most, 0) >> 5;
     int i = col >> 5;

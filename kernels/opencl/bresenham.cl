@@ -1,16 +1,11 @@
-// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as nav2_amcl and Beluga
-// cast: distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
+// Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as in nav2_amcl and
+// Beluga. Distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
 // The table holds 1 for occupied cells in a ring of twos.
 // requires: rectangles ray
 
 typedef uchar entry;
 
-int cell_below(const real a) {
-    const int whole = (int)a;
-    return whole - ((real)whole > a);
-}
-
-// Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+// Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const Ray r = make_ray(pose, ray);
@@ -22,8 +17,8 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const Walk start = start_walk(r, cell, rows, cols, limit);
     if (start.t >= limit) return limit;
     const int col = cell.x + r.step_x * start.k_x, row = cell.y + r.step_y * start.k_y;
-    const int end_col = cell.x + cell_below(pose.x + limit * r.direction.x);
-    const int end_row = cell.y + cell_below(pose.y + limit * r.direction.y);
+    const int end_col = cell.x + floor_int(pose.x + limit * r.direction.x);
+    const int end_row = cell.y + floor_int(pose.y + limit * r.direction.y);
     const int far_x = abs(end_col - col), far_y = abs(end_row - row);
     const int longer = max(far_x, far_y), shorter = min(far_x, far_y);
     const int right = end_col >= col ? 1 : -1, up = end_row >= row ? 1 : -1;

@@ -1,18 +1,18 @@
-// Expected range by a compressed directional distance transform (Walsh and Karaman 2018): for each angle bin the map is
-// cut into lines of one cell's width along the bin's direction, and each line keeps in order where its obstacles begin.
-// A ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins.
-// Table of integers: number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from place
-// 1 + 3 bins where each line's obstacles begin in the table (bins * lines + 1 numbers); then a bit for each cell, set
-// where it is occupied; then the obstacles in 2^-10 cells.
+// Expected range by a compressed directional distance transform (Walsh and Karaman 2018). For each angle bin the map is
+// cut into lines of one cell's width along the bin's direction. Each line has the sorted positions at which obstacles
+// begin. A ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins. Table of integers:
+// number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from index 1 + 3 bins on, the
+// index of the first obstacle of each line (bins * lines + 1 numbers); then a bit for each cell, set where it is
+// occupied; then the obstacles in 2^-10 cells.
 // requires: ray
 
 typedef int entry;
 
 #define ENTRY_UNIT ((real)1024)
-// Beyond this many cells, more than any map has, one place is like another and counts still fit.
+// Coordinates are clamped to this many cells: no map has as many, and indices still fit.
 #define FARTHEST ((real)1048576)
 
-// Distance in cells to the first obstacle of the line, or limit where there is none nearer.
+// Return the distance in cells to the first obstacle of the line, limit where none is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const int lines = map_table[0];
@@ -31,10 +31,10 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const real x = (real)cell.x + pose.x, y = (real)cell.y + pose.y;
     const real along = c * x + s * y, across = c * y - s * x;
     if (fabs(across) > FARTHEST) return limit;
-    const int whole = (int)across, line = whole - ((real)whole > across) - map_table[3 + 3 * bin];
+    const int line = floor_int(across) - map_table[3 + 3 * bin];
     if (line < 0 || line >= lines) return limit;
     const int from = (int)(along > FARTHEST ? FARTHEST * ENTRY_UNIT : along < -FARTHEST ? -FARTHEST * ENTRY_UNIT
-                                                                                       : along * ENTRY_UNIT);
+                           : along * ENTRY_UNIT);
     int low = first[bin * lines + line], high = first[bin * lines + line + 1];
     const int end = high;
     while (low < high) {

@@ -1,10 +1,11 @@
-// What nav2_amcl and Beluga sum over the beams of a scan, the cube of a density, for migration. terms[10] are those of
-// the mixture in the linear domain, but that terms[0] is z_hit alone for amcl and terms[7] is z_max, not its logarithm.
+// Cubes of densities, which nav2_amcl and Beluga sum over the beams of a scan; for migration. terms[10] are those of
+// the mixture in the linear domain, with two exceptions: terms[0] is z_hit alone for amcl, and terms[7] is z_max, not
+// its logarithm.
 // requires: mixture
 
 #if CUBES
-// The density that is cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of range_max is
-// a max reading.
+// Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of
+// range_max is a max reading.
 real compat_density(const real z, const real expected, global const real *terms) {
     const real off = z - expected;
     real p = terms[0] * exp(-(off * (off * terms[1])));

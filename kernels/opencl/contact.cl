@@ -1,11 +1,12 @@
-// Probability of contact from the distance of a robot's outline to the nearest obstacle.
-// The outline's points lie in cells of a table of squared distances to the nearest obstacle's centre; the nearest point of
-// a segment counts. An obstacle begins half a cell before its centre. Outline and map are off by a normal error, so
+// Probability of contact from the distance of a robot's outline to the nearest obstacle. Each point of the outline lies
+// in a cell of a table of squared distances to the nearest obstacle's centre; the nearest point of a segment counts. An
+// obstacle begins half a cell before its centre. The error of outline and map is normal, so
 //     P(touching) = Phi(-gap / sigma),    P(pressed) = p_contact P(touching) + p_false (1 - P(touching))
 // requires: error_free end_point log_terms
 
 #define NO_OBSTACLE 0x7fffffff
-// 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact, p_false and of 1 minus these.
+// 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false, and of 1 minus each
+// of them.
 #define SCALE 0
 #define SCALE_LOW 1
 #define REACH 2
@@ -16,13 +17,13 @@
 #define FALSE_TERM 7
 #define MISS_TERM 8
 #define NO_HIT_TERM 9
-// Without an obstacle the gap has as many cells.
+// Gap in cells where there is no obstacle.
 #define FAR_CELLS ((real)1e9)
 #define LOG_TWO_ROOT_PI ((real)1.2655121234846454)
 #define LARGE ((real)(FLOAT64 ? 10 : 6))
 #define SERIES 12
 
-// From the outline to the obstacle, negative where they overlap; the squared distance is in cells.
+// Return the gap between outline and obstacle, negative where they overlap; the squared distance is in cells.
 real2 gap(const int squared, global const real *terms) {
     const real2 whole = two_sum((real)(squared >> 12) * 4096, (real)(squared & 4095));
     const real d = sqrt(whole.x);
@@ -34,7 +35,7 @@ real2 gap(const int squared, global const real *terms) {
     return two_sum(left.x, left.y + (away.y - terms[REACH_LOW]));
 }
 
-// log(erfc(x) / 2), by an asymptotic series where erfc is about to vanish.
+// Return log(erfc(x) / 2), by an asymptotic series where erfc nearly underflows.
 real log_above(const real2 x) {
     if (!(x.x > LARGE)) return log((real)0.5 * erfc(x.x));
     const real t = (real)0.5 / (x.x * x.x);
@@ -44,7 +45,7 @@ real log_above(const real2 x) {
     return -square.x - (log(x.x) + LOG_TWO_ROOT_PI - log(series) + square.y);
 }
 
-// Log probability that a segment is pressed, or that it is not.
+// Return the log probability that a segment is pressed, or that it is not.
 real log_bump(const int squared, const int pressed, global const real *terms) {
     const real2 x = pair_product(gap(squared, terms), (real2)(terms[SCALE], terms[SCALE_LOW]));
     const real touching = log_above(x), clear = log_above(-x);
@@ -53,8 +54,8 @@ real log_bump(const int squared, const int pressed, global const real *terms) {
     return either(hit + touching, no_hit + clear);
 }
 
-// One work-item a particle: the sum over segments; points start[s] to start[s + 1] - 1 belong to segment s, which is
-// pressed if that is not 0.
+// Sum log p over segments: one work-item takes a particle. Points start[s] to start[s + 1] - 1 belong to segment s;
+// pressed[s] is not 0 where it is pressed.
 kernel void score_contact(global const int *table, global const int2 *pose_cell, global const real4 *pose,
                           global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                           global const int *start, global const int *pressed, global const real *terms,
@@ -63,7 +64,7 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
     const int n = get_global_id(0);
     if (n >= particles) return;
     const int2 cell = pose_cell[n];
-    const real4 own = pose[n];
+    const real4 sensor_pose = pose[n];
 #if CAREFUL
     const real4 low = pose_low[n];
 #else
@@ -73,7 +74,7 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
     for (int s = 0; s < segments; ++s) {
         int nearest = NO_OBSTACLE;
         for (int i = start[s]; i < start[s + 1]; ++i) {
-            const int2 at = cell + end_point(own, low, point[i], point_low[i], (real)0, guard).cell;
+            const int2 at = cell + end_point(sensor_pose, low, point[i], point_low[i], (real)0, guard).cell;
             nearest = min(nearest, table[field_cell(at.x, at.y, rows, cols)]);
         }
         total += log_bump(nearest, pressed[s], terms);

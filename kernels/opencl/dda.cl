@@ -1,10 +1,10 @@
-// Expected range by the plain walk of Amanatides and Woo (1987), cell by cell: exact, and the same bits as the exact
-// caster's. The table holds 1 for occupied cells in a ring of twos.
+// Expected range by the plain walk of Amanatides and Woo (1987), cell by cell. It is exact, with the same bits as the
+// exact caster. The table holds 1 for occupied cells in a ring of twos.
 // requires: rectangles ray
 
 typedef uchar entry;
 
-// Distance in cells to the first occupied cell, or limit where there is none nearer.
+// Return the distance in cells to the first occupied cell, limit where none is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const Ray r = make_ray(pose, ray);

@@ -1,13 +1,14 @@
-// Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000): all integers.
-// Processors take a work-item a line, whose work grows with its length alone. A pass works on parallel lines of a grid:
-// line i starts at i * line_stride, its cells are step apart. GPUs, which want more work-items than a map has lines, take
-// one a cell: it looks around itself only as far as something nearer may be.
+// Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000), in integers. On
+// processors a work-item takes a line, in time linear in its length. Lines of a pass are parallel: line i starts at i *
+// line_stride, and its cells are step apart. GPUs need more work-items than a map has lines: there a work-item takes a
+// cell, and searches around it only as far as a nearer obstacle is possible.
 // requires: bits
 
 #define NO_OBSTACLE (-1)
 #define UNREACHABLE 0x7fffffff
 
-// First pass, one work-item a line: cells to the nearest occupied cell of the same line, NO_OBSTACLE without one.
+// First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one. One work-item
+// takes a line.
 kernel void distance_lines(global const uchar *occupied, global int *along, const int lines, const int length,
                            const int line_stride, const int step) {
     const int line = get_global_id(0);
@@ -28,11 +29,12 @@ kernel void distance_lines(global const uchar *occupied, global int *along, cons
     }
 }
 
-// Squared distance from cell i to the obstacle nearest to cell j across the lines.
+// Return the squared distance from cell i to the obstacle nearest to cell j across the lines.
 int parabola(const int i, const int j, const int across) { return (i - j) * (i - j) + across * across; }
 
-// Second pass, one work-item a line: lower envelope of the parabolas of the first pass. The vertices wait in
-// squared, which a line overwrites from its far end: entry q of the stack never lies beyond the cell that reads it.
+// Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
+// vertices lies in squared, which is overwritten from its far end: entry q of the stack never lies beyond the cell that
+// reads it.
 kernel void distance_envelope(global const int *along, global int *starts, global int *squared, const int lines,
                               const int length, const int line_stride, const int step) {
     const int line = get_global_id(0);
@@ -69,16 +71,17 @@ kernel void distance_envelope(global const int *along, global int *starts, globa
     }
 }
 
-// ---- a work-item a cell
+// ---- kernels with a work-item per cell
 
-// Beyond all distances: the sum of its square and a distance's fits into 32 bits, without a sign.
+// Larger than all distances. Its square plus the square of a distance fits into 32 unsigned bits.
 #define FAR 46341
 #define BLOCK_BITS 5
 #define BLOCK_ROWS (1 << BLOCK_BITS)
-// Rows looked at between two decisions, so that reads need not wait for one another.
+// Rows read between two decisions, so that reads need not wait for one another.
 #define STEP_ROWS 4
 
-// First pass, one work-item a cell: cells to the nearest occupied cell of the same row, FAR if it is over reach.
+// First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach. One work-item
+// takes a cell.
 kernel void distance_bits(global const int *bits, global ushort *nearest, const int rows, const int cols,
                           const int words, const int reach) {
     const int col = get_global_id(0), row = get_global_id(1);
@@ -89,7 +92,7 @@ kernel void distance_bits(global const int *bits, global ushort *nearest, const 
     nearest[(long)row * cols + col] = (ushort)(cells > reach ? FAR : cells);
 }
 
-// One work-item a column of a block of rows: the least of its numbers.
+// Find the minimum of each column of a block of rows. One work-item takes a column of a block.
 kernel void distance_blocks(global const ushort *nearest, global ushort *blocks, const int rows, const int cols,
                             const int count) {
     const int col = get_global_id(0), block = get_global_id(1);
@@ -100,18 +103,18 @@ kernel void distance_blocks(global const ushort *nearest, global ushort *blocks,
     blocks[(long)block * cols + col] = (ushort)least;
 }
 
-// Sum of two squares.
+// Return the sum of two squares.
 uint squares_sum(const uint a, const uint b) { return a * a + b * b; }
 
-// Second pass, one work-item a cell: the least sum of squares along its column, UNREACHABLE if it is over most. Near
-// rows are looked at one by one. Of farther ones the blocks' least numbers give first a bound from above, and then which
-// blocks may hold less.
+// Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
+// work-item takes a cell. Near rows are read one by one. Farther away, the minima of blocks give an upper bound first,
+// and then the blocks that may hold less.
 kernel void distance_search(global const ushort *nearest, global const ushort *blocks, global int *squared,
                             const int rows, const int cols, const int count, const int most) {
     const int col = get_global_id(0), row = get_global_id(1);
     if (row >= rows || col >= cols) return;
     global const ushort *column = nearest + col, *block = blocks + col;
-    // One more than may be found.
+    // One more than the largest result.
     uint best = min(squares_sum(0, column[(long)row * cols]), (uint)most + 1);
     int i = 1;
     for (; i <= BLOCK_ROWS && (uint)(i * i) < best; i += STEP_ROWS) {
@@ -120,7 +123,7 @@ kernel void distance_search(global const ushort *nearest, global const ushort *b
             if (row + j < rows) best = min(best, squares_sum(j, column[(long)(row + j) * cols]));
         }
     }
-    // Blocks begin beyond what has been seen, so all rows of a block lie on one side.
+    // Blocks begin beyond the rows read so far, so all rows of a block lie on one side.
     for (int pass = (uint)(i * i) < best ? 0 : 2; pass < 2; ++pass) {
         for (int way = -1; way <= 1; way += 2) {
             for (int b = (row + way * i) >> BLOCK_BITS; b >= 0 && b < count; b += way) {
@@ -130,7 +133,8 @@ kernel void distance_search(global const ushort *nearest, global const ushort *b
                 const uint least = block[(long)b * cols];
                 if (pass == 0) best = min(best, squares_sum(far, least) + 1);
                 if (pass == 0 || squares_sum(near, least) >= best) continue;
-                for (int j = near; j <= far; ++j) best = min(best, squares_sum(j, column[(long)(row + way * j) * cols]));
+                for (int j = near; j <= far; ++j) best = min(best,
+                                                             squares_sum(j, column[(long)(row + way * j) * cols]));
             }
         }
     }

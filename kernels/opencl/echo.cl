@@ -1,20 +1,21 @@
-// What a sensor hears: the nearest return among the rays of its cone, one ray for a laser, and the angle there.
-// The angle of incidence lies between the ray and the normal of the surface that it hits. Normals of cells are made
-// beforehand, in a ring of cells around the map: 0 for free cells, NaN for cells without a normal, which count as met
-// head-on.
+// The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence. The angle of
+// incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring of cells
+// around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine counts as
+// 1.
 // requires: caster
 
 #if ECHO
-// Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 2 and 0 there: more than
-// any cosine, so that the first of the bins may be for such beams alone.
+// Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2 is
+// more than any cosine, so that the first bin can be for such beams alone.
 typedef struct {
     real t, cosine, sine;
 } Echo;
 
 #if INCIDENCE
-// Whether the normal is that of an obstacle.
+// Return whether a normal belongs to an obstacle.
 int is_wall(const real2 normal) { return normal.x != 0 || normal.y != 0; }
 
+// Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
 real2 normal_at(global const real2 *normals, const int rows, const int cols, const int col, const int row) {
     if (off_grid(col + 1, row + 1, rows + 2, cols + 2)) {
 #if OUTSIDE_OCCUPIED
@@ -26,21 +27,23 @@ real2 normal_at(global const real2 *normals, const int rows, const int cols, con
     return normals[padded(row, col, cols)];
 }
 
-// Normal of the cell in which a ray ends at a distance t, which tells where the exact walk was: across all boundaries in
-// x up to t and those in y before t, or, after a step in y, up to t as well. A corner is passed in x first.
-real2 hit_normal(global const real2 *normals, const int rows, const int cols, const int2 cell, const Ray r, const real t) {
+// Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
+// walk: it has crossed all boundaries in x up to t, and those in y before t or, after a step in y, up to t as well. At
+// a corner it steps in x first.
+real2 hit_normal(global const real2 *normals, const int rows, const int cols, const int2 cell, const Ray r,
+                 const real t) {
     if (t == 0) {
-        const real2 own = normal_at(normals, rows, cols, cell.x, cell.y);
-        if (is_wall(own)) return own;
+        const real2 start_normal = normal_at(normals, rows, cols, cell.x, cell.y);
+        if (is_wall(start_normal)) return start_normal;
     }
     const int col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
     const int before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
-    const real2 found = normal_at(normals, rows, cols, col, before);
-    if (is_wall(found)) return found;
+    const real2 normal = normal_at(normals, rows, cols, col, before);
+    if (is_wall(normal)) return normal;
     return normal_at(normals, rows, cols, col, cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 1)));
 }
 
-// The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.
+// Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
 global const real *incidence_terms(global const real *terms, global const real *edges, const int kinds,
                                    const real cosine) {
     int bin = 0;
@@ -49,14 +52,14 @@ global const real *incidence_terms(global const real *terms, global const real *
 }
 #endif
 
-// The nearest return of a cone's rays. A ray whose angle of incidence has a cosine below critical has none: the surface is
-// a mirror to it.
+// Return the nearest return of a cone's rays. A ray whose angle of incidence has a cosine below critical has none: the
+// surface reflects it like a mirror.
 Echo nearest_echo(global const entry *map_table, global const real2 *normals, const int rows, const int cols,
                   const int2 cell, const real4 pose, global const real2 *ray, const int cone_rays, const real critical,
                   const real limit, const int bins, const real slack, const real tolerance) {
     Echo echo = {limit, 2, 0};
     for (int i = 0; i < cone_rays; ++i) {
-        // Most casters need not look beyond what is found; those of tables and lines must.
+        // Most casters may stop at the nearest return so far; those of tables and lines may not.
         real farthest = echo.t;
 #if LOOKUP
         farthest = limit;
@@ -80,7 +83,7 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
     return echo;
 }
 
-// Expected ranges of cones, and the angles of incidence there, NaN where nothing returns: one work-item a particle and cone.
+// Cast cones to expected ranges and angles of incidence, NaN without a return. One work-item takes a particle and cone.
 kernel void cast_echoes(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global real *ranges, global real *incidence,
                         const int rows, const int cols, const int particles, const int rays, const int cone_rays,
@@ -88,8 +91,8 @@ kernel void cast_echoes(global const entry *map_table, global const real2 *norma
                         const real resolution, const real range_max) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
-    const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + k * cone_rays, cone_rays,
-                                   critical, limit, bins, slack, tolerance);
+    const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + k * cone_rays,
+                                   cone_rays, critical, limit, bins, slack, tolerance);
     ranges[(long)n * rays + k] = expected_range(echo.t, limit, resolution, range_max);
 #if INCIDENCE
     incidence[(long)n * rays + k] = echo.t < limit ? atan2(echo.sine, echo.cosine) : NAN;

@@ -1,14 +1,14 @@
-// The cell of the likelihood field's table that a beam's end point falls into, and its place within that cell.
-// Cells must be the same on every device and in every precision: an end point that is nearer to an edge than guard, the
-// bound of its rounding errors, is found again with twice the digits.
+// The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
+// Cells must be the same on every device and in every precision: an end point nearer to an edge than guard, the bound
+// of its rounding errors, is computed again with twice the digits.
 // requires: error_free
 
 #define FIELD_RING 2
 
-// i held to [0, last]; some drivers call clamp as a function.
+// Clamp i to [0, last]; some drivers call clamp as a function.
 int within(const int i, const int last) { return i < 0 ? 0 : i > last ? last : i; }
 
-// Index of a cell of the padded table; far cells become ring cells.
+// Return the index of a cell of the padded table; far cells become ring cells.
 int field_cell(const int col, const int row, const int rows, const int cols) {
     const int c = within(col + FIELD_RING, cols + 2 * FIELD_RING - 1);
     const int r = within(row + FIELD_RING, rows + 2 * FIELD_RING - 1);
@@ -16,8 +16,7 @@ int field_cell(const int col, const int row, const int rows, const int cols) {
 }
 
 #if CAREFUL
-// frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
-// the working precision.
+// Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
 real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2 c, const real2 d, const real sign) {
     const real2 ab = two_product(a.x, b.x), cd = two_product(c.x, d.x);
     const real2 products = two_sum(ab.x, sign * cd.x);
@@ -27,17 +26,12 @@ real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2
 }
 #endif
 
-// Largest integer not above a.
-int floor_int(const real a) {
-    const int whole = (int)a;
-    return whole - ((real)whole > a);
-}
-
-// Whole cells below an offset of two parts. What is left of it in [0, 1) is rest, and what is missing to 1 is to_next:
-// both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or less short
-// of an edge lies on it, so that end points on edges fall into the same cell in every precision.
+// Offsets this close below an edge count as on it.
 #define EDGE ((real)1.1641532182693481e-10)
 
+// Return the whole cells below an offset of two parts; rest in [0, 1) is the remainder and to_next is 1 minus it. Both
+// are computed relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below an
+// edge counts as on it, so that end points on edges fall into the same cell in every precision.
 int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
     const int nearest = floor_int(offset.x + (real)0.5);
 #if SHARP
@@ -53,14 +47,15 @@ int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
     return nearest - below;
 }
 
-// Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
+// An end point: its cell as an offset from the pose's cell, and its place between the edges of that cell.
 typedef struct {
     int2 cell;
     real2 rest_x, rest_y, to_next_x, to_next_y;
 } EndPoint;
 
-// point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
-// nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
+// Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell centres
+// onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is computed again
+// with twice the digits.
 EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
                    const real guard) {
     EndPoint end;
@@ -86,15 +81,16 @@ EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, co
 }
 
 #if QUICK
-// What is left of half a cell where end points are off by guard if products are rounded, by 3.12 eps of the reading and 1.5
-// altogether. Here they are not, as GPUs do that in one operation: it is 2 eps and 1.6.
-real sure_of(const real guard) { return 0.5f - 0.6875f * guard; }
+// Return the largest distance from a cell's centre at which rounding certainly gives the cell: half a cell less the
+// rounding errors of an end point. guard bounds them for rounded products, with 3.12 eps of the reading and 1.5 eps
+// altogether. Here products are not rounded, since GPUs fuse them, and the errors are 2 eps and 1.6 eps.
+real rounding_margin(const real guard) { return 0.5f - 0.6875f * guard; }
 
-// What cells have too much that are the bits of a number to which ROUNDING was added.
+// The bits of ROUNDING: the bits of a sum with ROUNDING, less these, are an integer.
 #define ROUNDING_BITS 0x4b400000
 
-// Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest, and ROUNDING_BITS too much.
-// off is how far the place is off the cell's centre, along the axis where it is farther.
+// Return the cell of an end point plus ROUNDING_BITS, by rounding to nearest; lowered is the pose less half a cell. off
+// is the distance from the cell's centre along the axis where it is larger.
 int2 rounded_cell(const real4 lowered, const real2 point, real *off) {
     const real x = fma(lowered.z, point.x, fma(-lowered.w, point.y, lowered.x));
     const real y = fma(lowered.w, point.x, fma(lowered.z, point.y, lowered.y));
@@ -103,8 +99,8 @@ int2 rounded_cell(const real4 lowered, const real2 point, real *off) {
     return (int2)(as_int(to_x), as_int(to_y));
 }
 
-// Index of such a cell of the padded table, seen from what table_origin makes of the pose's cell. Where no end point of
-// the cloud leaves the table that is a sum and a product modulo 2^32: what is too much is taken off once for all.
+// Return the origin for table_cell, from the pose's cell. Where no end point of the cloud leaves the table (INSIDE), an
+// index is a sum and a product modulo 2^32, and ROUNDING_BITS are subtracted once per pose.
 int2 table_origin(const int2 origin, const int cols) {
 #if INSIDE
     const uint stride = cols + 2 * FIELD_RING, more = FIELD_RING - ROUNDING_BITS;
@@ -114,6 +110,7 @@ int2 table_origin(const int2 origin, const int cols) {
 #endif
 }
 
+// Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
 int table_cell(const int2 near, const int2 from, const int rows, const int cols) {
 #if INSIDE
     return (uint)near.y * (uint)from.y + ((uint)near.x + (uint)from.x);

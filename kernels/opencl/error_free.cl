@@ -1,20 +1,20 @@
-// Error-free transformations: what a rounded operation leaves behind is kept in a second number.
-// Source: Knuth (two_sum), Dekker and Veltkamp (two_product). They need FP_CONTRACT OFF and no fast-math.
+// Error-free transformations: the rounding error of an operation is kept in a second number. Source: Knuth (two_sum),
+// Dekker and Veltkamp (two_product). They need FP_CONTRACT OFF and no fast-math.
 
-// a + b = sum.x + sum.y exactly.
+// Return a + b = sum.x + sum.y exactly.
 real2 two_sum(const real a, const real b) {
     const real sum = a + b;
     const real shift = sum - a;
     return (real2)(sum, (a - (sum - shift)) + (b - shift));
 }
 
-// High half of a float: its leading bits, few enough that a product of two such halves is exact.
+// Return the leading bits of a float, few enough that a product of two such halves is exact.
 real high_half(const real a) {
     const real scaled = SPLITTER * a;
     return scaled - (scaled - a);
 }
 
-// a * b = product.x + product.y exactly, short of overflow and underflow.
+// Return a * b = product.x + product.y exactly, short of overflow and underflow.
 real2 two_product(const real a, const real b) {
     const real product = a * b;
     const real a_high = high_half(a), b_high = high_half(b);
@@ -23,39 +23,46 @@ real2 two_product(const real a, const real b) {
     return (real2)(product, error);
 }
 
-// Sums and products of two numbers of two parts each, to about twice the working precision.
+// Add two numbers of two parts each, to about twice the working precision.
 real2 pair_sum(const real2 a, const real2 b) {
     const real2 sum = two_sum(a.x, b.x);
     return two_sum(sum.x, sum.y + (a.y + b.y));
 }
 
+// Multiply two numbers of two parts each, to about twice the working precision.
 real2 pair_product(const real2 a, const real2 b) {
     const real2 product = two_product(a.x, b.x);
     return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x));
 }
 
-// Adding and taking off this large number rounds to nearest.
+// Adding and subtracting this number rounds to nearest.
 #if FLOAT64
 #define ROUNDING ((real)6755399441055744.0)
 #else
 #define ROUNDING ((real)12582912)
 #endif
 
-// Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of
-// compensating every term, at nearly the cost of none.
+// Return the largest integer not above a; some drivers call floor as a function.
+int floor_int(const real a) {
+    const int whole = (int)a;
+    return whole - ((real)whole > a);
+}
+
+// Sums over beams add the terms of a block plainly, then the sum of the block to a compensated total. The accuracy is
+// nearly that of compensating every term, the cost nearly that of compensating none.
 #define BLOCK_TERMS 16
 
-// A block of the beam model's sums has so many strands, each of every fourth term: a strand is added plainly, then its sum
-// to the compensated total. So work-items and lanes that share a block need not ask one another for terms.
+// A block of the beam model's sums has STRANDS strands; strand i has every fourth term from term i on. Each strand is
+// added plainly, then its sum to the compensated total. So work-items or lanes that share a block exchange no terms.
 #define STRANDS 4
 
-// One more term in a compensated sum: total.x is the running sum, total.y what its roundings lost.
+// Add a term to a compensated sum: total.x is the running sum, total.y the sum of its rounding errors.
 real2 add_term(const real2 total, const real term) {
     const real2 sum = two_sum(total.x, term);
     return (real2)(sum.x, total.y + sum.y);
 }
 
-// A block more, by its strands.
+// Add a block to a compensated sum, by its strands.
 real2 add_strands(const real2 total, const real4 strands) {
     return add_term(add_term(add_term(add_term(total, strands.x), strands.y), strands.z), strands.w);
 }

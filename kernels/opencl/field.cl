@@ -1,23 +1,12 @@
-// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
-// The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
-// requires: end_point field_lanes
+// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point. The table is padded by a
+// ring of two cells for everything outside the grid, so no look-up needs a bounds test.
+// requires: end_point
 
-// Particles of a work-group of field_blocks.
+// Particles per work-group of field_blocks.
 #define GROUP 64
 
-// Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
-// squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is beyond.
-kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
-                       const int cols, const int cap, const real beyond, const int from_col, const int from_row,
-                       const int width, const int height, const int begin, const int stride) {
-    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
-    if (i >= width || j >= height) return;
-    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
-    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
-}
-
 #if BILINEAR
-// a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their digits.
+// Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
 real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const real2 b) {
 #if SHARP
     return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b));
@@ -26,7 +15,7 @@ real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const r
 #endif
 }
 
-// Smooth distance between the four cell centres around an end point, in two parts.
+// Interpolate the distance between the four cell centres around an end point, in two parts.
 real2 bilinear(global const real *table, const int2 cell, const EndPoint end, const int rows, const int cols) {
     const real2 a = (real2)(table[field_cell(cell.x, cell.y, rows, cols)], 0);
     const real2 b = (real2)(table[field_cell(cell.x + 1, cell.y, rows, cols)], 0);
@@ -38,14 +27,20 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 #endif
 
 #if !LOG_TABLE
-// terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1}: z_hit / (sigma sqrt(2 pi))
-// and z_rand / range_max, logarithms in the log domain. Where the peak is high, exponent and log peak nearly cancel.
-real log_field(const real2 distance, global const real *terms) {
+// Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel. terms[6]
+// = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma sqrt(2 pi)) and
+// rand is z_rand / range_max, or their logarithms in the log domain.
+real2 field_exponent(const real2 distance, global const real *terms) {
 #if SHARP
-    const real2 exponent = pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
+    return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
 #else
-    const real2 exponent = (real2)(distance.x * (distance.x * terms[1]), 0);
+    return (real2)(distance.x * (distance.x * terms[1]), 0);
 #endif
+}
+
+// Return log p of the distance from an end point to the nearest obstacle.
+real log_field(const real2 distance, global const real *terms) {
+    const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
     real p = terms[2];
 #if HIT
@@ -60,8 +55,8 @@ real log_field(const real2 distance, global const real *terms) {
 }
 #endif
 
-// What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or capped
-// distances in metres where it is interpolated.
+// Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
+// interpolated, capped distances in metres.
 real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
                    const real2 point_low, global const real *terms, const int rows, const int cols, const real guard) {
 #if ALL_READINGS
@@ -83,9 +78,9 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 }
 
 #if QUICK
-// What one reading adds whose cell is found by rounding alone; worst becomes how far a place is off its cell's centre, if
-// that is farther. A reading that is no range has no cell: the sensor's own is looked up in its place, and what a max
-// reading adds is far.
+// Return the term of a reading by rounding alone. worst becomes the distance of the end point from the cell's centre,
+// if that is larger. A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max
+// reading is far.
 real quick_value(global const real *table, const int2 from, const real4 lowered, const real2 point, const real far,
                  const int rows, const int cols, real *worst) {
     real off;
@@ -102,7 +97,7 @@ real quick_value(global const real *table, const int2 from, const real4 lowered,
 #endif
 }
 
-// The same where that is in doubt: the cell is found with more digits.
+// Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
 real careful_value(global const real *table, const int2 origin, const real4 lowered, const real4 pose, const real4 low,
                    const real2 point, const real2 point_low, const real far, const int rows, const int cols,
                    const real guard, const real sure) {
@@ -117,8 +112,20 @@ real careful_value(global const real *table, const int2 origin, const real4 lowe
 }
 #endif
 
-#if !WIDE
-// One work-item a particle. QUICK changes Warp's body for processors alone, whose compiler makes vectors of loops.
+// Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value for
+// each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the grid get
+// beyond.
+kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
+                       const int cols, const int cap, const real beyond, const int from_col, const int from_row,
+                       const int width, const int height, const int begin, const int stride) {
+    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
+    if (i >= width || j >= height) return;
+    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
+    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
+}
+
+// Score scans: one work-item takes a particle. QUICK changes this kernel in Warp alone, on processors, whose compiler
+// makes vector code of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                         global const real *terms, global const int *start, global const real *fixed_of,
@@ -129,12 +136,12 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     if (n >= particles) return;
 #if SCANS
     const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real lead = fixed_of[scan];
+    const real constant_term = fixed_of[scan];
     point += start[scan];
     point_low += start[scan];
 #else
     const int size = readings;
-    const real lead = fixed;
+    const real constant_term = fixed;
 #endif
     const int2 origin = pose_cell[n];
 #if CAREFUL
@@ -142,7 +149,7 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 #else
     const real4 low = (real4)(0);
 #endif
-    real2 total = (real2)(lead, 0);
+    real2 total = (real2)(constant_term, 0);
     real block = 0;
     for (int k = 0; k < size; ++k) {
         const real term =
@@ -164,8 +171,9 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 #endif
 }
 
-// For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-// parts[n * across + block * along]. Each block has its own guard; of several scans each has as many as the longest.
+// Write the sums of blocks of readings to parts[n * across + block * along], for GPUs. One work-item takes a particle
+// and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards as the
+// longest one.
 kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                          global const real *terms, global const real *guard, global const int *start,
@@ -182,7 +190,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
     const int size = readings;
 #endif
     const int2 origin = pose_cell[n];
-    const real4 own = pose[n];
+    const real4 sensor_pose = pose[n];
 #if CAREFUL
     const real4 low = pose_low[n];
 #else
@@ -190,7 +198,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
 #endif
 #if QUICK
     const int2 from = table_origin(origin, cols);
-    const real4 lowered = own - (real4)(0.5f, 0.5f, 0, 0);
+    const real4 lowered = sensor_pose - (real4)(0.5f, 0.5f, 0, 0);
     const real far = terms[3];
 #endif
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
@@ -198,20 +206,20 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         real sum = 0;
 #if QUICK
         real worst = 0;
-        const real sure = sure_of(guard[block]);
+        const real sure = rounding_margin(guard[block]);
         if (begin + BLOCK_TERMS <= size) {
 #if SCANS
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i)
                 sum += quick_value(table, from, lowered, point[begin + i], far, rows, cols, &worst);
 #else
-            // Points of one scan begin where two of them can be read at once.
+            // The points of one scan are aligned, so that two of them can be read at once.
             global const real4 *two = (global const real4 *)(point + begin);
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS / 2; ++i) {
-                const real4 both = two[i];
-                sum += quick_value(table, from, lowered, both.xy, far, rows, cols, &worst);
-                sum += quick_value(table, from, lowered, both.zw, far, rows, cols, &worst);
+                const real4 pair = two[i];
+                sum += quick_value(table, from, lowered, pair.xy, far, rows, cols, &worst);
+                sum += quick_value(table, from, lowered, pair.zw, far, rows, cols, &worst);
             }
 #endif
         } else {
@@ -221,14 +229,14 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
         if (worst > sure) {
             sum = 0;
             for (int k = begin; k < end; ++k)
-                sum += careful_value(table, origin, lowered, own, low, point[k], point_low[k], far, rows, cols,
+                sum += careful_value(table, origin, lowered, sensor_pose, low, point[k], point_low[k], far, rows, cols,
                                      guard[block], sure);
         }
 #else
         for (int k = begin; k < end; ++k)
-            sum += reading_value(table, origin, own, low, point[k], point_low[k], terms, rows, cols, guard[block]);
+            sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, rows, cols,
+                                 guard[block]);
 #endif
         parts[(long)n * across + (long)block * along] = sum;
     }
 }
-#endif

@@ -1,13 +1,13 @@
-// Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits.
-// A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
-// count times pi/2 in four parts (Cody and Waite), beyond by the product with as many bits of 2/pi as matter, in integers
-// (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
-// bench/heading_constants.py derives the constants.
+// Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits. A heading is
+// reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the count times
+// pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in integers (Payne
+// and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. bench/derive/heading_constants.py derives
+// the constants.
 
 // Up to this heading the counts of quarter turns have 20 bits.
 #define LIMIT 1048576.0
 #define TWO_OVER_PI 0.6366197723675814
-// 1.5 * 2^52: a sum with it is rounded to a whole number.
+// 1.5 * 2^52: a sum with it is rounded to an integer.
 #define ROUNDER 6755399441055744.0
 // pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
 #define QUARTER_1 1.5707963267341256
@@ -40,24 +40,26 @@ constant uint WORDS[39] = {
 };
 #endif
 
-// Quarter turns modulo 4, and the rest as the sum of two numbers.
+// Quarter turns modulo 4, and the remaining angle as the sum of two numbers.
 typedef struct {
     int quadrant;
     double2 rest;
 } Turn;
 
-// The error-free transformations in float64, whatever the precision of real.
+// two_sum of error_free.cl in float64, whatever the precision of real.
 double2 two_sum_float64(const double a, const double b) {
     const double sum = a + b;
     const double shift = sum - a;
     return (double2)(sum, (a - (sum - shift)) + (b - shift));
 }
 
+// high_half in float64.
 double high_half_float64(const double a) {
     const double scaled = 134217729.0 * a;
     return scaled - (scaled - a);
 }
 
+// pair_product in float64.
 double2 pair_product_float64(const double2 a, const double2 b) {
     const double product = a.x * b.x;
     const double a_high = high_half_float64(a.x), b_high = high_half_float64(b.x);
@@ -66,7 +68,7 @@ double2 pair_product_float64(const double2 a, const double2 b) {
     return two_sum_float64(product, error + (a.x * b.y + a.y * b.x));
 }
 
-// For headings of at most LIMIT.
+// Reduce a heading of at most LIMIT.
 Turn reduce_ordinary(const double theta) {
     const double count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER;
     // The first product and difference are exact, and so are the next two products.
@@ -80,26 +82,27 @@ Turn reduce_ordinary(const double theta) {
 }
 
 #if HUGE_HEADINGS
-// For headings above LIMIT, up to the largest there is.
+// Reduce a heading above LIMIT, up to the largest number.
 Turn reduce_huge(const double theta) {
     const ulong bits = as_ulong(fabs(theta));
     const ulong mantissa = (bits & 0xFFFFFFFFFFFFFUL) | 0x10000000000000UL;
     const ulong low_half = mantissa & 0xFFFFFFFFUL, high_half = mantissa >> 32;
-    // Bits of 2/pi that make whole turns are left out: the window's first bit is worth half a turn in the mantissa's
-    // last place.
+    // Bits of 2/pi that make whole turns are left out: times the last bit of the mantissa, the window's first bit is
+    // half a turn.
     const int first = (int)(bits >> 52) - (1075 - 62);
     const int word = first >> 5, shift = first & 31;
     // turns = mantissa * window modulo 2^192, of which the upper four words stay.
     ulong turn_1 = 0, turn_2 = 0, turn_3 = 0, turn_4 = 0, carry_1 = 0, carry_2 = 0, below = 0;
     for (int k = 5; k >= 0; k--) {
-        const ulong both = (ulong)WORDS[word + k] << 32 | WORDS[word + k + 1];
-        const ulong here = both << shift >> 32;
-        const ulong sum_1 = low_half * here + carry_1;
+        const ulong words = (ulong)WORDS[word + k] << 32 | WORDS[word + k + 1];
+        const ulong digit = words << shift >> 32;
+        const ulong sum_1 = low_half * digit + carry_1;
         const ulong sum_2 = high_half * below + (sum_1 & 0xFFFFFFFFUL) + carry_2;
-        carry_1 = sum_1 >> 32, carry_2 = sum_2 >> 32, below = here;
+        carry_1 = sum_1 >> 32, carry_2 = sum_2 >> 32, below = digit;
         turn_4 = turn_3, turn_3 = turn_2, turn_2 = turn_1, turn_1 = sum_2 & 0xFFFFFFFFUL;
     }
-    // To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.
+    // Round to the nearest quarter. The rest, in units of 2^-62 quarters, is cut into pieces that convert without
+    // rounding.
     const ulong turn_high = (turn_1 << 32 | turn_2) + 0x2000000000000000UL, turn_low = turn_3 << 32 | turn_4;
     const int quadrant = (int)(turn_high >> 62);
     const long rest = (long)(turn_high & 0x3FFFFFFFFFFFFFFFUL) - 0x2000000000000000L;
@@ -116,7 +119,7 @@ Turn reduce_huge(const double theta) {
 }
 #endif
 
-// (cosine, sine) of a heading; of no meaning, but not NaN, where it is not finite.
+// Return (cosine, sine) of a heading; for a heading that is not finite they have no meaning but are not NaN.
 double2 cos_sin(const double theta) {
 #if HUGE_HEADINGS
     const Turn turn = fabs(theta) <= LIMIT ? reduce_ordinary(theta) : reduce_huge(theta);

@@ -1,37 +1,39 @@
-// Likelihood of features by the landmarks near to where each of them points, book table 6.5.
-// Landmarks lie in square buckets, row by row; start has the first of each bucket. A feature looks into the buckets that a
-// disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
+// Search for the landmarks near the end point of a feature, book table 6.5. Landmarks lie in square buckets, row by
+// row; start[i] is the first landmark of bucket i. A search visits the buckets that a disc around the feature's end
+// point touches, and evaluates the landmarks within the disc; others have a negligible density.
 // requires: error_free landmarks
 
-// A sum of densities is kept relative to one of them until another is e to this larger.
+// A sum of densities is relative to one of them, until another is larger by a factor of e^RELATIVE.
 #define RELATIVE 4
 
-// What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place.
+// Result of a search: the log density, of the likeliest landmark or with MARGINAL of all of them; the log density of
+// the likeliest one, and its index.
 typedef struct {
-    real found, best;
+    real log_p, best;
     int chosen;
 } Match;
 
-// Row or column of the bucket at a position; the nearest one outside.
+// Return the row or column of the bucket at a position, the nearest one for positions outside.
 int bucket_at(const real position, const real size, const int count) {
     return (int)clamp(floor(position / size), (real)0, (real)(count - 1));
 }
 
-// Whether a landmark lies in a feature's disc, no farther than what may still matter (squared), and within the limits of the sensor that it does not measure.
+// Return whether a landmark lies in a feature's disc, within the limits of the sensor that the feature does not
+// measure, and no farther from the end point than the square root of most.
 int near(const real4 off, const real4 turned, global const real *feature, const real most) {
     const real reach = feature[REACH], radius = feature[RADIUS], hole = feature[HOLE];
     const real x = off.x - reach * turned.x, y = off.z - reach * turned.z, squared = off.x * off.x + off.z * off.z;
     const real apart = x * x + y * y;
     if (apart > radius * radius || squared < hole * hole) return 0;
-    // That bound is for the end point itself.
+    // The bound most holds for a disc around the end point itself.
     if (reach > 0 && reach == feature[RANGE_AT] && apart > most) return 0;
     const real d = sqrt(squared);
     return d <= feature[FARTHEST] && turned.x * off.x + turned.z * off.z >= feature[AXIS] * d;
 }
 
-// Square of the radius around a feature's end point outside which exponents are larger than some: with r the error of the
-// range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b) <= b^2. A
-// little is added for what rounding takes from such distances.
+// Return the square of the radius around a feature's end point outside which exponents are larger than exponent. With r
+// the error of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 -
+// cos b) <= b^2. A factor and SLACK cover rounding errors of such distances.
 real squared_reach(const real exponent, global const real *feature) {
     if (!(exponent > 0)) return 0;
     const real r = sqrt(exponent) * feature[RANGE_SPREAD], b = sqrt(exponent) * feature[BEARING_SPREAD];
@@ -39,17 +41,17 @@ real squared_reach(const real exponent, global const real *feature) {
     return (real)1.01 * (r * r + z * (z + r) * (b * b)) + feature[SLACK];
 }
 
-// A match and one more landmark; sum is that of densities relative to found.
+// Update a match by one more landmark; sum is the sum of densities relative to match.log_p.
 Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
 #if MARGINAL
-    if (isinf(match.found)) {
-        match.found = log_p;
+    if (isinf(match.log_p)) {
+        match.log_p = log_p;
         *sum = (real2)(isinf(log_p) ? 0 : 1, 0);
-    } else if (log_p > match.found + RELATIVE) {
-        *sum = *sum * exp(match.found - log_p) + (real2)(1, 0);
-        match.found = log_p;
+    } else if (log_p > match.log_p + RELATIVE) {
+        *sum = *sum * exp(match.log_p - log_p) + (real2)(1, 0);
+        match.log_p = log_p;
     } else {
-        *sum = add_term(*sum, exp(log_p - match.found));
+        *sum = add_term(*sum, exp(log_p - match.log_p));
     }
 #endif
     if (log_p > match.best) {
@@ -59,6 +61,7 @@ Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
     return match;
 }
 
+// Return the match of a feature among the landmarks within its disc.
 Match search(global const real4 *landmark, global const real4 *signature, global const int *start, const real4 place,
              const real4 turned, global const real *feature, global const real *terms, global const real2 *arcs,
              const int rows, const int cols, const real size) {
@@ -66,7 +69,7 @@ Match search(global const real4 *landmark, global const real4 *signature, global
     real2 sum = 0;
     const real reach = feature[REACH], radius = feature[RADIUS];
     if (radius < 0) return match;
-    // What cannot be likelier than the best so far is not evaluated.
+    // Landmarks that cannot be likelier than the best so far are not evaluated.
     real most = INFINITY;
     const real x = place.x + reach * turned.x, y = place.z + reach * turned.z;
     const int left = bucket_at(x - radius, size, cols), right = bucket_at(x + radius, size, cols);
@@ -83,9 +86,9 @@ Match search(global const real4 *landmark, global const real4 *signature, global
         }
     }
 #if MARGINAL
-    if (!isinf(match.found)) match.found += log(sum.x + sum.y);
+    if (!isinf(match.log_p)) match.log_p += log(sum.x + sum.y);
 #else
-    match.found = match.best;
+    match.log_p = match.best;
 #endif
     return match;
 }

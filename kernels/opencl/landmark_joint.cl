@@ -1,13 +1,14 @@
-// The likeliest joint association of a few features, in which no two of them are the same landmark.
-// Features without a landmark are false positives. Landmarks are taken one after the other; best[s] is the largest sum of
-// log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may join
-// one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+// The likeliest joint association of a few features, in which no two features have the same landmark. Features without
+// a landmark are false positives. Landmarks are processed one after the other. A set s of features is a bit mask;
+// best[s] is the largest sum of log p over the features of s when all of them have landmarks that were processed. A
+// landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
 // requires: error_free landmarks landmark_grid
 
-// Features that a work-item has room for.
+// Largest number of features.
 #define MOST_FEATURES 8
 
-// One work-item a particle. choice[s] has the landmark of each feature of a set, and its log p at value; sets is 2^features.
+// Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set s,
+// and value[s] its log p; sets is 2^features.
 kernel void joint_features(global const real4 *landmark, global const real4 *signature, global const int2 *pose_cell,
                            global const real4 *pose, global const real4 *pose_low, global const real *feature,
                            global const real *terms, global const real2 *arcs, global real *best, global int *choice,
@@ -16,7 +17,7 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
                            const real size, const real fixed, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], own, low, size);
+    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
     global real *sums = best + (long)n * sets, *each = value + (long)n * sets * features;
     global int *who = choice + (long)n * sets * features;
     for (int s = 0; s < sets; ++s) sums[s] = s == 0 ? (real)0 : -INFINITY;
@@ -25,13 +26,14 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
         const real4 off = offset(landmark[j], place);
         real log_each[MOST_FEATURES];
         for (int k = 0; k < features; ++k) {
-            global const real *one = feature + FEATURE * k;
-            const real4 turned = direction(own, low, one);
+            global const real *numbers = feature + FEATURE * k;
+            const real4 turned = direction(high, low, numbers);
             log_each[k] = -INFINITY;
-            if (one[RADIUS] >= 0 && near(off, turned, one, INFINITY))
-                log_each[k] = either(log_detection(off, turned, one, signature[j], terms, arcs), one[FALSE_POSITIVE]);
+            if (numbers[RADIUS] >= 0 && near(off, turned, numbers, INFINITY))
+                log_each[k] = either(log_detection(off, turned, numbers, signature[j], terms, arcs),
+                                     numbers[FALSE_POSITIVE]);
         }
-        // From the full set down: the smaller sets do not have this landmark yet.
+        // From the full set down, since smaller sets must not yet contain this landmark.
         for (int s = sets - 1; s > 0; --s) {
             for (int k = 0; k < features; ++k) {
                 if (!(s >> k & 1)) continue;

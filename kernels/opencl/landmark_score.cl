@@ -1,60 +1,9 @@
 // Likelihood of a set of features for each particle, log p(f | x, m): the sum over features, book tables 6.4 and 6.5.
-// requires: error_free landmarks landmark_grid landmark_lanes
+// requires: error_free landmarks landmark_grid
 
-#if WIDE
-// One work-item has LANES particles; their sums are those of the scalar kernel.
-kernel void score_features(global const real4 *landmark, global const real4 *signature, global const int *start,
-                           global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
-                           global const real *feature, global const int *partner, global const real *terms,
-                           global const real2 *arcs, global real *log_p, global real *parts, global int *which,
-                           const int rows, const int cols, const int landmarks, const int particles,
-                           const int features, const real size, const real share, const real fixed,
-                           const real temperature) {
-    const int first_particle = LANES * get_global_id(0);
-    if (first_particle >= particles) return;
-    // The last particle stands in where there are no more.
-    real p[8][LANES];
-    for (int i = 0; i < LANES; ++i) {
-        const int n = min(first_particle + i, particles - 1);
-        const real4 own = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], own, low, size);
-        p[0][i] = place.x, p[1][i] = place.y, p[2][i] = place.z, p[3][i] = place.w;
-        p[4][i] = own.z, p[5][i] = low.z, p[6][i] = own.w, p[7][i] = low.w;
-    }
-    const Spot place = {{load_lanes(0, p[0]), load_lanes(0, p[1])}, {load_lanes(0, p[2]), load_lanes(0, p[3])}};
-    const Spot heading = {{load_lanes(0, p[4]), load_lanes(0, p[5])}, {load_lanes(0, p[6]), load_lanes(0, p[7])}};
-    Two total = {(lanes)fixed, (lanes)0};
-    ilanes lost = 0;
-    for (int first = 0; first < features; first += BLOCK_TERMS) {
-        const int last = min(first + BLOCK_TERMS, features);
-        lanes block = 0;
-        for (int k = first; k < last; ++k) {
-            global const real *one = feature + FEATURE * k;
-            const Spot turned = lane_direction(heading, one);
-#if KNOWN
-            const lanes found = lane_detection(lane_offset(landmark[partner[k]], place), turned, one, terms);
-#else
-            const lanes found = lane_search(landmark, start, place, turned, one, terms, rows, cols, size);
-#endif
-            const lanes value = lane_either(found, one[FALSE_POSITIVE]);
-            const ilanes never = !(value > -INFINITY);
-            lost |= never;
-            block += never ? (lanes)0 : value;
-        }
-        const Two sum = lane_sum(total.hi, block);
-        total = (Two){sum.hi, total.lo + sum.lo};
-    }
-    const lanes all = lost ? (lanes)-INFINITY : temperature * (total.hi + total.lo);
-    if (first_particle + LANES <= particles) {
-        store_lanes(all, 0, log_p + first_particle);
-    } else {
-        store_lanes(all, 0, p[0]);
-        for (int i = 0; first_particle + i < particles; ++i) log_p[first_particle + i] = p[0][i];
-    }
-}
-#else
-// One work-item a particle: the sum of log p over features, with the partner that is KNOWN, of all landmarks (MARGINAL), or
-// of the likeliest one. With PER_BEAM also what each feature adds, and its likeliest landmark's place in the buckets, -1
-// where a false positive is likelier. share is log(1 / landmarks), the prior of each one with MARGINAL and else 0.
+// Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item takes a
+// particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest landmark, -1 where
+// a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a landmark, else 0.
 kernel void score_features(global const real4 *landmark, global const real4 *signature, global const int *start,
                            global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
                            global const real *feature, global const int *partner, global const real *terms,
@@ -64,36 +13,36 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
                            const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], own, low, size);
+    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
     real2 total = (real2)(fixed, 0);
-    int lost = 0;
+    int impossible = 0;
     for (int first = 0; first < features; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, features);
         real block = 0;
         for (int k = first; k < last; ++k) {
-            global const real *one = feature + FEATURE * k;
-            const real4 turned = direction(own, low, one);
+            global const real *numbers = feature + FEATURE * k;
+            const real4 turned = direction(high, low, numbers);
 #if KNOWN
             const int j = partner[k];
-            const real found = log_detection(offset(landmark[j], place), turned, one, signature[j], terms, arcs);
-            const Match match = {found, found, j};
+            const real detected = log_detection(offset(landmark[j], place), turned, numbers, signature[j], terms, arcs);
+            const Match match = {detected, detected, j};
 #else
-            const Match match = search(landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size);
+            const Match match = search(landmark, signature, start, place, turned, numbers, terms, arcs, rows, cols,
+                                       size);
 #endif
-            const real value = either(match.found + share, one[FALSE_POSITIVE]);
-            lost |= isinf(value);
+            const real value = either(match.log_p + share, numbers[FALSE_POSITIVE]);
+            impossible |= isinf(value);
             block += isinf(value) ? (real)0 : value;
 #if PER_BEAM
             parts[(long)n * features + k] = value;
 #if KNOWN
             which[(long)n * features + k] = j;
 #else
-            which[(long)n * features + k] = match.best + share >= one[FALSE_POSITIVE] ? match.chosen : -1;
+            which[(long)n * features + k] = match.best + share >= numbers[FALSE_POSITIVE] ? match.chosen : -1;
 #endif
 #endif
         }
         total = add_term(total, block);
     }
-    log_p[n] = lost ? -INFINITY : temperature * (total.x + total.y);
+    log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
 }
-#endif

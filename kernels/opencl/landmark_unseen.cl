@@ -1,13 +1,13 @@
-// Negative information: landmarks that the sensor should see from a pose, and that no feature is.
+// Negative information: landmarks that the sensor should see from a pose, but that belong to no feature.
 // requires: error_free landmarks landmark_grid
 
-// Whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
+// Return whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
 int in_view(const real4 off, const real cosine, const real sine, const real range_max, const real least) {
     const real d = sqrt(off.x * off.x + off.z * off.z);
     return d <= range_max && cosine * off.x + sine * off.z >= least * d;
 }
 
-// One work-item a particle: add log_missed to log_p for every landmark in view that none of its features is.
+// Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
 kernel void count_unseen(global const real4 *landmark, global const int *start, global const int2 *pose_cell,
                          global const real4 *pose, global const real4 *pose_low, global const int *which,
                          global real *log_p, const int rows, const int cols, const int particles, const int features,
@@ -15,8 +15,9 @@ kernel void count_unseen(global const real4 *landmark, global const int *start, 
                          const real least, const real log_missed) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 own = pose[n], place = sensor_place(pose_cell[n], own, pose_low[n], size);
-    const real cosine = own.z * axis_cosine - own.w * axis_sine, sine = own.w * axis_cosine + own.z * axis_sine;
+    const real4 sensor_pose = pose[n], place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], size);
+    const real cosine = sensor_pose.z * axis_cosine - sensor_pose.w * axis_sine;
+    const real sine = sensor_pose.w * axis_cosine + sensor_pose.z * axis_sine;
     const int left = bucket_at(place.x - range_max, size, cols), right = bucket_at(place.x + range_max, size, cols);
     const int high = bucket_at(place.z + range_max, size, rows);
     int unseen = 0;

@@ -1,12 +1,12 @@
 // Density of one feature (range, bearing, signature) at one landmark, book table 6.4, with normalised components.
 //     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
-// d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m is
-// the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A part
-// that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an error
-// of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
-// A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
-// (x, its low part, y, its low part), and so are an offset and a direction.
-// terms[4] = {range_max, its low part, field of view, density of a bearing at zero range over that of its peak and scale}.
+// d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi].
+// m is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
+// Components that were not measured are left out. Positions, directions and quantities derived from them are sums of
+// two numbers, since a relative error of eps in a distance of 20 m is far too much beside a deviation of 1 cm. A
+// feature is FEATURE numbers, which are named below, in the same order in all three languages. A place is (x, its low
+// part, y, its low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view,
+// density of a bearing at zero range over that of its peak and scale}.
 // requires: error_free log_terms offsets
 
 // Range; cosine and sine of the bearing on the robot; signature.
@@ -18,7 +18,8 @@
 #define SINE_LOW 5
 #define SIGNATURE_AT 6
 #define SIGNATURE_LOW 7
-// 1 / (sigma sqrt 2), 0 for what was not measured; log of z_detect and of the components' peaks; log of the false positive.
+// 1 / (sigma sqrt 2), 0 for components that were not measured; log of z_detect and of the components' peaks; log of the
+// false positive.
 #define RANGE_SCALE 8
 #define RANGE_SCALE_LOW 9
 #define BEARING_SCALE 10
@@ -31,16 +32,17 @@
 // From the bearing to the upper end of the field of view.
 #define UPPER 17
 #define UPPER_LOW 18
-// Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, can matter; RADIUS is
-// negative where none can.
+// Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is
+// not negligible; RADIUS is negative where none has.
 #define REACH 19
 #define RADIUS 20
 #define HOLE 21
-// What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
+// The sensor's limits for components that a feature does not measure: the distance, the cosine of the angle to the
+// axis.
 #define FARTHEST 22
 #define AXIS 23
-// sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be; and what
-// squares of distances are off at most.
+// sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
+// density; and the largest error of squared distances.
 #define RANGE_SPREAD 24
 #define BEARING_SPREAD 25
 #define MOST 26
@@ -48,18 +50,18 @@
 #define FEATURE 28
 // Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
 #define ARC_STEPS 8
-// Nearer than a micrometre every bearing is as likely.
+// Below this distance [m] all bearings are equally likely.
 #define ZERO_RANGE ((real)1e-6)
-// Above this the error function is 1 to the last bit.
+// From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 
-// Sensors in metres from the origin of the buckets, whose side, a power of two, is size.
+// Return the place of a sensor in metres from the origin of the buckets; size, a power of two, is the side of a bucket.
 real4 sensor_place(const int2 cell, const real4 pose, const real4 low, const real size) {
     const real2 x = two_sum((real)cell.x, pose.x), y = two_sum((real)cell.y, pose.y);
     return size * (real4)(x.x, x.y + low.x, y.x, y.y + low.y);
 }
 
-// Direction in the world in which a feature was seen: the heading, turned by the bearing.
+// Return the direction of a feature in the world: the heading, turned by the bearing.
 real4 direction(const real4 pose, const real4 pose_low, global const real *feature) {
     const real c = feature[COSINE], s = feature[SINE], c_low = feature[COSINE_LOW], s_low = feature[SINE_LOW];
     const real2 cc = two_product(pose.z, c), ss = two_product(pose.w, s);
@@ -71,7 +73,7 @@ real4 direction(const real4 pose, const real4 pose_low, global const real *featu
 }
 
 #if BEARING
-// Part of an offset to the left of a direction.
+// Return the component of an offset to the left of a direction.
 real2 across(const real4 off, const real4 turned) {
     const real2 right = two_product(turned.x, off.z), left = two_product(turned.z, off.x);
     const real2 sum = two_sum(right.x, -left.x);
@@ -79,7 +81,7 @@ real2 across(const real4 off, const real4 turned) {
     return (real2)(sum.x, sum.y + ((right.y - left.y) + low));
 }
 
-// Part of an offset along a direction.
+// Return the component of an offset along a direction.
 real2 along(const real4 off, const real4 turned) {
     const real2 x = two_product(turned.x, off.x), y = two_product(turned.z, off.z);
     const real2 sum = two_sum(x.x, y.x);
@@ -87,14 +89,14 @@ real2 along(const real4 off, const real4 turned) {
     return (real2)(sum.x, sum.y + ((x.y + y.y) + low));
 }
 
-// arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
+// Return arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
 real arc_series(const real t) {
     const real z = t * t;
     const real high = (real)1 / 9 + z * ((real)-1 / 11 + z * ((real)1 / 13 + z * ((real)-1 / 15)));
     return z * ((real)-1 / 3 + z * ((real)1 / 5 + z * ((real)-1 / 7 + z * high)));
 }
 
-// Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series.
+// Return the angle of an offset in (-pi, pi]: the arc of the nearest slope i / 8, and a series for the rest.
 real2 angle_pair(const real2 side, const real2 ahead, global const real2 *arcs) {
     const real2 a = signbit(ahead.x) ? -ahead : ahead, b = signbit(side.x) ? -side : side;
     const int steep = b.x > a.x;
@@ -118,7 +120,7 @@ real2 angle_pair(const real2 side, const real2 ahead, global const real2 *arcs) 
 #endif
 
 #if RANGE
-// Mass of the normal around d on [0, range_max]; that of range_max itself where d is beyond.
+// Return the mass of the normal around d on [0, range_max]; d is clamped to range_max.
 real range_mass(const real2 d, const real scale, global const real *terms) {
     const real below = fmin(d.x, terms[0]) * scale;
     const real above = fmax((terms[0] - d.x) + (terms[1] - d.y), (real)0) * scale;
@@ -128,8 +130,8 @@ real range_mass(const real2 d, const real scale, global const real *terms) {
 #endif
 
 #if FIELD
-// Mass of the normal around a landmark's bearing on the field of view; at its end where the landmark is beyond. A part of
-// the field more than half a turn away from the landmark is nearer the other way round.
+// Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its ends.
+// Parts of the field more than half a turn away from the landmark are nearer in the other direction.
 real field_mass(const real2 angle, const real upper, const real upper_low, const real scale, global const real *terms,
                 global const real2 *arcs) {
     const real half_turn = arcs[ARC_STEPS + 2].x, whole = 2 * half_turn, field = terms[2];
@@ -147,15 +149,15 @@ real field_mass(const real2 angle, const real upper, const real upper_low, const
 }
 #endif
 
-// An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel.
+// Add (residual * scale)^2 to an exponent, in two parts, since exponents and peaks may nearly cancel.
 real2 add_square(const real2 total, const real2 residual, const real scale, const real scale_low) {
     const real2 u = pair_product(residual, (real2)(scale, scale_low));
     const real2 more = pair_sum(total, pair_product(u, u));
-    // What overflows has no low part.
+    // After an overflow there is no low part.
     return (real2)(more.x, isfinite(more.y) ? more.y : (real)0);
 }
 
-// log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
+// Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
 real log_detection(const real4 off, const real4 turned, global const real *feature, const real4 signature,
                    global const real *terms, global const real2 *arcs) {
     real2 exponent = 0;
@@ -178,7 +180,7 @@ real log_detection(const real4 off, const real4 turned, global const real *featu
             mass *= field_mass(angle, feature[UPPER], feature[UPPER_LOW], feature[BEARING_SCALE], terms, arcs);
 #endif
         } else {
-            // The density is 1 / field, which is the peak over that.
+            // The density is 1 / field: the peak times terms[3] and the scale.
             mass *= terms[3] * feature[BEARING_SCALE];
         }
     }

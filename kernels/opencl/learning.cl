@@ -1,15 +1,15 @@
 // Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
-// terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN only fills up a
-// block. p_hit has its mean at z* + range_bias, held within [0, range_max]; p_short's obstacles lie before z*.
-// r are the responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances
-// x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+// terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is padding.
+// The mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
+// responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
+// and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
 //     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
 //     Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
 // log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
 //     h_s = u^2 - 1 + T,  h_m = u + P,  h_ss = -2 u^2 - T + U + T^2,  h_sm = -2 u - P + Q,  h_mm = -1 + T + P^2
 // and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
 //     s_l = 1 - v - lambda z,  s_ll = v (f - 1) - lambda z.
-// requires: mixture error_free lanes
+// requires: mixture error_free
 
 #define ROOT_2PI ((real)2.5066282746310002)
 #if INFORMATION
@@ -18,14 +18,13 @@
 #define SUMS 14
 #endif
 
-#if !WIDE
-// Where p_hit has its mean.
+// Return the mean of p_hit.
 real hit_mean(const real expected, global const real *terms) {
     const real mean = expected + terms[10];
     return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
 }
 
-// log p(z | z*) and the responsibilities of hit, short and rand for it: 0 where the density is 0.
+// Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
 real4 responsibilities(const real z, const real expected, global const real *terms) {
     const real hit = log_hit(z, hit_mean(expected, terms), terms), shorter = log_short(z, expected, terms);
     const real largest = fmax(fmax(hit, shorter), terms[5]);
@@ -35,10 +34,10 @@ real4 responsibilities(const real z, const real expected, global const real *ter
     return (real4)(largest + log(p), p_hit / p, p_short / p, p_rand / p);
 }
 
-// What a pair adds to the sums: log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm,
-// r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
-// triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
-// r_hit h_m^2, r_short s_l^2.
+// Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
+// r_hit h_mm, r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest
+// cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2,
+// r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
 void add_pair(const real z, const real expected, global const real *terms, real *sums) {
     const real4 r = responsibilities(z, expected, terms);
     real h_s = 0, h_m = 0, h_ss = 0, h_sm = 0, h_mm = 0, s_l = 0, s_ll = 0;
@@ -60,7 +59,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
         h_ss = -2 * u * u - t + w + t * t;
         h_sm = -2 * u - p + q;
         h_mm = -1 + t + p * p;
-        // A mean that is held does not move with the bias.
+        // A mean that is clamped does not move with the bias.
         if (mean != expected + terms[10]) h_m = h_sm = h_mm = 0;
     }
     if (r.z > 0) {
@@ -96,130 +95,14 @@ void add_pair(const real z, const real expected, global const real *terms, real 
 #endif
 }
 
-#else
-// The same in lanes, a pair in each. Functions of vectors are PoCL's own, which cost far less a number than its scalar ones.
-lanes hit_mean(const lanes expected, global const real *terms) {
-    const lanes mean = expected + terms[10], held = mean > terms[6] ? (lanes)terms[6] : mean;
-    return held < 0 ? (lanes)0 : held;
-}
-
-lanes hit_mass(const lanes mean, const real erf_scale, const real range_max) {
-    const lanes below = mean * erf_scale, above = (range_max - mean) * erf_scale;
-    const lanes nearer = below < above ? below : above, farther = below < above ? above : below;
-    if (!some(nearer <= ERF_ONE)) return (lanes)1;
-    const lanes rest = some(farther <= ERF_ONE) ? erf(farther) : (lanes)1;
-    return nearer > ERF_ONE ? (lanes)1 : (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
-}
-
-lanes short_factor(const lanes x) {
-    const lanes h = (real)0.5 * x;
-    return h > TINY_DECAY ? h / tanh(h) + h : (lanes)1;
-}
-
-// What pairs add to the sums of their lanes.
-void add_pair(const lanes reading, const lanes ahead, global const real *terms, lanes *sums) {
-    // Pairs that fill up have no weight; in their place stands one that can be computed with.
-    const ilanes known = reading == reading;
-    const lanes z = known ? reading : (lanes)0, expected = known ? ahead : (lanes)0;
-
-    const lanes mean = hit_mean(expected, terms), mass = hit_mass(mean, terms[2], terms[6]), from = z - mean;
-    const lanes f = short_factor(terms[4] * expected);
-    lanes hit = terms[0] - from * (from * terms[1]) + terms[8];
-    const ilanes cut = mass < 1;
-    if (some(cut)) hit -= cut ? log(mass) : (lanes)0;
-    const lanes length = expected > 0 ? expected : (lanes)1;
-    lanes shorter = terms[3] + log(f) - log(length) - terms[4] * z;
-    shorter = (z <= expected) & (expected > 0) ? shorter : (lanes)-INFINITY;
-    lanes largest = hit > shorter ? hit : shorter;
-    largest = largest > terms[5] ? largest : (lanes)terms[5];
-    const ilanes possible = largest > -INFINITY;
-    const lanes shift = possible ? largest : (lanes)0;
-    lanes r_hit = exp(hit - shift), r_short = exp(shorter - shift), r_rand = exp(terms[5] - shift);
-    const lanes p = possible ? r_hit + r_short + r_rand : (lanes)1;
-    const lanes part = known ? 1 / p : (lanes)0;
-    r_hit *= part;
-    r_short *= part;
-    r_rand *= part;
-
-    const lanes u = from * terms[11], square = u * u;
-    lanes t = 0, q = 0, w = 0, slope = 0;
-    if (some(cut)) {
-        const lanes x_0 = mean * terms[11], x_1 = (terms[6] - mean) * terms[11];
-        const lanes phi_0 = cut ? exp((real)-0.5 * x_0 * x_0) / (ROOT_2PI * mass) : (lanes)0;
-        const lanes phi_1 = cut ? exp((real)-0.5 * x_1 * x_1) / (ROOT_2PI * mass) : (lanes)0;
-        t = x_0 * phi_0 + x_1 * phi_1;
-        slope = phi_1 - phi_0;
-        q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + slope * t;
-        w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1;
-    }
-    // A mean that is held does not move with the bias.
-    const lanes moved = mean == expected + terms[10] ? r_hit : (lanes)0;
-    // Where there is no such cause, its terms may be infinite.
-    const ilanes is_hit = r_hit > 0, is_short = r_short > 0;
-    const lanes h_s = is_hit ? square - 1 + t : (lanes)0, h_m = moved > 0 ? u + slope : (lanes)0;
-    const lanes v = f - terms[4] * expected;
-    const lanes s_l = is_short ? 1 - v - terms[4] * z : (lanes)0;
-    const lanes off = z - expected;
-    sums[0] += known ? largest + log(p) : (lanes)0;
-    sums[1] += r_hit;
-    sums[2] += r_short;
-    sums[3] += r_rand;
-    sums[4] += r_hit * h_s;
-    sums[5] += r_hit * h_m;
-    sums[6] += r_short * s_l;
-    sums[7] += is_hit ? r_hit * (-2 * square - t + w + t * t) : (lanes)0;
-    sums[8] += moved > 0 ? moved * (-2 * u - slope + q) : (lanes)0;
-    sums[9] += moved > 0 ? moved * (-1 + t + slope * slope) : (lanes)0;
-    sums[10] += is_short ? r_short * (v * (f - 1) - terms[4] * z) : (lanes)0;
-    sums[11] += r_hit * off * off;
-    sums[12] += r_hit * off;
-    sums[13] += r_short * z;
-#if INFORMATION
-    sums[14] += (r_rand > r_hit) & (r_rand > r_short) ? (lanes)1 : (lanes)0;
-    const lanes y[6] = {r_hit, r_short, r_rand, r_hit * h_s, r_hit * h_m, r_short * s_l};
-    int place = 15;
-    for (int i = 0; i < 6; ++i)
-        for (int j = i; j < 6; ++j) sums[place++] += y[i] * y[j];
-    sums[36] += r_hit * h_s * h_s;
-    sums[37] += r_hit * h_s * h_m;
-    sums[38] += r_hit * h_m * h_m;
-    sums[39] += r_short * s_l * s_l;
-#endif
-}
-#endif
-
-#if WIDE
-// One work-item a block of pairs, which lie one after the other (along is 1): as many as fill all lanes.
+// Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
 kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
                    global real *sums, const int blocks, const int readings, const int across, const int along,
                    const int width) {
     const int block = get_global_id(0);
     if (block >= blocks) return;
-    global const real *z = reading + (long)block * across, *ahead = expected + (long)block * across;
-    real total[SUMS], lost[SUMS];
-    lanes part[SUMS];
-    for (int j = 0; j < SUMS; ++j) total[j] = lost[j] = 0;
-    for (int first = 0; first < readings; first += BLOCK_TERMS * LANES) {
-        const int last = min(first + BLOCK_TERMS * LANES, readings);
-        for (int j = 0; j < SUMS; ++j) part[j] = 0;
-        for (int k = first; k < last; k += LANES) add_pair(load_lanes(0, z + k), load_lanes(0, ahead + k), terms, part);
-        for (int j = 0; j < SUMS; ++j) {
-            const real2 sum = add_term((real2)(total[j], lost[j]), sum_lanes(part[j]));
-            total[j] = sum.x;
-            lost[j] = sum.y;
-        }
-    }
-    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + lost[j];
-}
-#else
-// One work-item a block of pairs, each along farther than the last, from number block * across on.
-kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
-                   global real *sums, const int blocks, const int readings, const int across, const int along,
-                   const int width) {
-    const int block = get_global_id(0);
-    if (block >= blocks) return;
-    real total[SUMS], lost[SUMS], part[SUMS];
-    for (int j = 0; j < SUMS; ++j) total[j] = lost[j] = 0;
+    real total[SUMS], total_low[SUMS], part[SUMS];
+    for (int j = 0; j < SUMS; ++j) total[j] = total_low[j] = 0;
     for (int first = 0; first < readings; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, readings);
         for (int j = 0; j < SUMS; ++j) part[j] = 0;
@@ -228,15 +111,15 @@ kernel void e_step(global const real *reading, global const real *expected, glob
             if (!isnan(reading[n])) add_pair(reading[n], expected[n], terms, part);
         }
         for (int j = 0; j < SUMS; ++j) {
-            const real2 sum = add_term((real2)(total[j], lost[j]), part[j]);
+            const real2 sum = add_term((real2)(total[j], total_low[j]), part[j]);
             total[j] = sum.x;
-            lost[j] = sum.y;
+            total_low[j] = sum.y;
         }
     }
-    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + lost[j];
+    for (int j = 0; j < SUMS; ++j) sums[(long)block * width + j] = total[j] + total_low[j];
 }
 
-// One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.
+// Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
 kernel void pair_causes(global const real *reading, global const real *expected, global const real *terms,
                         global real4 *causes, const int blocks, const int readings, const int across,
                         const int along) {
@@ -247,4 +130,3 @@ kernel void pair_causes(global const real *reading, global const real *expected,
         causes[n] = isnan(reading[n]) ? (real4)(NAN) : responsibilities(reading[n], expected[n], terms);
     }
 }
-#endif

@@ -1,10 +1,10 @@
 // Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed"):
-// for each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+// for each cell and bin the range from the cell's centre in the bin's direction, in units of limit / 65 535.
 // requires: ray
 
 typedef ushort entry;
 
-// Distance in cells as the table has it, or limit where there is no obstacle nearer.
+// Return the distance in cells from the table, limit where no obstacle is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     int col = cell.x, row = cell.y;

@@ -1,7 +1,7 @@
 // The look-up table of expected ranges, filled by the exact caster from the centres of cells, some rows at a time.
 // requires: raycast
 
-// One work-item a bin and cell; a hit is 65 534 parts of the limit at most.
+// Fill rows of the table: one work-item takes a bin and cell. A hit is at most 65 534; 65 535 means no hit.
 kernel void fill_lookup(global const ushort *rectangles, global const real2 *ray, global ushort *lookup, const int rows,
                         const int cols, const int bins, const int first_row, const int count, const real limit) {
     const int bin = get_global_id(0), index = get_global_id(1);

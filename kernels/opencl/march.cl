@@ -1,21 +1,15 @@
-// Expected range by marching through the distance field (sphere tracing): at each place the ray steps by the distance
-// from the cell's centre to the nearest obstacle's centre, less slack, and by tolerance at least.
-// With slack sqrt(2) no step passes an obstacle but the least one, so a range is too long by at most tolerance, and an
-// obstacle is missed only where the ray's way through it is shorter than that. With slack 0 (what other programs do) a
-// step may pass obstacles.
+// Expected range by marching through the distance field (sphere tracing): each step is the distance from the current
+// cell's centre to the nearest obstacle's centre less slack, and at least tolerance. With slack sqrt(2) only steps of
+// length tolerance may pass an obstacle: a range is too long by at most tolerance, and an obstacle is missed only where
+// the ray's path through it is shorter than that. With slack 0, as in other programs, any step may pass obstacles.
 // requires: ray
 
 typedef float entry;
 
-// A step that is told from none at any distance, as a part of it.
+// Smallest step relative to the distance, so that every step changes the distance.
 #define LEAST_STEP ((real)2.384185791015625e-7)
 
-int whole_below(const real a) {
-    const int whole = (int)a;
-    return whole - ((real)whole > a);
-}
-
-// Distance in cells to a place in an occupied cell, or limit where none is found nearer.
+// Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const Ray r = make_ray(pose, ray);
@@ -31,8 +25,8 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     }
 #endif
     while (t < limit) {
-        const int col = cell.x + whole_below(pose.x + t * r.direction.x);
-        const int row = cell.y + whole_below(pose.y + t * r.direction.y);
+        const int col = cell.x + floor_int(pose.x + t * r.direction.x);
+        const int row = cell.y + floor_int(pose.y + t * r.direction.y);
 #if OUTSIDE_OCCUPIED
         if (off_grid(col, row, rows, cols)) return t;
 #else

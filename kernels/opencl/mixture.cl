@@ -1,21 +1,18 @@
-// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding
-// took from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
-// z_rand / range_max; in the log domain their logarithms.
-// requires: lanes lane_math error_free
+// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom. terms[10]
+// = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of terms 0
+// and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in
+// the log domain they are the logarithms of these.
+// requires: error_free
 
-// Above this the error function is 1 to the last bit.
+// From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
 #define TINY_DECAY ((real)1e-30)
 #define SMALLEST_RANGE ((real)1e-37)
-// Up to this 1 - exp(-x) is x within a quarter of the last bit of float32.
-#define SMALL_DECAY 2.98023224e-08f
 
-#if !WIDE
 #if HIT
-// Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels. Most
-// ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
+// Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing cancels.
+// Most ranges are far from both ends and most others far from one of them; rays without an obstacle are at one end.
 real hit_mass(const real expected, const real erf_scale, const real range_max) {
     const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
     const real nearer = below < above ? below : above, farther = below < above ? above : below;
@@ -24,8 +21,8 @@ real hit_mass(const real expected, const real erf_scale, const real range_max) {
     return (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
 }
 
-// (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large and
-// nearly cancel, and the second part keeps the digits that are left.
+// Return (z - z*)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
+// large and nearly cancel; the second part keeps the digits that remain.
 real2 hit_exponent(const real z, const real expected, global const real *terms) {
     const real off = z - expected;
 #if SHARP
@@ -37,7 +34,7 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
 #endif
 }
 
-// Terms of the log domain: log of z_hit p_hit(z | z*).
+// Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
 real log_hit(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
     const real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
@@ -46,57 +43,29 @@ real log_hit(const real z, const real expected, global const real *terms) {
 #endif
 
 #if SHORT
-// x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
+// Return x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
 real short_factor(const real x) {
     const real h = (real)0.5 * x;
     return h > TINY_DECAY ? h / tanh(h) + h : (real)1;
 }
 
-// Terms of the log domain: log of z_short p_short(z | z*).
+// Return log(z_short p_short(z | z*)); terms are those of the log domain.
 real log_short(const real z, const real expected, global const real *terms) {
     if (!(z <= expected && expected > 0)) return -INFINITY;
     return terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
 }
 
-// short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
+// Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
 real short_peak(const real lambda, const real expected) {
     const real h = (real)0.5 * (lambda * expected), t = tanh(h);
     const real shortest = expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE;
     return (h > TINY_DECAY ? lambda * (1 + t) : (real)1) / (h > TINY_DECAY ? 2 * t : shortest);
 }
 #endif
-#endif
 
-#if WIDE
-#if !FLOAT64
-// p_rand is at least 1e-30 times the larger of 1 and the peak, so components may underflow one by one, from 2e-38 on, and
-// one logarithm is enough.
-lanes log_density(const lanes z, const lanes expected, global const real *terms) {
-    lanes p = terms[5];
-#if HIT
-    const lanes off = z - expected, hit = terms[0] * exp_lanes(off * (off * -terms[1]));
-    // The mass is 1 unless the nearer end is near.
-    const lanes below = expected * terms[2], above = (terms[6] - expected) * terms[2];
-    const lanes nearer = below < above ? below : above;
-    if (some(nearer < ERF_ONE))
-        p += hit / (0.5f * (erf_lanes(nearer) + erf_lanes(below < above ? above : below)));
-    else
-        p += hit;
-#endif
-#if SHORT
-    // short_factor(x) / z* with one division: (1 - exp(-x)) / lambda is z* to the last bit where x is small.
-    const lanes x = terms[4] * expected;
-    const lanes length = x > SMALL_DECAY ? one_minus_exp(-x) * (1 / terms[4]) : expected;
-    const lanes divisor = length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
-    const lanes within = terms[3] * exp_lanes(-terms[4] * z) / divisor;
-    p += ((z <= expected) & (expected > 0)) ? within : (lanes)0;
-#endif
-    return log_lanes(p);
-}
-#endif
-#else
 #if LINEAR
-// p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
+// Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is
+// enough.
 real log_density(const real z, const real expected, global const real *terms) {
     real p = 0;
 #if HIT
@@ -110,7 +79,8 @@ real log_density(const real z, const real expected, global const real *terms) {
     return log(p + terms[5]);
 }
 #else
-// Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
+// Return log p(z | z*). Without a sufficient p_rand every component stays a logarithm; -inf only where the mixture is
+// 0.
 real log_density(const real z, const real expected, global const real *terms) {
     real largest = -INFINITY;
 #if HIT
@@ -141,5 +111,4 @@ real log_density(const real z, const real expected, global const real *terms) {
     return largest + log(p);
 #endif
 }
-#endif
 #endif

@@ -1,14 +1,14 @@
-// Offsets between places in sums of two numbers: an error of eps in 20 m is too much beside a deviation of 1 cm.
-// A place is (x, its low part, y, its low part), and so is an offset.
+// Offsets between places in sums of two numbers: a relative error of eps in 20 m is too much beside a deviation of 1
+// cm. A place is (x, its low part, y, its low part), and so is an offset.
 // requires: error_free
 
-// From a sensor to a landmark or beacon, which is x, y, and the low parts of both.
+// Return the offset from a sensor to a landmark or beacon, which has x, y, and the low parts of both.
 real4 offset(const real4 landmark, const real4 place) {
     const real2 x = two_sum(landmark.x, -place.x), y = two_sum(landmark.y, -place.z);
     return (real4)(two_sum(x.x, x.y + (landmark.z - place.y)), two_sum(y.x, y.y + (landmark.w - place.w)));
 }
 
-// Length of an offset: the rounded root, and what one step of Newton's method adds.
+// Return the length of an offset: the rounded root, and the correction of one step of Newton's method.
 real2 distance_pair(const real4 off) {
     const real2 xx = two_product(off.x, off.x), yy = two_product(off.z, off.z), sum = two_sum(xx.x, yy.x);
     const real d = sqrt(sum.x);

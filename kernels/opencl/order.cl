@@ -1,24 +1,25 @@
-// An order of particles in which neighbours have much the same position and heading: then their rays meet the same
-// cells, and none waits long for another. Which order it is changes no result.
+// An order of particles in which neighbours have similar positions and headings. Their rays then meet the same cells,
+// and none waits long for another. The order changes no result.
 // requires: ray
 
-// Samples of the particles; bins of rows, of columns and of headings; work-items that count starts.
+// Sampled particles; bins per axis (rows, columns, headings); and bins per work-item of order_starts.
 #define SAMPLES 256
 #define BINS 32
 #define ALL_BINS (BINS * BINS * BINS)
 #define STRETCH 16
-// Parts of a turn.
+// Units of a turn.
 #define TURN ((real)65536)
 
-// Heading relative to the first particle's, from -TURN / 2 to TURN / 2.
+// Return the heading relative to that of the first particle, from -TURN / 2 to TURN / 2.
 int relative_turn(const real4 pose, const real4 other) {
     const real2 heading = (real2)(pose.z * other.z + pose.w * other.w, pose.w * other.z - pose.z * other.w);
     const int turn = (int)(turn_of(heading) * TURN);
     return 2 * turn > (int)TURN ? turn - (int)TURN : turn;
 }
 
-// One work-item a bin, which it empties; some of them look at a particle each. bounds, which the caller sets to
-// -2^31, become the largest of minus the smallest and the largest row, column and heading of those, and last 0.
+// Clear the bins and find the bounds: one work-item takes a bin, and the first SAMPLES of them a particle each. bounds,
+// which the caller sets to -2^31, become the negated smallest and the largest row, column and heading of these
+// particles; the last one becomes 0.
 kernel void order_bounds(global const int2 *pose_cell, global const real4 *pose, global int *bounds, global int *bins,
                          const int particles) {
     const int bin = get_global_id(0);
@@ -36,13 +37,13 @@ kernel void order_bounds(global const int2 *pose_cell, global const real4 *pose,
     atomic_max(&bounds[5], turn);
 }
 
-// Which of BINS equal parts of the bounds; what is beyond them belongs to the outermost.
+// Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost.
 int part_of(const int value, const int least, const int most) {
     const real part = ((real)value - (real)least) * ((real)BINS / ((real)most - (real)least + 1));
     return part < 0 ? 0 : part >= BINS ? BINS - 1 : (int)part;
 }
 
-// One work-item a particle: its bin, which counts it.
+// Find the bin of each particle, and count it there. One work-item takes a particle.
 kernel void order_count(global const int2 *pose_cell, global const real4 *pose, global const int *bounds,
                         global int *bins, global int *bin_of, const int particles) {
     const int n = get_global_id(0);
@@ -55,26 +56,26 @@ kernel void order_count(global const int2 *pose_cell, global const real4 *pose, 
     atomic_add(&bins[bin], 1);
 }
 
-// One work-item a stretch of bins, which lie together: from how many particles each has to where they begin.
+// Replace the counts of bins by the indices at which they begin. One work-item takes a stretch of neighbouring bins.
 kernel void order_starts(global int *bounds, global int *bins) {
     const int stretch = get_global_id(0);
     if (stretch >= ALL_BINS / STRETCH) return;
-    global int *own = bins + stretch * STRETCH;
-    // All are read before any is added, so that a work-item waits once for them.
+    global int *counted = bins + stretch * STRETCH;
+    // All are read before any is used, so that a work-item waits once for them.
     int counts[STRETCH], sum = 0;
 #pragma unroll
-    for (int i = 0; i < STRETCH; ++i) counts[i] = own[i];
+    for (int i = 0; i < STRETCH; ++i) counts[i] = counted[i];
 #pragma unroll
     for (int i = 0; i < STRETCH; ++i) sum += counts[i];
     int start = atomic_add(&bounds[6], sum);
 #pragma unroll
     for (int i = 0; i < STRETCH; ++i) {
-        own[i] = start;
+        counted[i] = start;
         start += counts[i];
     }
 }
 
-// One work-item a particle: it takes the next place of its bin.
+// Put each particle at the next index of its bin. One work-item takes a particle.
 kernel void order_fill(global const int *bin_of, global int *bins, global int *order, const int particles) {
     const int n = get_global_id(0);
     if (n >= particles) return;

@@ -1,5 +1,5 @@
-// Poses on their way into a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
-// Only +, -, *, /, floor and comparisons are used, so that every device places a pose alike to the last bit.
+// Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading. Only +, -, *,
+// /, floor and comparisons are used, so that every device gives the same bits.
 // requires: heading
 
 #if POSES_FLOAT32
@@ -8,7 +8,7 @@ typedef float coordinate;
 typedef double coordinate;
 #endif
 
-// Cells farther off than this are as good as here: no range reaches them, and sums of two stay within int32.
+// Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
 #define FARTHEST 1073741824.0
 #if FLOAT64
 #define BELOW_ONE 0x1.fffffffffffffp-1
@@ -16,22 +16,22 @@ typedef double coordinate;
 #define BELOW_ONE 0x1.fffffep-1f
 #endif
 
-// What is not a number, as after an overflow, is far away too.
+// Clamp a coordinate to +-FARTHEST cells; NaN, as after an overflow, becomes -FARTHEST.
 double within_reach(const double position) {
     const double above = position > -FARTHEST ? position : -FARTHEST;
     return above < FARTHEST ? above : FARTHEST;
 }
 
-// floor, which some drivers call as a function; 0 of -0.
-double whole_below(const double position) {
+// Return the floor of a coordinate, 0 for -0; some drivers call floor as a function.
+double floor_cells(const double position) {
     const double whole = (double)(int)position;
     return whole > position ? whole - 1.0 : whole;
 }
 
-// A pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low takes what rounding took from
-// pose. verdict, which the caller clears, becomes 1 where (0) a pose is not finite, (1) a sensor is outside the window. A
-// pose that is not finite becomes the farthest cell, fraction 0 and heading (1, 0): it sees nothing, and no index made of
-// it is out of bounds.
+// Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets the
+// rounding errors (low parts) of pose. verdict, which the caller clears, becomes 1 at (0) if a pose is not finite, and
+// at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading
+// (1, 0): it sees nothing, and its indices stay in bounds.
 void place_pose(const int particle, global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
                 global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
                 const double resolution, const double mount_x, const double mount_y, const double yaw_cos,
@@ -62,11 +62,11 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
         x = y = -FARTHEST;
         cosine = 1, sine = 0;
     }
-    const double whole_x = whole_below(x), whole_y = whole_below(y);
+    const double whole_x = floor_cells(x), whole_y = floor_cells(y);
     const int2 cell = (int2)((int)whole_x - first_col, (int)whole_y - first_row);
     if (cell.x < 0 || cell.y < 0 || cell.x >= cols || cell.y >= rows) atomic_or(&verdict[1], 1);
     pose_cell[particle] = cell;
-    // The sum makes 0 of -0.
+    // Adding 0 turns -0 into 0.
     x = (x - whole_x) + 0.0;
     y = (y - whole_y) + 0.0;
     // A fraction just below 1 may round to 1, which would be the next cell.
@@ -81,7 +81,7 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
 #endif
 }
 
-// One work-item a particle.
+// Place poses: one work-item takes a particle.
 kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
                         global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
                         const double resolution, const double mount_x, const double mount_y, const double yaw_cos,

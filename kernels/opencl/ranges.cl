@@ -1,28 +1,7 @@
 // Expected ranges of poses and bearings by any caster.
 // requires: caster tiles
 
-#if WIDE
-// One work-item a particle and LANES rays.
-kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real2 *ray, global real *ranges, const int rows, const int cols,
-                        const int particles, const int rays, const int bins, const real slack, const real tolerance,
-                        const real limit, const real resolution, const real range_max) {
-    const int first = LANES * get_global_id(0), n = get_global_id(1);
-    if (first >= rays || n >= particles) return;
-    lanes x, y;
-    load_rays(ray, first, rays, &x, &y);
-    const lanes found = expected_ranges(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit, resolution, range_max);
-    global real *out = ranges + (long)n * rays + first;
-    if (first + LANES <= rays) {
-        store_lanes(found, 0, out);
-        return;
-    }
-    float one[LANES];
-    store_lanes(found, 0, one);
-    for (int i = 0; first + i < rays; ++i) out[i] = one[i];
-}
-#else
-// One work-item a particle and ray.
+// Cast rays: one work-item takes a particle and ray.
 kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
                         global const real2 *ray, global real *ranges, const int rows, const int cols,
                         const int particles, const int rays, const int bins, const real slack, const real tolerance,
@@ -32,10 +11,9 @@ kernel void cast_ranges(global const entry *map_table, global const int2 *pose_c
     const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance);
     ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
 }
-#endif
 
-// For GPUs, tiles of particles and rays: fewer than 2^31 ranges. What is told not to overlap need not be read again
-// after each of them is written.
+// Cast rays in tiles of particles and rays, for GPUs. There are fewer than 2^31 ranges. With restrict the compiler need
+// not read arguments again after a write.
 kernel void cast_tiles(global const entry *restrict map_table, global const int2 *restrict pose_cell,
                        global const real4 *restrict pose, global const int *restrict order,
                        global const real2 *restrict ray, global real *restrict ranges, const int rows,
@@ -50,9 +28,9 @@ kernel void cast_tiles(global const entry *restrict map_table, global const int2
     const int n = place;
 #endif
     const int2 cell = pose_cell[n];
-    const real4 own = pose[n];
+    const real4 sensor_pose = pose[n];
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
-        const real t = cast_ray(map_table, rows, cols, cell, own, ray[k], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray[k], limit, bins, slack, tolerance);
         ranges[n * rays + k] = expected_range(t, limit, resolution, range_max);
     }
 }

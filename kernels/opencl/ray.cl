@@ -1,10 +1,10 @@
-// A ray on the grid and the walk along it, which all casters share. Crossing distances are (k + a) * inv with an integer
-// count k of boundaries, never accumulated.
+// A ray on the grid and the walk along it, which all casters share. Distances of boundaries are (k + a) * inv with an
+// integer count k of boundaries; they are never accumulated.
 // requires: error_free
-// Casts and comparisons stand where floor, ceil, fmin and fmax would do: some drivers call those as functions.
+// Casts and comparisons take the place of floor, ceil, fmin and fmax, which some drivers call as functions.
 
-// Counts k of boundaries are real numbers from COUNT on, where numbers are whole: what is added to COUNT is rounded to
-// nearest, and the last bits are those of k and FIRST, so that a count is an index without a conversion.
+// Counts k of boundaries are floating-point numbers COUNT + k. From COUNT on all numbers are integers, so a sum with
+// COUNT is rounded to nearest. The last bits of a count are k + FIRST, so a count is an index without a conversion.
 #if FLOAT64
 #define COUNT ((real)4503599627370496.0)
 #define FIRST 0u
@@ -17,30 +17,36 @@
 #define as_real as_float
 #endif
 
-// Smallest direction component that is told from zero: its inverse must be finite.
+// Smaller components of a direction count as 0, so that inverses are finite.
 #define TINY ((real)1e-30)
 
-// Direction of a ray in the grid's frame, of unit length: sign, size and inverse of each component, and the distance in
-// x and y to the first boundaries.
+// A ray in the grid's frame: its unit direction; sign, absolute value and inverse of each component; and the distances
+// in x and y to the first boundaries.
 typedef struct {
     real2 direction;
     int right, up, step_x, step_y;
     real speed_x, speed_y, inv_x, inv_y, a_x, a_y;
 } Ray;
 
-// How far a walk is: boundaries crossed in x and y, and the distance in cells.
+// State of a walk: boundaries crossed in x and y, and the distance in cells.
 typedef struct {
     int k_x, k_y;
     real t;
 } Walk;
 
-// pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
+// Return whether a cell lies outside the grid.
+int off_grid(const int col, const int row, const int rows, const int cols) {
+    return col < 0 || col >= cols || row < 0 || row >= rows;
+}
+
+// Return the unit direction in the grid's frame: pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
 real2 ray_direction(const real4 pose, const real2 ray) {
     const real dx = pose.z * ray.x - pose.w * ray.y;
     const real dy = pose.w * ray.x + pose.z * ray.y;
     return (real2)(fabs(dx) < TINY ? (real)0 : dx, fabs(dy) < TINY ? (real)0 : dy);
 }
 
+// Return the ray of a pose and a beam.
 Ray make_ray(const real4 pose, const real2 ray) {
     Ray r;
     r.direction = ray_direction(pose, ray);
@@ -52,24 +58,19 @@ Ray make_ray(const real4 pose, const real2 ray) {
     return r;
 }
 
-// k of a count.
+// Return k of a count.
 int whole(const real count) { return (int)((uint)as_bits(count) - FIRST); }
 
-// Count of the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as well.
-// Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
+// Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t. The
+// coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
 real crossed(const real t, const real speed, const real a, const real inv, const int until) {
     const real place = (t * speed - a) + COUNT, count = place > COUNT ? place : COUNT;
     const real here = ((count - COUNT) + a) * inv;
     return (here < t) | (until & (here == t)) ? count + 1 : count;
 }
 
-// Whether a cell is none of the grid's.
-int off_grid(const int col, const int row, const int rows, const int cols) {
-    return col < 0 || col >= cols || row < 0 || row >= rows;
-}
-
-// The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a ray
-// from outside meets the grid no nearer.
+// Return the walk at the ray's origin or, where that lies outside the grid, at the first cell inside; t is limit where
+// a ray from outside does not meet the grid before limit.
 Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, const real limit) {
     Walk walk = {0, 0, 0};
 #if ORIGINS_OUTSIDE
@@ -94,7 +95,7 @@ Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, co
     return walk;
 }
 
-// Direction as a part of a full turn in [0, 1], to 2e-6: Abramowitz and Stegun 4.4.49 for the arc tangent.
+// Return a direction as a part of a full turn in [0, 1], within 2e-6: Abramowitz and Stegun 4.4.49 for the arc tangent.
 real turn_of(const real2 direction) {
     const real x = fabs(direction.x), y = fabs(direction.y);
     const real a = x > y ? y / x : x / y, s = a * a;
@@ -105,13 +106,13 @@ real turn_of(const real2 direction) {
     return direction.y >= 0 ? upper : (real)1 - upper;
 }
 
-// Angle bin whose centre is nearest; centres are at 0, 1 / bins, ... of a turn.
+// Return the angle bin with the nearest centre; centres are at 0, 1 / bins, ... of a turn.
 int angle_bin(const real2 direction, const int bins) {
     const int bin = (int)(turn_of(direction) * (real)bins + (real)0.5);
     return bin >= bins ? bin - bins : bin;
 }
 
-// Metres from cells: exactly range_max where nothing is nearer.
+// Convert a distance in cells to metres, exactly range_max where nothing is nearer.
 real expected_range(const real t, const real limit, const real resolution, const real range_max) {
     const real range = t * resolution;
     return t >= limit || range > range_max ? range_max : range;

@@ -1,7 +1,7 @@
-// Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
-// An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step
+// Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3). It is an
+// Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it steps
 // in x first.
-// requires: lanes rectangles ray
+// requires: rectangles ray
 
 typedef ushort entry;
 
@@ -15,7 +15,8 @@ typedef ushort entry;
 #endif
 #endif
 
-// Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
+// Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not change
+// the result.
 int sector_of(const real speed_x, const real speed_y) {
 #if SECTORS_4
     const int steep = speed_y > speed_x;
@@ -29,7 +30,7 @@ int sector_of(const real speed_x, const real speed_y) {
 #endif
 }
 
-// Distance in cells to the first occupied cell, or limit where there is none nearer.
+// Return the distance in cells to the first occupied cell, limit where none is nearer.
 real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
               const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
     const Ray r = make_ray(pose, ray);
@@ -47,13 +48,14 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     const uint origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols) - (step_x + step_y) * FIRST;
     real k_x = COUNT + (real)start.k_x, k_y = COUNT + (real)start.k_y, t = start.t;
     uint sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
-    // A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
+    // A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.
     while (sides > OCCUPIED && t < limit) {
         const real end_x = as_real(as_bits(k_x) + (sides & 255)), end_y = as_real(as_bits(k_y) + (sides >> 8));
         const real t_x = ((end_x - (COUNT + 1)) + r.a_x) * r.inv_x, t_y = ((end_y - (COUNT + 1)) + r.a_y) * r.inv_y;
         const int by_x = t_x <= t_y;
         t = by_x ? t_x : t_y;
-        const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x, !by_x);
+        const real aside = crossed(t, by_x ? r.speed_y : r.speed_x, by_x ? r.a_y : r.a_x, by_x ? r.inv_y : r.inv_x,
+                                   !by_x);
         k_x = by_x ? end_x : aside;
         k_y = by_x ? aside : end_y;
         sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
@@ -65,95 +67,3 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
 #endif
 }
 
-#if WIDE
-// The same walk along LANES rays of one pose inside the grid at once; a lane that is done reads the ring's first zero.
-lanes cast_rays(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-                const lanes ray_x, const lanes ray_y, const real limit) {
-    lanes dx = pose.z * ray_x - pose.w * ray_y, dy = pose.w * ray_x + pose.z * ray_y;
-    dx = fabs(dx) < TINY ? (lanes)0 : dx;
-    dy = fabs(dy) < TINY ? (lanes)0 : dy;
-    const ilanes right = dx >= 0, up = dy >= 0;
-    const lanes speed_x = fabs(dx), speed_y = fabs(dy), inv_x = 1 / speed_x, inv_y = 1 / speed_y;
-    const lanes a_x = right ? (lanes)(1 - pose.x) : (lanes)pose.x;
-    const lanes a_y = up ? (lanes)(1 - pose.y) : (lanes)pose.y;
-    const int size = (rows + 2) * (cols + 2);
-    ilanes plane = (right ? (ilanes)0 : (ilanes)SECTORS) + (up ? (ilanes)0 : (ilanes)(2 * SECTORS));
-#if SECTORS_2
-    plane = speed_y > speed_x ? plane + 1 : plane;
-#endif
-#if SECTORS_4
-    plane = speed_y > speed_x ? plane + 2 : plane;
-    plane = speed_y > (speed_y > speed_x ? (lanes)2.4142136f : (lanes)0.41421356f) * speed_x ? plane + 1 : plane;
-#endif
-    const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)(cols + 2) : (ilanes)(-cols - 2);
-    const ilanes origin = plane * size + padded(cell.y, cell.x, cols);
-    lanes k_x = COUNT, k_y = COUNT, t = 0, found = limit;
-    ilanes going = -1;
-    for (;;) {
-        const ilanes x = as_ilanes(k_x) - (int)FIRST, y = as_ilanes(k_y) - (int)FIRST;
-        const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
-        const ilanes sides = GATHER(ilanes, map_table, at);
-        const ilanes stopped = going & (sides <= OCCUPIED);
-        if (some(stopped)) {
-#if OUTSIDE_OCCUPIED
-            found = stopped ? t : found;
-#else
-            found = (stopped & (sides == OCCUPIED)) ? t : found;
-#endif
-            going &= sides > OCCUPIED;
-            if (!some(going)) return found;
-        }
-        const lanes end_x = as_lanes(as_ilanes(k_x) + (sides & 255)), end_y = as_lanes(as_ilanes(k_y) + (sides >> 8));
-        const lanes t_x = ((end_x - (COUNT + 1)) + a_x) * inv_x, t_y = ((end_y - (COUNT + 1)) + a_y) * inv_y;
-        const ilanes by_x = t_x <= t_y;
-        t = by_x ? t_x : t_y;
-        going &= t < limit;
-        if (!some(going)) return found;
-        const lanes a = by_x ? a_y : a_x, inv = by_x ? inv_y : inv_x;
-        const lanes place = (t * (by_x ? speed_y : speed_x) - a) + COUNT;
-        const lanes count = place > COUNT ? place : (lanes)COUNT, here = ((count - COUNT) + a) * inv;
-        const ilanes more = (here < t) | (~by_x & (here == t));
-        const lanes aside = more ? count + 1 : count;
-        k_x = by_x ? end_x : aside;
-        k_y = by_x ? aside : end_y;
-    }
-}
-
-// Cosines and sines of LANES rays from number first on; beyond the last one that one again.
-void load_rays(global const real2 *ray, const int first, const int rays, lanes *x, lanes *y) {
-    if (first + LANES <= rays) {
-        const lanes low = load_lanes(0, (global const real *)(ray + first));
-        const lanes high = load_lanes(1, (global const real *)(ray + first));
-        *x = (lanes)(low.even, high.even);
-        *y = (lanes)(low.odd, high.odd);
-        return;
-    }
-    float these_x[LANES], these_y[LANES];
-    for (int i = 0; i < LANES; ++i) {
-        const real2 one = ray[min(first + i, rays - 1)];
-        these_x[i] = one.x, these_y[i] = one.y;
-    }
-    *x = load_lanes(0, these_x);
-    *y = load_lanes(0, these_y);
-}
-
-// Expected ranges of LANES rays in metres.
-lanes expected_ranges(global const entry *map_table, const int rows, const int cols, const int2 cell,
-                        const real4 pose, const lanes ray_x, const lanes ray_y, const real limit,
-                        const real resolution, const real range_max) {
-    lanes t;
-#if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) {
-        float x[LANES], y[LANES], one[LANES];
-        store_lanes(ray_x, 0, x);
-        store_lanes(ray_y, 0, y);
-        for (int i = 0; i < LANES; ++i)
-            one[i] = cast_ray(map_table, rows, cols, cell, pose, (real2)(x[i], y[i]), limit, 0, 0, 0);
-        t = load_lanes(0, one);
-    } else
-#endif
-        t = cast_rays(map_table, rows, cols, cell, pose, ray_x, ray_y, limit);
-    const lanes range = t * resolution;
-    return t >= limit || range > range_max ? (lanes)range_max : range;
-}
-#endif

@@ -1,41 +1,45 @@
 // Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
-// the cell at its corner and grows that way; each at most 255, as width + 256 height. A ray may cross it in one step
-// without missing an obstacle. Of all such rectangles it is the one that the ray in the middle of the sector stays in
-// longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares.
-// Planes are padded by a ring of zeros, so a walk that leaves the grid stops there. Quadrant q grows to
-// (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, a plane each.
+// the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
+// cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the one in which the ray in
+// the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
+// have squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x,
+// +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for
+// each.
 //
-// Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
-// only cells whose rectangles can hold one of these are. Made at first, all of them have changed. What is known of
-// occupied cells is a band of whole rows of the map from row first on.
+// Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only
+// cells whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a
+// band of whole rows of the map, from row first on.
 // requires: bits
 
 #define LONGEST 255
-// Of a cell that is no rectangle's; the ring has 0.
+// The entry of an occupied cell; the ring has 0.
 #define OCCUPIED 1
-// Cells from a changed cell to the farthest one whose rectangle holds it.
+// Distance from a changed cell to the farthest cell whose rectangle contains it.
 #define RECTANGLE_REACH 254
-// Room for the columns that may bound a rectangle.
+// Capacity of the stack of columns that may bound a rectangle.
 #define STACK 256
 
+// Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
 
-// Along an axis: the cells whose rectangles, growing to larger (way 1) or smaller (way -1) indices, can hold one of
-// those in [low, high) are those from reach_begin to before reach_end.
+// Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
+// larger (way 1) or smaller (way -1) indices.
 int reach_begin(const int way, const int low) { return way > 0 ? max(low - RECTANGLE_REACH, 0) : low; }
+
+// Return one beyond the last cell whose rectangle can contain a cell before high.
 int reach_end(const int way, const int high, const int size) {
     return way > 0 ? high : min(high + RECTANGLE_REACH, size);
 }
 
-// Height and width in the proportion of the ray in the middle of a sector.
+// Return height and width in the proportion of the ray in the middle of a sector.
 int2 slope(const int sectors, const int sector) {
     if (sectors == 1) return (int2)(1, 1);
     if (sectors == 2) return sector == 0 ? (int2)(5, 12) : (int2)(12, 5);
     return sector == 0 ? (int2)(1, 5) : sector == 1 ? (int2)(2, 3) : sector == 2 ? (int2)(3, 2) : (int2)(5, 1);
 }
 
-// For serial devices, one work-item 64 columns and a direction: free cells of the band in the column, to larger
-// (direction 0) or smaller rows (direction 1), at columns from begin to before end.
+// Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
+// columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
 kernel void free_columns(global const uchar *occupied, global uchar *runs, const int band, const int cols,
                          const int begin, const int end) {
     const int from = begin + 64 * get_global_id(0), direction = get_global_id(1), until = min(from + 64, end);
@@ -49,9 +53,10 @@ kernel void free_columns(global const uchar *occupied, global uchar *runs, const
     }
 }
 
-// For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle
-// of enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height,
-// each lower than all before it, with their free cells above the column's last 16 bits, which tell their distance.
+// Find the rectangles along rows, from the far end of a row to its begin. For processors: one work-item takes a row and
+// quadrant. The widest rectangle of sufficient height is at most one column wider than that of its neighbour. The stack
+// has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last
+// 16 bits of the column, which give the distance.
 kernel void rectangles_rows(global const uchar *runs, global int *stack, global ushort *rectangles, const int rows,
                             const int cols, const int sectors, const int first, const int band, const int top,
                             const int left, const int bottom, const int right) {
@@ -82,14 +87,14 @@ kernel void rectangles_rows(global const uchar *runs, global int *stack, global 
             const int lower = known ? min(height, (int)run[other]) : 0;
             const int wider = lower * middle.y > width * middle.x;
             if (col < begin || col >= end) continue;
-            const int found = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : OCCUPIED;
-            out[padded(row, col, cols)] = (ushort)found;
+            const int sides = wider ? width + 1 + 256 * lower : width > 0 ? width + 256 * height : OCCUPIED;
+            out[padded(row, col, cols)] = (ushort)sides;
         }
     }
 }
 
-// For parallel devices, one work-item a cell from begin to before end: free cells of the row, to the right (direction 0)
-// or left (direction 1).
+// Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
+// end). For GPUs: one work-item takes a cell.
 kernel void free_rows(global const int *bits, global uchar *runs, const int band, const int cols, const int words,
                       const int begin, const int end) {
     const int col = begin + get_global_id(0), row = get_global_id(1);
@@ -102,8 +107,8 @@ kernel void free_rows(global const int *bits, global uchar *runs, const int band
     runs[(long)band * cols + cell] = (uchar)min(left, LONGEST);
 }
 
-// For parallel devices, one work-item a cell and quadrant, which looks along the column: the higher a rectangle, the
-// narrower. The first work-item of a quadrant has the first of its cells.
+// Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
+// quadrant; the first work-item of a quadrant takes the first of its cells.
 kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles, const int rows, const int cols,
                             const int sectors, const int first, const int band, const int top, const int left,
                             const int bottom, const int right) {
@@ -117,7 +122,7 @@ kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles,
     int width = LONGEST, sector = 0, height = 1;
     int2 middle = slope(sectors, 0);
     while (sector < sectors) {
-        // While no sector can end, four rows between two decisions, so that reads need not wait for one another.
+        // While no sector can end, read four rows between two decisions, so that reads need not wait for one another.
         if (height + 3 <= room) {
             global const uchar *next = run + (height - 1) * step;
             const int four = min(min((int)next[0], (int)next[step]), min((int)next[2 * step], (int)next[3 * step]));
@@ -130,8 +135,8 @@ kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles,
         const int narrower = height > room ? 0 : min(width, (int)run[(height - 1) * step]);
         while (sector < sectors && narrower * middle.x < height * middle.y) {
             const int higher = narrower * middle.x > (height - 1) * middle.y;
-            const int found = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
-            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)found;
+            const int sides = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
+            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)sides;
             middle = slope(sectors, ++sector);
         }
         width = narrower;

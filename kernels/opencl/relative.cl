@@ -1,5 +1,6 @@
-// Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, and only then rounded.
-// What is left of a large coordinate or of many turns is small, and small numbers keep their digits in any precision.
+// Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, rounded at the end.
+// The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any
+// precision.
 // requires: heading
 
 #if POSES_FLOAT32
@@ -8,22 +9,23 @@ typedef float coordinate;
 typedef double coordinate;
 #endif
 
-// Farther off than this is as good as here; squares of it are finite in float32.
+// Coordinates are clamped to this; its square is finite in float32.
 #define FARTHEST 1152921504606846976.0
 
+// pair_sum of error_free.cl in float64.
 double2 pair_sum_float64(const double2 a, const double2 b) {
     const double2 sum = two_sum_float64(a.x, b.x);
     return two_sum_float64(sum.x, sum.y + (a.y + b.y));
 }
 
-// theta - target in [-pi, pi]; the target is in there already.
+// Return theta - target in [-pi, pi]; the target is in that interval.
 double2 wrapped_difference(const double theta, const double2 target) {
 #if HUGE_HEADINGS
     const Turn turn = fabs(theta) <= LIMIT ? reduce_ordinary(theta) : reduce_huge(theta);
 #else
     const Turn turn = reduce_ordinary(theta);
 #endif
-    // Up to three quarters are exact: the last bits of one are 0.
+    // Up to three quarters are exact: the last bits of QUARTER are 0.
     const double quarters = (double)turn.quadrant;
     double2 angle = pair_sum_float64((double2)(quarters * QUARTER, quarters * QUARTER_LOW), turn.rest);
     angle = pair_sum_float64(angle, -target);
@@ -31,7 +33,7 @@ double2 wrapped_difference(const double theta, const double2 target) {
     return pair_sum_float64(angle, (double2)(turns * QUARTER, turns * QUARTER_LOW));
 }
 
-// A coordinate as a sum of two numbers in the model's precision.
+// Round a coordinate to a sum of two numbers in the model's precision.
 real2 rounded_place(const double2 at) {
     const double high = at.x > FARTHEST ? FARTHEST : at.x < -FARTHEST ? -FARTHEST : at.x;
     const double low = high == at.x ? at.y : 0.0;
@@ -39,21 +41,21 @@ real2 rounded_place(const double2 at) {
     return (real2)(rounded, (real)((high - (double)rounded) + low));
 }
 
-// One work-item a particle: the place of its sensor relative to an origin as x, its low part, y, its low part. verdict,
-// which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
+// Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. verdict, which
+// the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
 kernel void place_relative(global const coordinate *poses, global real4 *place, global int *verdict,
                            const double origin_x, const double origin_y, const double mount_x, const double mount_y,
                            const int particles) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const long first = 3 * (long)n;
-    const double given_x = poses[first], given_y = poses[first + 1], theta = poses[first + 2];
-    if (!((given_x - given_x) + (given_y - given_y) + (theta - theta) == 0)) {
+    const double pose_x = poses[first], pose_y = poses[first + 1], theta = poses[first + 2];
+    if (!((pose_x - pose_x) + (pose_y - pose_y) + (theta - theta) == 0)) {
         atomic_or(&verdict[0], 1);
         place[n] = (real4)(0, 0, 0, 0);
         return;
     }
-    double2 x = two_sum_float64(given_x, -origin_x), y = two_sum_float64(given_y, -origin_y);
+    double2 x = two_sum_float64(pose_x, -origin_x), y = two_sum_float64(pose_y, -origin_y);
     const int near = fabs(x.x) <= FARTHEST && fabs(y.x) <= FARTHEST;
     if (near && (mount_x != 0 || mount_y != 0)) {
         const double2 heading = cos_sin(theta);
@@ -65,8 +67,8 @@ kernel void place_relative(global const coordinate *poses, global real4 *place, 
     place[n] = (real4)(rounded_place(x), rounded_place(y));
 }
 
-// One work-item a particle: its heading minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict as for
-// places.
+// Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
+// verdict is as for place_relative.
 kernel void wrap_headings(global const coordinate *poses, global real2 *residual, global int *verdict,
                           const double target, const double target_low, const int particles) {
     const int n = get_global_id(0);

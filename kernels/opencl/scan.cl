@@ -1,7 +1,6 @@
-// Poses and readings that are on the device. Which readings count and where they go is as gpusense/scan.py finds it on the
-// host.
-// Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits;
-// what is left at the end are missing readings (nan), which add nothing.
+// Placement of poses and readings that lie on the device. Readings are selected and placed as
+// gpusense.models.scan.classed does it on the host. Uninformative readings are left out and the others move up, so that sums over blocks of readings have the same
+// bits. The places that remain at the end get missing readings (nan), which add nothing.
 // requires: error_free placement
 
 #if RANGES_FLOAT32
@@ -10,12 +9,13 @@ typedef float measured;
 typedef double measured;
 #endif
 
-// What max readings are: left out, in the constant, or evaluated like others.
+// Max readings are left out, part of the constant term, or evaluated like others.
 #define MAX_LEFT_OUT 0
 #define MAX_FIXED 1
 #define MAX_PLACED 2
 
-// Whether an even choice of so many informative readings has that of a rank: some i * informative / chosen is it.
+// Return whether an even choice of informative readings includes one of this rank: some i * informative / chosen is the
+// rank.
 int is_chosen(const int rank, const int informative, const int chosen) {
     if (chosen >= informative) return 1;
     if (chosen == 0) return 0;
@@ -23,7 +23,7 @@ int is_chosen(const int rank, const int informative, const int chosen) {
     return nearest * informative / chosen == rank;
 }
 
-// The reading with a number among so many, of some beams; nan beyond the last.
+// Return reading k of the chosen beams, nan beyond the last.
 double reading_of(const int k, global const measured *ranges, global const int *beam, const int beams) {
     if (k >= beams) return NAN;
 #if SOME_BEAMS
@@ -33,20 +33,20 @@ double reading_of(const int k, global const measured *ranges, global const int *
 #endif
 }
 
-// A reading's and a place's own part: it looks at all readings, of which 16 are read before any is looked at, finds the
-// place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam, each of
-// them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A max reading is
-// inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings add that have no
-// place; -inf where a range is there and none is possible.
-void place_reading(const int own, global const measured *ranges, global const int *beam, global const double *vector,
+// Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a place
+// at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points the vectors
+// of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and point_low its
+// rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2 cells). fixed is the
+// constant term of max readings that have no place, -inf if there is a range where none is possible.
+void place_reading(const int item, global const measured *ranges, global const int *beam, global const double *vector,
                    global real2 *point, global real2 *point_low, global real *reading, global real *guard,
                    global real *fixed, const double resolution, const int beams, const int each, const int places,
                    const int chosen, const int max_readings, const int possible, const double nearest,
                    const double farthest, const double log_max, const double top, const double guard_scale) {
-    // What is needed last is read first, so that nothing waits for it.
-    const long from = 2 * (long)min(own, beams - 1) * each;
-    const double z_own = reading_of(own, ranges, beam, beams);
-    const double vector_x = own < beams ? vector[from] : 1, vector_y = own < beams ? vector[from + 1] : 0;
+    // Values that are needed last are read first, so that nothing waits for them.
+    const long from = 2 * (long)min(item, beams - 1) * each;
+    const double item_reading = reading_of(item, ranges, beam, beams);
+    const double vector_x = item < beams ? vector[from] : 1, vector_y = item < beams ? vector[from + 1] : 0;
     int informative = beams;
     if (chosen < beams) {
         informative = 0;
@@ -55,9 +55,9 @@ void place_reading(const int own, global const measured *ranges, global const in
             informative += z >= nearest && (z < farthest || max_readings != MAX_LEFT_OUT);
         }
     }
-    int rank = 0, place = 0, own_place = places, far_count = 0, impossible = 0;
-    // Of the readings in the block of places that begins with the own one, if one does.
-    double own_value = NAN, longest = 0;
+    int rank = 0, place = 0, item_place = places, far_count = 0, impossible = 0;
+    // The longest reading in the block of places that begins with this item's place, if a block begins there.
+    double item_value = NAN, longest = 0;
     for (int first = 0; first < beams; first += BLOCK_TERMS) {
         double several[BLOCK_TERMS];
 #pragma unroll
@@ -69,12 +69,12 @@ void place_reading(const int own, global const measured *ranges, global const in
             hits |= (uint)(several[i] >= nearest && several[i] < farthest) << i;
             fars |= (uint)(several[i] >= farthest) << i;
         }
-        const uint told = max_readings == MAX_LEFT_OUT ? hits : hits | fars;
-        uint used = told;
+        const uint telling = max_readings == MAX_LEFT_OUT ? hits : hits | fars;
+        uint used = telling;
         if (chosen < informative) {
             for (int i = 0; i < BLOCK_TERMS; ++i) {
-                const int its_rank = rank + popcount(told & ((1u << i) - 1));
-                if (!is_chosen(its_rank, informative, chosen)) used &= ~(1u << i);
+                const int rank_of_i = rank + popcount(telling & ((1u << i) - 1));
+                if (!is_chosen(rank_of_i, informative, chosen)) used &= ~(1u << i);
             }
         }
         const uint as_range = possible ? used & hits : 0, as_far = max_readings == MAX_PLACED ? used & fars : 0;
@@ -83,61 +83,62 @@ void place_reading(const int own, global const measured *ranges, global const in
 #else
         const uint placed = as_range | as_far;
 #endif
-        const int i_own = own - first;
-        if (i_own >= 0 && i_own < BLOCK_TERMS && (placed >> i_own & 1)) {
-            own_place = place + popcount(placed & ((1u << i_own) - 1));
-            own_value = as_range >> i_own & 1 ? z_own : as_far >> i_own & 1 ? INFINITY : NAN;
+        const int item_bit = item - first;
+        if (item_bit >= 0 && item_bit < BLOCK_TERMS && (placed >> item_bit & 1)) {
+            item_place = place + popcount(placed & ((1u << item_bit) - 1));
+            item_value = as_range >> item_bit & 1 ? item_reading : as_far >> item_bit & 1 ? INFINITY : NAN;
         }
 #if END_POINTS
-        if (own_place < places && own_place % BLOCK_TERMS == 0 && place < own_place + BLOCK_TERMS) {
+        if (item_place < places && item_place % BLOCK_TERMS == 0 && place < item_place + BLOCK_TERMS) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) {
                 const int other = place + popcount(placed & ((1u << i) - 1));
-                const int beside = other >= own_place && other < own_place + BLOCK_TERMS;
+                const int beside = other >= item_place && other < item_place + BLOCK_TERMS;
                 if ((as_range >> i & 1) && beside) longest = several[i] > longest ? several[i] : longest;
             }
         }
 #endif
-        rank += popcount(told);
+        rank += popcount(telling);
         far_count += popcount(used & fars);
         impossible |= !possible && (used & hits);
         place += popcount(placed);
     }
 #if END_POINTS
-    if (own_place < places) {
-        const double cells = own_value / resolution, length = isfinite(cells) ? cells : 0;
+    if (item_place < places) {
+        const double cells = item_value / resolution, length = isfinite(cells) ? cells : 0;
         const double x = vector_x * length, y = vector_y * length;
         const real2 high = (real2)((real)x, (real)y);
-        point[own_place] = isfinite(cells) ? high : (real2)((real)cells);
-        point_low[own_place] = (real2)((real)(x - high.x), (real)(y - high.y));
-        if (own_place % BLOCK_TERMS == 0) guard[own_place / BLOCK_TERMS] = (real)(guard_scale * (longest / resolution + 2));
+        point[item_place] = isfinite(cells) ? high : (real2)((real)cells);
+        point_low[item_place] = (real2)((real)(x - high.x), (real)(y - high.y));
+        if (item_place % BLOCK_TERMS == 0)
+            guard[item_place / BLOCK_TERMS] = (real)(guard_scale * (longest / resolution + 2));
     }
-    if (own >= place && own < places) {
-        point[own] = (real2)((real)NAN);
-        point_low[own] = (real2)(0);
-        if (own % BLOCK_TERMS == 0) guard[own / BLOCK_TERMS] = (real)(guard_scale * 2);
+    if (item >= place && item < places) {
+        point[item] = (real2)((real)NAN);
+        point_low[item] = (real2)(0);
+        if (item % BLOCK_TERMS == 0) guard[item / BLOCK_TERMS] = (real)(guard_scale * 2);
     }
 #else
-    if (own_place < places) {
-        point[(long)own_place * each] = (real2)((real)vector_x, (real)vector_y);
+    if (item_place < places) {
+        point[(long)item_place * each] = (real2)((real)vector_x, (real)vector_y);
         for (int j = 1; j < each; ++j) {
-            point[(long)own_place * each + j] = (real2)((real)vector[from + 2 * j], (real)vector[from + 2 * j + 1]);
+            point[(long)item_place * each + j] = (real2)((real)vector[from + 2 * j], (real)vector[from + 2 * j + 1]);
         }
-        const real rounded = (real)own_value;
-        reading[own_place] = rounded > (real)top && !isinf(rounded) ? (real)top : rounded;
+        const real rounded = (real)item_value;
+        reading[item_place] = rounded > (real)top && !isinf(rounded) ? (real)top : rounded;
     }
-    if (own >= place && own < places) {
-        for (int j = 0; j < each; ++j) point[(long)own * each + j] = (real2)(1, 0);
-        reading[own] = (real)NAN;
+    if (item >= place && item < places) {
+        for (int j = 0; j < each; ++j) point[(long)item * each + j] = (real2)(1, 0);
+        reading[item] = (real)NAN;
     }
 #endif
-    if (own == 0) {
+    if (item == 0) {
         fixed[0] = max_readings == MAX_FIXED ? (real)(far_count * log_max) : 0;
         if (impossible > 0) fixed[0] = -INFINITY;
     }
 }
 
-// One work-item a beam and place, in whole groups, and after these one a particle.
+// Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a particle.
 kernel void place_inputs(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
                          global real4 *pose_low, global int *verdict, global const measured *ranges,
                          global const int *beam, global const double *vector, global real2 *point,

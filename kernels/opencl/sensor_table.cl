@@ -1,15 +1,16 @@
-// The density of one reading from a table of log p over bins of readings and expected ranges, instead of a formula.
-// Row i is a bin of readings, the last row for max readings (log probabilities); column j a bin of expected ranges, the
-// last column for rays without an obstacle.
+// Density of one reading from a table of log p over bins of readings and expected ranges. Row i is a bin of readings;
+// the last row is for max readings (log probabilities). Column j is a bin of expected ranges; the last column is for
+// rays without an obstacle.
 // requires: ray
 
-// Bin of a range; the last one, after the cells, is for range_max and more.
+// Return the bin of a range; the last one, after the cells, is for range_max and more.
 int range_bin(const real range, const real per_metre, const int cells, const real range_max) {
     if (range >= range_max) return cells;
     const int bin = (int)(range * per_metre);
     return bin < cells ? bin : cells - 1;
 }
 
+// Return log p of a reading for an expected range.
 real tabulated_density(const real z, const real expected, global const real *sensor, const int cells,
                        const real per_metre, const real range_max) {
     const int column = range_bin(expected, per_metre, cells, range_max);

@@ -1,11 +1,12 @@
-// Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings.
+// Sums of the terms of readings, or of blocks of readings, in the order of the readings.
 // requires: error_free
 
-// One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. They are sums
-// of blocks or strands, and block is 1, or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first.
-// All go to a compensated total. With STRANDED counts are of readings, and what is added are their strands. BLOCK_TERMS
-// numbers are read before any is added, so that a work-item waits once for all of them; what lies beyond the last counts as
-// 0, which changes no sum. There are fewer than 2^31 numbers.
+// Sum count numbers, number k at parts[place * across + k * along]: one work-item takes a particle. They are sums of
+// blocks or strands (block is 1), or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first. All
+// are added to a compensated total. With SCANS each scan has a count of its own; with STRANDED it is a count of
+// readings, and the numbers are sums of their strands. BLOCK_TERMS numbers are read before any is added, so that a
+// work-item waits once for all of them; numbers beyond the last count as 0, which changes no sum. There are fewer than
+// 2^31 numbers.
 kernel void sum_parts(global const real *parts, global const int *order, global const int *counts,
                       global const real *fixed_of, global real *log_p, const int particles, const int count,
                       const int block, const int across, const int along, const real fixed, const real temperature,
@@ -19,24 +20,24 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
 #endif
 #if SCANS
 #if STRANDED
-    const int terms = counts[n / per_scan], own = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
+    const int terms = counts[n / per_scan], size = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
 #else
-    const int own = counts[n / per_scan];
+    const int size = counts[n / per_scan];
 #endif
-    const real lead = fixed_of[n / per_scan];
+    const real constant_term = fixed_of[n / per_scan];
 #else
-    const int own = count;
-    const real lead = fixed;
+    const int size = count;
+    const real constant_term = fixed;
 #endif
     const int begin = place * across;
-    real2 total = (real2)(lead, 0);
-    for (int first = 0; first < own; first += BLOCK_TERMS) {
+    real2 total = (real2)(constant_term, 0);
+    for (int first = 0; first < size; first += BLOCK_TERMS) {
         real term[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[begin + min(first + i, own - 1) * along];
-        if (first + BLOCK_TERMS > own) {
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[begin + min(first + i, size - 1) * along];
+        if (first + BLOCK_TERMS > size) {
 #pragma unroll
-            for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < own ? term[i] : 0;
+            for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < size ? term[i] : 0;
         }
         if (block == 1) {
 #pragma unroll

@@ -1,9 +1,10 @@
 """Densities of sensors that know where they are: a position in the plane, and a heading.
 
-A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): up to sigma = 1.5 by
-its largest terms, beyond by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2); or
-von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
-*Directional Statistics* (2000), section 3.5. With z_rand a reading may be anything (RAND): that is a uniform density.
+A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed up to sigma
+= 1.5 by its largest terms, beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q =
+exp(-sigma^2 / 2). Or a heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa
+sin^2(r / 2). Mardia and Jupp, *Directional Statistics* (2000), section 3.5. z_rand is the weight of a uniform density
+(RAND).
 """
 
 import functools
@@ -13,11 +14,11 @@ import warp as wp
 from . import error_free, log_terms
 from .prelude import kernel, precision
 
-# How a heading is distributed: sums of normals, their Fourier series, von Mises.
+# Distributions of a heading: sum of normals, its Fourier series, von Mises.
 NEARBY, SERIES, VON_MISES = wp.constant(0), wp.constant(1), wp.constant(2)
 WRAPS, WAVES = wp.constant(3), wp.constant(6)
-# A heading's numbers: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part,
-# 2 pi / sigma^2, and from WAVE on 2 q^(n n).
+# Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
+# sigma^2, and from WAVE on 2 q^(n n).
 SCALE, SCALE_LOW, PEAK, PEAK_LOW = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 RANDOM, DECAY, WAVE = wp.constant(4), wp.constant(5), wp.constant(6)
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
@@ -30,7 +31,7 @@ SINE = (
 
 @functools.cache
 def make(name, flags):
-    """A kernel of the file specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     base = flags & {"FLOAT64"}
@@ -40,12 +41,12 @@ def make(name, flags):
     ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
     HALF_TURN = real(3.141592653589793)
     HALF_TURN_LOW = real(0.0 if "FLOAT64" in flags else -8.742277657347586e-08)
-    # exp of minus this is below half an eps.
+    # exp(-NEGLIGIBLE) is below half an eps.
     NEGLIGIBLE = real(40.0)
     RAND = "RAND" in flags
     S0, S1, S2, S3, S4, S5, S6, S7, S8, S9 = (real(term) for term in SINE)
 
-    # sin(r / 2) of an angle in [-pi, pi].
+    # Return sin(r / 2) of an angle in [-pi, pi].
     @wp.func
     def half_sine(residual: vec2):
         x = HALF * residual.x
@@ -54,7 +55,7 @@ def make(name, flags):
         series = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * higher))))
         return two_sum(x, HALF * residual.y + x * (z * series))
 
-    # Log of all turns' normals over that of the nearest turn.
+    # Return the log of the sum over all turns over the normal of the nearest turn.
     @wp.func
     def log_other_turns(residual: vec2, decay: real):
         size = wp.abs(residual.x)
@@ -64,7 +65,7 @@ def make(name, flags):
         rest = wp.max((HALF_TURN - size) + (HALF_TURN_LOW - low), ZERO)
         others = real(0.0)
         k = int(1)
-        # Mostly nothing is to be added.
+        # For most headings the other turns add nothing.
         if decay * rest > NEGLIGIBLE:
             k = WRAPS + 1
         while k <= WRAPS:
@@ -74,7 +75,7 @@ def make(name, flags):
             k += 1
         return log_one_plus(others)
 
-    # Log of the Fourier series over its first term, by Clenshaw's recurrence.
+    # Return the log of the Fourier series over its first term, by Clenshaw's recurrence.
     @wp.func
     def log_waves(residual: vec2, terms: wp.array(dtype=real)):
         sine = half_sine(residual)
@@ -89,8 +90,9 @@ def make(name, flags):
             n -= 1
         return log_one_plus(cosine * newer - older)
 
-    # One work-item a particle. terms = {a, b, c, peak}, each followed by its low part, and the log of the uniform part.
-    # The exponent is (a x)^2 + (b x + c y)^2, where (x, y) lies from the reading to the sensor.
+    # Score positions: one work-item takes a particle. terms = {a, b, c, peak}, each followed by its low part, and the
+    # log of the uniform part. The exponent is (a x)^2 + (b x + c y)^2, where (x, y) is the offset from the reading to
+    # the sensor.
     @kernel
     def score_position(
         place: wp.array(dtype=vec4),
@@ -102,18 +104,18 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = place[n]
-        x = vec2(own.x, own.y)
-        y = vec2(own.z, own.w)
+        sensor = place[n]
+        x = vec2(sensor.x, sensor.y)
+        y = vec2(sensor.z, sensor.w)
         first = bounded_square(pair_product(x, vec2(terms[0], terms[1])))
         mixed = pair_sum(pair_product(x, vec2(terms[2], terms[3])), pair_product(y, vec2(terms[4], terms[5])))
         exponent = pair_sum(first, bounded_square(mixed))
-        found = (terms[6] - exponent.x) + (terms[7] - exponent.y)
+        log_density = (terms[6] - exponent.x) + (terms[7] - exponent.y)
         if RAND:
-            found = either(found, terms[8])
-        log_p[n] = temperature * found
+            log_density = either(log_density, terms[8])
+        log_p[n] = temperature * log_density
 
-    # One work-item a particle. Residuals are headings minus the reading in [-pi, pi].
+    # Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
     @kernel
     def score_heading(
         residual: wp.array(dtype=vec2),
@@ -127,19 +129,19 @@ def make(name, flags):
         if n >= particles:
             return
         r = residual[n]
-        found = real(0.0)
+        log_density = real(0.0)
         if kind == SERIES:
-            found = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
+            log_density = terms[PEAK] + (terms[PEAK_LOW] + log_waves(r, terms))
         else:
             root = r
             if kind == VON_MISES:
                 root = half_sine(r)
             exponent = bounded_square(pair_product(root, vec2(terms[SCALE], terms[SCALE_LOW])))
-            found = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
+            log_density = (terms[PEAK] - exponent.x) + (terms[PEAK_LOW] - exponent.y)
             if kind == NEARBY:
-                found += log_other_turns(r, terms[DECAY])
+                log_density += log_other_turns(r, terms[DECAY])
         if RAND:
-            found = either(found, terms[RANDOM])
-        log_p[n] = temperature * found
+            log_density = either(log_density, terms[RANDOM])
+        log_p[n] = temperature * log_density
 
     return {"score_position": score_position, "score_heading": score_heading}[name]

@@ -2,9 +2,9 @@
 
     p(z | d) = z_hit f(z - d - bias) / m  +  z_rand / range_max
 
-d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or two normals of which one is
-wide; m is f's mass on [0, range_max], where d + bias is held to that interval. For a whole nu the mass of a t between 0
-and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
+d is the distance to the beacon. f is normal, a Student t with nu degrees of freedom, or a sum of two normals, one of
+them wide. m is the mass of f on [0, range_max], with d + bias clamped to that interval. For an integer nu the mass of a
+t between 0 and t is a finite sum of positive terms (Abramowitz and Stegun, 26.7.3 and 26.7.4).
 """
 
 import functools
@@ -15,11 +15,11 @@ from . import error_free, log_terms, offsets
 from .prelude import kernel, precision
 
 STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
-# A beacon is its place (x, its low part, y, its low part) and the reading minus the bias (and its low part).
+# A beacon has its place (x, its low part, y, its low part), and the reading minus the bias with its low part.
 BEACON = wp.constant(6)
-# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; then of two normals the wide
-# one's scale and peak. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and instead of
-# the wide normal 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the arc's factor, 1 for an odd nu.
+# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
+# peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
+# of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
 SCALE, SCALE_LOW, PEAK, RANDOM = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(4)
 RANGE_MAX, BIAS = wp.constant(5), wp.constant(6)
 WIDE_SCALE, WIDE_PEAK = wp.constant(7), wp.constant(9)
@@ -29,7 +29,7 @@ ARC, ODD = wp.constant(11), wp.constant(12)
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_beacons specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     base = flags & {"FLOAT64"}
@@ -39,25 +39,25 @@ def make(name, flags):
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
     bounded_square, either = logs.bounded_square, logs.either
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
-    # Above this an arc is a quarter turn to the last bit, and its tangent's square is finite.
+    # From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
     STEEPEST = real(1e18)
-    # Above this the error function is 1 to the last bit.
+    # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
     RAND = "RAND" in flags
 
-    # Log of a truncated normal; near and far are the distances of its mean from the interval's ends.
+    # Return the log of a truncated normal; near and far are the distances of its mean from the ends.
     @wp.func
     def log_normal(residual: vec2, near: real, far: real, terms: wp.array(dtype=real), first: wp.int32, peak: wp.int32):
         scale = terms[first]
         below = near * scale
         above = far * scale
         exponent = bounded_square(pair_product(residual, vec2(scale, terms[first + 1])))
-        found = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y)
+        untruncated = (terms[peak] - exponent.x) + (terms[peak + 1] - exponent.y)
         if wp.min(below, above) <= ERF_ONE:
-            found = found - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
-        return found
+            untruncated = untruncated - wp.log(HALF * (wp.erf(below) + wp.erf(above)))
+        return untruncated
 
-    # Mass of a Student t between -t and t, where t >= 0 is in units of its scale and sqrt(nu).
+    # Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu).
     @wp.func
     def t_mass(any_t: real, terms: wp.array(dtype=real), series: wp.array(dtype=real), count: wp.int32):
         t = wp.min(any_t, STEEPEST)
@@ -73,7 +73,7 @@ def make(name, flags):
             factor = factor * cosine
         return terms[ARC] * wp.atan(t) + factor * total
 
-    # Log of a truncated Student t: -(nu + 1) / 2 log of (1 + u^2 / nu) / k, two numbers that include the peak.
+    # Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak.
     @wp.func
     def log_student_t(
         residual: vec2,
@@ -89,34 +89,34 @@ def make(name, flags):
         above = t_mass(far * terms[T_SCALE], terms, series, count)
         return (terms[PEAK] - terms[POWER] * (wp.log(x.x) + x.y / x.x)) - wp.log(HALF * (below + above))
 
-    # Log p of one range at a distance.
+    # Return log p of one range at a distance.
     @wp.func
     def log_range(
         d: vec2,
         beacon: wp.array(dtype=real),
-        one: wp.int32,
+        base: wp.int32,
         terms: wp.array(dtype=real),
         series: wp.array(dtype=real),
         count: wp.int32,
         kind: wp.int32,
     ):
-        first = two_sum(d.x, -beacon[one + 4])
-        r = two_sum(first.x, first.y + (d.y - beacon[one + 5]))
+        first = two_sum(d.x, -beacon[base + 4])
+        r = two_sum(first.x, first.y + (d.y - beacon[base + 5]))
         near = wp.clamp(d.x + terms[BIAS], ZERO, terms[RANGE_MAX])
         far = terms[RANGE_MAX] - near
-        found = real(0.0)
+        log_p = real(0.0)
         if kind == STUDENT_T:
-            found = log_student_t(r, near, far, terms, series, count)
+            log_p = log_student_t(r, near, far, terms, series, count)
         else:
-            found = log_normal(r, near, far, terms, SCALE, PEAK)
+            log_p = log_normal(r, near, far, terms, SCALE, PEAK)
         if kind == TWO_NORMALS:
-            found = either(found, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
+            log_p = either(log_p, log_normal(r, near, far, terms, WIDE_SCALE, WIDE_PEAK))
         if RAND:
-            found = either(found, terms[RANDOM])
-        return found
+            log_p = either(log_p, terms[RANDOM])
+        return log_p
 
-    # One work-item a particle: the sum over beacons of log p of their ranges; the first count numbers of the series are
-    # a t's.
+    # Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong
+    # to a t.
     @kernel
     def score_beacons(
         place: wp.array(dtype=vec4),
@@ -133,14 +133,14 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = place[n]
+        sensor = place[n]
         total = vec2(ZERO, ZERO)
         i = int(0)
         while i < beacons:
-            one = BEACON * i
-            at = vec4(beacon[one], beacon[one + 2], beacon[one + 1], beacon[one + 3])
-            d = distance_pair(offset(at, own))
-            total = add_term(total, log_range(d, beacon, one, terms, series, count, kind))
+            base = BEACON * i
+            at = vec4(beacon[base], beacon[base + 2], beacon[base + 1], beacon[base + 3])
+            d = distance_pair(offset(at, sensor))
+            total = add_term(total, log_range(d, beacon, base, terms, series, count, kind))
             i += 1
         log_p[n] = wp.where(wp.isinf(total.x), total.x, temperature * (total.x + total.y))
 

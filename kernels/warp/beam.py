@@ -1,6 +1,6 @@
 """Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 
-Only readings that depend on the pose come here; what is constant over poses arrives as one fixed term.
+Readings whose density does not depend on the pose are not passed in: their sum is the constant term fixed.
 """
 
 import functools
@@ -18,7 +18,7 @@ from .tiles import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_beams or beam_tiles specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
@@ -47,7 +47,7 @@ def make(name, flags):
     ZERO = real(0.0)
     NEVER = real(-math.inf)
 
-    # What one reading adds to the sum.
+    # Return the term of one reading in the sum.
     @wp.func
     def reading_term(
         z: real,
@@ -72,7 +72,7 @@ def make(name, flags):
         else:
             return log_density(z, expected, terms)
 
-    # The scan's logarithm from its sum.
+    # Return the logarithm of a scan from its sum.
     @wp.func
     def scan_log(total: real):
         if CUBES:
@@ -80,8 +80,9 @@ def make(name, flags):
         else:
             return total
 
-    # One work-item a particle. Readings of ray r are first[r] to first[r + 1] - 1 where rays are shared. Of several
-    # scans each has its rays from start on, and first counts the readings of all. A launch has fewer than 2^31 parts.
+    # Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r +
+    # 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch
+    # has fewer than 2^31 parts.
     @kernel
     def score_beams(
         map_table: wp.array(dtype=ENTRY),
@@ -123,11 +124,11 @@ def make(name, flags):
         if n >= particles:
             return
         cell = cell_at(pose_cell, n)
-        from_pose = pose_at(pose, n)
+        sensor_pose = pose_at(pose, n)
         before = int(0)
         size = rays
         readings_before = int(0)
-        lead = fixed
+        constant_term = fixed
         if SCANS:
             scan = (n + ahead) // per_scan
             before = start[scan]
@@ -135,23 +136,23 @@ def make(name, flags):
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-            lead = fixed_of[scan]
-        total = vec2(lead, ZERO)
+            constant_term = fixed_of[scan]
+        total = vec2(constant_term, ZERO)
         strands = vec4()
         impossible = bool(False)
         for r in range(size):
-            own = terms
+            bin_terms = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, from_pose, ray, (before + r) * cone_rays, cone_rays, critical,
-                    limit, bins, slack, tolerance,
+                    map_table, normals, rows, cols, cell, sensor_pose, ray, (before + r) * cone_rays, cone_rays,
+                    critical, limit, bins, slack, tolerance,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
-                    own = incidence_terms(terms, edges, kinds, heard.cosine)
+                    bin_terms = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
                 t = cast_ray(
-                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                    map_table, rows, cols, cell, sensor_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
                 )
             expected = expected_range(t, limit, resolution, range_max)
             begin = r
@@ -161,7 +162,7 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             for k in range(begin, end):
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
+                term = reading_term(z, expected, bin_terms, sensor, cells, per_metre, range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -180,8 +181,8 @@ def make(name, flags):
         else:
             log_p[n] = temperature * scan_log(total.x + total.y)
 
-    # For GPUs, tiles of particles and rays: what each reading adds, at parts[place * across + k * along], or with the
-    # flag STRANDED the sum of each strand in place of that of reading k. A work-item then takes whole strands.
+    # Write the term of reading k to parts[place * across + k * along], in tiles of particles and rays, for GPUs. With
+    # STRANDED the number there is the sum of strand k, and a work-item takes whole strands.
     @kernel
     def beam_tiles(
         map_table: wp.array(dtype=ENTRY),
@@ -226,7 +227,7 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         cell = cell_at(pose_cell, n)
-        from_pose = pose_at(pose, n)
+        sensor_pose = pose_at(pose, n)
         before = int(0)
         size = rays
         readings_before = int(0)
@@ -237,24 +238,24 @@ def make(name, flags):
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-        summed = real(0.0)
+        strand_sum = real(0.0)
         if STRANDED:
             r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS
         else:
             r = tile_ray(item, spread)
         while r < size:
-            own = terms
+            bin_terms = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, from_pose, ray, (before + r) * cone_rays, cone_rays, critical,
-                    limit, bins, slack, tolerance,
+                    map_table, normals, rows, cols, cell, sensor_pose, ray, (before + r) * cone_rays, cone_rays,
+                    critical, limit, bins, slack, tolerance,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
-                    own = incidence_terms(terms, edges, kinds, heard.cosine)
+                    bin_terms = incidence_terms(terms, edges, kinds, heard.cosine)
             else:
                 t = cast_ray(
-                    map_table, rows, cols, cell, from_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
+                    map_table, rows, cols, cell, sensor_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
                 )
             expected = expected_range(t, limit, resolution, range_max)
             k = r
@@ -264,19 +265,19 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             while k < end:
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, own, sensor, cells, per_metre, range_max)
+                term = reading_term(z, expected, bin_terms, sensor, cells, per_metre, range_max)
                 if STRANDED:
-                    summed += term
+                    strand_sum += term
                 else:
                     put(parts, place * across + k * along, term)
                 k += 1
             if STRANDED:
                 r += STRANDS
-                # Past a block's or the scan's end.
+                # The end of a block or of the scan.
                 if r >= size or (r & (BLOCK_TERMS - STRANDS)) == 0:
                     q = (r - STRANDS) // BLOCK_TERMS * STRANDS + (r & (STRANDS - 1))
-                    put(parts, place * across + q * along, summed)
-                    summed = ZERO
+                    put(parts, place * across + q * along, strand_sum)
+                    strand_sum = ZERO
                     r += ((1 << spread) - 1) * BLOCK_TERMS
             else:
                 r += tile_step(spread)

@@ -1,5 +1,5 @@
-"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit; what a row
-lacks to a whole word is 0. A look at a word is a look at 32 cells.
+"""Rows of a map as bits, 1 where a cell is occupied: 32 cells a word, the first cell in the lowest bit. The unused bits
+of the last word of a row are 0. One read of a word gives 32 cells.
 """
 
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ NONE = wp.constant(0x7FFFFFFF)
 ALL_BITS = wp.constant(wp.uint32(0xFFFFFFFF))
 
 
-# Places of the lowest and highest 1 of a word that is not 0.
+# Return the index of the lowest 1 of a word that is not 0.
 @wp.func
 def lowest_bit(word: wp.uint32):
     rest = word
@@ -32,6 +32,7 @@ def lowest_bit(word: wp.uint32):
     return place
 
 
+# Return the index of the highest 1 of a word that is not 0.
 @wp.func
 def highest_bit(word: wp.uint32):
     rest = word
@@ -53,8 +54,8 @@ def highest_bit(word: wp.uint32):
     return place
 
 
-# Cells from a cell to the first occupied one to its right, itself included; NONE if none is within most cells. What is
-# farther may be found, too. The row begins at begin.
+# Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
+# cells. An occupied cell beyond most cells may be returned, too. The row begins at index begin.
 @wp.func
 def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32, col: wp.int32, most: wp.int32):
     last = wp.min((col + most) >> 5, words - 1)
@@ -69,7 +70,7 @@ def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32
     return cells
 
 
-# The same to its left.
+# Count the cells to the first occupied one to its left.
 @wp.func
 def cells_left(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32, most: wp.int32):
     last = wp.max(col - most, 0) >> 5
@@ -85,5 +86,5 @@ def cells_left(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32, m
 
 
 def functions(flags):
-    """cells_right and cells_left; no flag changes them."""
+    """Return the functions of the file; no flag changes them."""
     return SimpleNamespace(cells_right=cells_right, cells_left=cells_left)

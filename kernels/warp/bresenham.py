@@ -1,7 +1,7 @@
 """Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end.
 
-So cast nav2_amcl and Beluga: distances are from cell centre to cell centre, and a line may pass between two cells that
-touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+nav2_amcl and Beluga cast in this manner. Distances are from cell centre to cell centre, and a line may pass between two
+cells that touch at a corner. The table holds 1 for occupied cells in a ring of twos.
 """
 
 import functools
@@ -18,7 +18,7 @@ ENTRY = wp.uint8
 
 @functools.cache
 def functions(flags):
-    """cast_ray specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
@@ -28,7 +28,7 @@ def functions(flags):
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
 
-    # Distance in cells from the origin's cell to the first occupied cell of the line, or limit where it meets none.
+    # Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),

@@ -1,9 +1,9 @@
-"""Expected range by a compressed directional distance transform (Walsh and Karaman 2018): for each angle bin the map is
-cut into lines of one cell's width along the bin's direction, and each line keeps in order where its obstacles begin. A
-ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins.
+"""Expected range by a compressed directional distance transform (Walsh and Karaman 2018). For each angle bin the map is
+cut into lines of one cell's width along the bin's direction. Each line has the sorted positions at which obstacles
+begin. A ray takes the line of its origin in the nearest bin, so errors grow as range * pi / bins.
 
-Table of integers: number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from place
-1 + 3 bins where each line's obstacles begin in the table (bins * lines + 1 numbers); then a bit for each cell, set
+Table of integers: number of lines of a bin; for each bin its cosine and sine in 2^-30 and its first line; from index 1
++ 3 bins on, the index of the first obstacle of each line (bins * lines + 1 numbers); then a bit for each cell, set
 where it is occupied; then the obstacles in 2^-10 cells.
 """
 
@@ -20,7 +20,7 @@ ENTRY = wp.int32
 
 @functools.cache
 def functions(flags):
-    """cast_ray specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
@@ -29,10 +29,10 @@ def functions(flags):
     ZERO = real(0.0)
     ENTRY_UNIT = real(1024.0)
     COSINE_UNIT = real(2.0**-30)
-    # Beyond this many cells, more than any map has, one place is like another and counts still fit.
+    # Coordinates are clamped to this many cells: no map has as many, and indices still fit.
     FARTHEST, NOWHERE = real(1048576.0), real(-1048576.0)
 
-    # Distance in cells to the first obstacle of the line, or limit where there is none nearer.
+    # Return the distance in cells to the first obstacle of the line, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),

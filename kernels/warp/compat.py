@@ -1,7 +1,7 @@
-"""What nav2_amcl and Beluga sum over the beams of a scan, the cube of a density, for migration.
+"""Cubes of densities, which nav2_amcl and Beluga sum over the beams of a scan; for migration.
 
-terms[10] are those of the mixture in the linear domain, but that terms[0] is z_hit alone for amcl and terms[7] is
-z_max, not its logarithm.
+terms[10] are those of the mixture in the linear domain, with two exceptions: terms[0] is z_hit alone for amcl, and
+terms[7] is z_max, not its logarithm.
 """
 
 import functools
@@ -15,14 +15,14 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """compat_density specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     real = precision(flags).real
     parts = mixture.functions(flags)
     hit_mass, short_factor = parts.hit_mass, parts.short_factor
     AMCL = "AMCL" in flags
 
-    # The density that is cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of range_max
-    # is a max reading.
+    # Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of
+    # range_max is a max reading.
     @wp.func
     def compat_density(z: real, expected: real, terms: wp.array(dtype=real)):
         off = z - expected

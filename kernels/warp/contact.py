@@ -1,7 +1,7 @@
 """Probability of contact from the distance of a robot's outline to the nearest obstacle.
 
-The outline's points lie in cells of a table of squared distances to the nearest obstacle's centre; the nearest point of
-a segment counts. An obstacle begins half a cell before its centre. Outline and map are off by a normal error, so
+Each point of the outline lies in a cell of a table of squared distances to the nearest obstacle's centre; the nearest
+point of a segment counts. An obstacle begins half a cell before its centre. The error of outline and map is normal, so
 
     P(touching) = Phi(-gap / sigma),    P(pressed) = p_contact P(touching) + p_false (1 - P(touching))
 """
@@ -14,7 +14,8 @@ from . import end_point, error_free, log_terms
 from .prelude import kernel, precision
 
 NO_OBSTACLE = wp.constant(0x7FFFFFFF)
-# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact, p_false and of 1 minus these.
+# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false, and of 1 minus each
+# of them.
 SCALE, SCALE_LOW, REACH, REACH_LOW = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 SIDE, SIDE_LOW, HIT_TERM, FALSE_TERM = wp.constant(4), wp.constant(5), wp.constant(6), wp.constant(7)
 MISS_TERM, NO_HIT_TERM = wp.constant(8), wp.constant(9)
@@ -24,7 +25,7 @@ field_cell = end_point.field_cell
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_contact specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact, logs = error_free.functions(flags & {"FLOAT64"}), log_terms.functions(flags & {"FLOAT64"})
@@ -34,12 +35,12 @@ def make(name, flags):
     CAREFUL = "CAREFUL" in flags
     ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
     HIGH_PART = real(4096.0)
-    # Without an obstacle the gap has as many cells.
+    # Gap in cells where there is no obstacle.
     FAR_CELLS = real(1e9)
     LOG_TWO_ROOT_PI = real(1.2655121234846454)
     LARGE = real(10.0 if "FLOAT64" in flags else 6.0)
 
-    # From the outline to the obstacle, negative where they overlap; the squared distance is in cells.
+    # Return the gap between outline and obstacle, negative where they overlap; the squared distance is in cells.
     @wp.func
     def gap(squared: wp.int32, terms: wp.array(dtype=real)):
         whole = two_sum(real(squared >> 12) * HIGH_PART, real(squared & 4095))
@@ -54,10 +55,10 @@ def make(name, flags):
         left = two_sum(away.x, -terms[REACH])
         return two_sum(left.x, left.y + (away.y - terms[REACH_LOW]))
 
-    # log(erfc(x) / 2), by an asymptotic series where erfc is about to vanish.
+    # Return log(erfc(x) / 2), by an asymptotic series where erfc nearly underflows.
     @wp.func
     def log_above(x: vec2):
-        found = real(0.0)
+        log_half = real(0.0)
         if x.x > LARGE:
             t = HALF / (x.x * x.x)
             series = real(1.0)
@@ -66,12 +67,12 @@ def make(name, flags):
                 series = ONE - real(2 * n - 1) * t * series
                 n -= 1
             square = bounded_square(x)
-            found = -square.x - (wp.log(x.x) + LOG_TWO_ROOT_PI - wp.log(series) + square.y)
+            log_half = -square.x - (wp.log(x.x) + LOG_TWO_ROOT_PI - wp.log(series) + square.y)
         else:
-            found = wp.log(HALF * wp.erfc(x.x))
-        return found
+            log_half = wp.log(HALF * wp.erfc(x.x))
+        return log_half
 
-    # Log probability that a segment is pressed, or that it is not.
+    # Return the log probability that a segment is pressed, or that it is not.
     @wp.func
     def log_bump(squared: wp.int32, pressed: wp.int32, terms: wp.array(dtype=real)):
         x = pair_product(gap(squared, terms), vec2(terms[SCALE], terms[SCALE_LOW]))
@@ -82,8 +83,8 @@ def make(name, flags):
             no_hit = terms[FALSE_TERM]
         return either(hit + log_above(x), no_hit + log_above(-x))
 
-    # One work-item a particle: the sum over segments; points start[s] to start[s + 1] - 1 belong to segment s, which is
-    # pressed if that is not 0.
+    # Sum log p over segments: one work-item takes a particle. Points start[s] to start[s + 1] - 1 belong to segment s;
+    # pressed[s] is not 0 where it is pressed.
     @kernel
     def score_contact(
         table: wp.array(dtype=wp.int32),
@@ -106,7 +107,7 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
+        sensor_pose = pose[n]
         low = vec4()
         if CAREFUL:
             low = pose_low[n]
@@ -116,7 +117,7 @@ def make(name, flags):
             nearest = NO_OBSTACLE
             i = start[s]
             while i < start[s + 1]:
-                end = find_end_point(own, low, point[i], point_low[i], ZERO, guard)
+                end = find_end_point(sensor_pose, low, point[i], point_low[i], ZERO, guard)
                 at = pose_cell[n] + end.cell
                 nearest = wp.min(nearest, table[field_cell(at.x, at.y, rows, cols)])
                 i += 1

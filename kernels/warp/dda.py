@@ -1,5 +1,5 @@
-"""Expected range by the plain walk of Amanatides and Woo (1987), cell by cell: exact, and the same bits as the exact
-caster's. The table holds 1 for occupied cells in a ring of twos.
+"""Expected range by the plain walk of Amanatides and Woo (1987), cell by cell. It is exact, with the same bits as the
+exact caster. The table holds 1 for occupied cells in a ring of twos.
 """
 
 import functools
@@ -16,7 +16,7 @@ ENTRY = wp.uint8
 
 @functools.cache
 def functions(flags):
-    """cast_ray specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
@@ -26,7 +26,7 @@ def functions(flags):
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
 
-    # Distance in cells to the first occupied cell, or limit where there is none nearer.
+    # Return the distance in cells to the first occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),

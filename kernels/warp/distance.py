@@ -1,8 +1,8 @@
-"""Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000): all integers.
+"""Exact squared Euclidean distance transform in cells (Meijster, Roerdink and Hesselink 2000), in integers.
 
-Processors take a work-item a line, whose work grows with its length alone. A pass works on parallel lines of a grid:
-line i starts at i * line_stride, its cells are step apart. GPUs, which want more work-items than a map has lines, take
-one a cell: it looks around itself only as far as something nearer may be. The grid has fewer than 2^31 cells, so
+On processors a work-item takes a line, in time linear in its length. Lines of a pass are parallel: line i starts at i *
+line_stride, and its cells are step apart. GPUs need more work-items than a map has lines: there a work-item takes a
+cell, and searches around it only as far as a nearer obstacle is possible. The grid has fewer than 2^31 cells, so
 indices fit int32.
 """
 
@@ -15,7 +15,8 @@ NO_OBSTACLE = wp.constant(-1)
 UNREACHABLE = wp.constant(0x7FFFFFFF)
 
 
-# First pass, one work-item a line: cells to the nearest occupied cell of the same line, NO_OBSTACLE without one.
+# First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one. One work-item
+# takes a line.
 @kernel
 def distance_lines(
     occupied: wp.array(dtype=wp.uint8),
@@ -48,14 +49,15 @@ def distance_lines(
                 along[begin + i * step] = after
 
 
-# Squared distance from cell i to the obstacle nearest to cell j across the lines.
+# Return the squared distance from cell i to the obstacle nearest to cell j across the lines.
 @wp.func
 def parabola(i: wp.int32, j: wp.int32, across: wp.int32):
     return (i - j) * (i - j) + across * across
 
 
-# Second pass, one work-item a line: lower envelope of the parabolas of the first pass. The vertices wait in
-# squared, which a line overwrites from its far end: entry q of the stack never lies beyond the cell that reads it.
+# Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
+# vertices lies in squared, which is overwritten from its far end: entry q of the stack never lies beyond the cell that
+# reads it.
 @kernel
 def distance_envelope(
     along: wp.array(dtype=wp.int32),
@@ -99,17 +101,18 @@ def distance_envelope(
                 top -= 1
 
 
-# ---- a work-item a cell
+# ---- kernels with a work-item per cell
 
-# Beyond all distances: the sum of its square and a distance's fits into 32 bits, without a sign.
+# Larger than all distances. Its square plus the square of a distance fits into 32 unsigned bits.
 FAR = wp.constant(46341)
 BLOCK_BITS = wp.constant(5)
 BLOCK_ROWS = wp.constant(32)
-# Rows looked at between two decisions, so that reads need not wait for one another.
+# Rows read between two decisions, so that reads need not wait for one another.
 STEP_ROWS = wp.constant(4)
 
 
-# First pass, one work-item a cell: cells to the nearest occupied cell of the same row, FAR if it is over reach.
+# First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach. One work-item
+# takes a cell.
 @kernel
 def distance_bits(
     bits: wp.array(dtype=wp.int32),
@@ -129,7 +132,7 @@ def distance_bits(
     nearest[row * cols + col] = wp.uint16(cells)
 
 
-# One work-item a column of a block of rows: the least of its numbers.
+# Find the minimum of each column of a block of rows. One work-item takes a column of a block.
 @kernel
 def distance_blocks(
     nearest: wp.array(dtype=wp.uint16),
@@ -147,15 +150,15 @@ def distance_blocks(
     blocks[block * cols + col] = wp.uint16(least)
 
 
-# Sum of two squares.
+# Return the sum of two squares.
 @wp.func
 def squares_sum(a: wp.uint32, b: wp.uint32):
     return a * a + b * b
 
 
-# Second pass, one work-item a cell: the least sum of squares along its column, UNREACHABLE if it is over most. Near
-# rows are looked at one by one. Of farther ones the blocks' least numbers give first a bound from above, and then which
-# blocks may hold less.
+# Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
+# work-item takes a cell. Near rows are read one by one. Farther away, the minima of blocks give an upper bound first,
+# and then the blocks that may hold less.
 @kernel
 def distance_search(
     nearest: wp.array(dtype=wp.uint16),
@@ -169,7 +172,7 @@ def distance_search(
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
-    # One more than may be found.
+    # One more than the largest result.
     best = wp.min(squares_sum(wp.uint32(0), wp.uint32(nearest[row * cols + col])), wp.uint32(most) + wp.uint32(1))
     i = int(1)
     while i <= BLOCK_ROWS and wp.uint32(i * i) < best:
@@ -180,7 +183,7 @@ def distance_search(
             if row + j < rows:
                 best = wp.min(best, squares_sum(wp.uint32(j), wp.uint32(nearest[(row + j) * cols + col])))
         i += STEP_ROWS
-    # Blocks begin beyond what has been seen, so all rows of a block lie on one side.
+    # Blocks begin beyond the rows read so far, so all rows of a block lie on one side.
     step = int(4)
     if wp.uint32(i * i) < best:
         step = 0
@@ -221,5 +224,5 @@ _KERNELS = {
 
 
 def make(name, flags):
-    """A kernel of this file; no flag changes it."""
+    """Return a kernel of the file; no flag changes it."""
     return _KERNELS[name]

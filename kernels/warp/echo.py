@@ -1,8 +1,8 @@
-"""What a sensor hears: the nearest return among the rays of its cone, one ray for a laser, and the angle there.
+"""The nearest return among the rays of a sensor's cone (one ray for a laser), and its angle of incidence.
 
-The angle of incidence lies between the ray and the normal of the surface that it hits. Normals of cells are made
-beforehand, in a ring of cells around the map: 0 for free cells, NaN for cells without a normal, which count as met
-head-on.
+The angle of incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring
+of cells around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine
+counts as 1.
 """
 
 import functools
@@ -19,7 +19,7 @@ from .ranges import caster_of
 
 @functools.cache
 def functions(flags):
-    """hit_normal, incidence_terms and nearest_echo specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
@@ -35,19 +35,20 @@ def functions(flags):
     ZERO, ONE, TWO = real(0.0), real(1.0), real(2.0)
     NOWHERE = real(math.nan)
 
-    # Distance in cells, limit where nothing returns, and cosine and sine of the angle of incidence, 2 and 0 there: more
-    # than any cosine, so that the first of the bins may be for such beams alone.
+    # Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2 is
+    # more than any cosine, so that the first bin can be for such beams alone.
     @wp.struct
     class Echo:
         t: real
         cosine: real
         sine: real
 
-    # Whether the normal is that of an obstacle.
+    # Return whether a normal belongs to an obstacle.
     @wp.func
     def is_wall(normal: vec2):
         return normal.x != ZERO or normal.y != ZERO
 
+    # Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
     @wp.func
     def normal_at(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, col: wp.int32, row: wp.int32):
         if off_grid(col + 1, row + 1, rows + 2, cols + 2):
@@ -57,24 +58,24 @@ def functions(flags):
                 return vec2(ZERO, ZERO)
         return normals[padded(row, col, cols)]
 
-    # Normal of the cell in which a ray ends at a distance t, which tells where the exact walk was: across all
-    # boundaries in x up to t and those in y before t, or, after a step in y, up to t as well. A corner is passed in x
-    # first.
+    # Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
+    # walk: it has crossed all boundaries in x up to t, and those in y before t or, after a step in y, up to t as well.
+    # At a corner it steps in x first.
     @wp.func
     def hit_normal(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, cell: wp.vec2i, r: Ray, t: real):
         if t == ZERO:
-            own = normal_at(normals, rows, cols, cell.x, cell.y)
-            if is_wall(own):
-                return own
+            start_normal = normal_at(normals, rows, cols, cell.x, cell.y)
+            if is_wall(start_normal):
+                return start_normal
         col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
         before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
-        found = normal_at(normals, rows, cols, col, before)
-        if is_wall(found):
-            return found
+        normal = normal_at(normals, rows, cols, col, before)
+        if is_wall(normal):
+            return normal
         until = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
         return normal_at(normals, rows, cols, col, until)
 
-    # The mixture's terms for the bin of an angle of incidence, by the cosines of the bins' upper edges.
+    # Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
     @wp.func
     def incidence_terms(terms: wp.array(dtype=real), edges: wp.array(dtype=real), kinds: wp.int32, cosine: real):
         bin = int(0)
@@ -82,8 +83,8 @@ def functions(flags):
             bin += 1
         return terms[10 * bin :]
 
-    # The nearest return of a cone's rays, which begin at number first. A ray whose angle of incidence has a cosine
-    # below critical has none: the surface is a mirror to it.
+    # Return the nearest return of a cone's rays, which begin at index first. A ray whose angle of incidence has a
+    # cosine below critical has none: the surface reflects it like a mirror.
     @wp.func
     def nearest_echo(
         map_table: wp.array(dtype=ENTRY),
@@ -105,7 +106,7 @@ def functions(flags):
         echo.t = limit
         echo.cosine = TWO
         for i in range(first, first + cone_rays):
-            # Most casters need not look beyond what is found; those of tables and lines must.
+            # Most casters may stop at the nearest return so far; those of tables and lines may not.
             farthest = real(echo.t)
             if TO_THE_LIMIT:
                 farthest = limit
@@ -130,7 +131,7 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """The kernel cast_echoes specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ENTRY = caster_of(flags).ENTRY
@@ -139,8 +140,8 @@ def make(name, flags):
     INCIDENCE = "INCIDENCE" in flags
     NOWHERE = real(math.nan)
 
-    # Expected ranges of cones, and the angles of incidence there, NaN where nothing returns: one work-item a particle
-    # and cone, fewer than 2^31 in a launch.
+    # Cast cones to expected ranges and angles of incidence, NaN without a return. One work-item takes a particle and
+    # cone; a launch has fewer than 2^31.
     @kernel
     def cast_echoes(
         map_table: wp.array(dtype=ENTRY),

@@ -1,7 +1,7 @@
-"""The cell of the likelihood field's table that a beam's end point falls into, and its place within that cell.
+"""The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
 
-Cells must be the same on every device and in every precision: an end point that is nearer to an edge than guard, the
-bound of its rounding errors, is found again with twice the digits.
+Cells must be the same on every device and in every precision: an end point nearer to an edge than guard, the bound of
+its rounding errors, is computed again with twice the digits.
 """
 
 import functools
@@ -15,7 +15,7 @@ from .prelude import fused, precision
 FIELD_RING = wp.constant(2)
 
 
-# Index of a cell of the padded table; far cells become ring cells.
+# Return the index of a cell of the padded table; far cells become ring cells.
 @wp.func
 def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
     c = wp.clamp(col, -FIELD_RING, cols + FIELD_RING - 1)
@@ -25,7 +25,7 @@ def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """careful_offset, whole_cells, end_point, sure_of, rounded_cell, table_origin and table_cell for a set of flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
@@ -38,15 +38,14 @@ def functions(flags):
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_ONE = real(-1.0)
     EDGE = real(2.0**-33)
-    # Adding and taking off a large number rounds to nearest, and the bits of the sum hold the integer.
+    # Adding and subtracting ROUNDING rounds to nearest; the bits of the sum hold the integer.
     ROUNDING = real(1.5 * 2.0**52 if "FLOAT64" in flags else 1.5 * 2.0**23)
     bits = wp.int64 if "FLOAT64" in flags else wp.int32
-    # What cells have too much that are the bits of a number to which ROUNDING was added.
+    # The bits of ROUNDING: the bits of a sum with ROUNDING, less these, are an integer.
     ROUNDING_BITS = wp.int32(0 if "FLOAT64" in flags else 0x4B400000)
     multiply_add = fused(real)
 
-    # frac + a b - c d (sign -1) or frac + a b + c d (sign +1) where every factor is a sum of two reals; to about twice
-    # the working precision.
+    # Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
     @wp.func
     def careful_offset(frac: vec2, a: vec2, b: vec2, c: vec2, d: vec2, sign: real):
         ab = two_product(a.x, b.x)
@@ -56,9 +55,9 @@ def functions(flags):
         low = (a.x * b.y + a.y * b.x) + sign * (c.x * d.y + c.y * d.x)
         return vec2(total.x, ((ab.y + sign * cd.y) + (products.y + frac.y)) + (low + total.y))
 
-    # Whole cells below an offset of two parts. What is left of it in [0, 1) comes second, and what is missing to 1
-    # third: both found relative to the nearest edge, where small numbers keep their digits. An offset that is EDGE or
-    # less short of an edge lies on it, so that end points on edges fall into the same cell in every precision.
+    # Return the whole cells below an offset of two parts, the remainder in [0, 1), and 1 minus it. Both are computed
+    # relative to the nearest edge, where small numbers keep their digits. An offset at most EDGE below an edge counts
+    # as on it, so that end points on edges fall into the same cell in every precision.
     @wp.func
     def whole_cells(offset: vec2):
         nearest = wp.floor(offset.x + HALF)
@@ -79,7 +78,7 @@ def functions(flags):
             to_next = -past
         return int(nearest), rest, to_next
 
-    # Where an end point lies: its cell as an offset from the pose's cell, and its place between that cell's edges.
+    # An end point: its cell as an offset from the pose's cell, and its place between the edges of that cell.
     @wp.struct
     class EndPoint:
         cell: wp.vec2i
@@ -88,8 +87,9 @@ def functions(flags):
         to_next_x: vec2
         to_next_y: vec2
 
-    # point is the reading times the beam's (cos, sin), in cells; shift moves cell centres onto corners. An end point
-    # nearer to a cell's edge than guard, the bound of its rounding errors, is found again with twice the digits.
+    # Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell
+    # centres onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is
+    # computed again with twice the digits.
     @wp.func
     def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
         end = EndPoint()
@@ -119,8 +119,9 @@ def functions(flags):
         end.to_next_y = to_next_y
         return end
 
-    # What is left of half a cell where end points are off by guard if products are rounded, by 3.12 eps of the reading
-    # and 1.5 altogether. On GPUs they are not, and it is 2 eps and 1.6.
+    # Return the largest distance from a cell's centre at which rounding certainly gives the cell: half a cell less the
+    # rounding errors of an end point. guard bounds them for rounded products, with 3.12 eps of the reading and 1.5 eps
+    # altogether. GPUs fuse products, and the errors are 2 eps and 1.6 eps.
     @wp.func_native(f"""
     #if defined(__CUDA_ARCH__)
     return static_cast<{one}>(0.5) - static_cast<{one}>(0.6875) * guard;
@@ -128,7 +129,7 @@ def functions(flags):
     return static_cast<{one}>(0.5) - guard;
     #endif
     """)
-    def sure_of(guard: real) -> real: ...
+    def rounding_margin(guard: real) -> real: ...
 
     # Nearest cell of an end point, whose place is given half a cell lower: rounded to nearest, and ROUNDING_BITS too
     # much. How far the place is off a cell's centre comes second.
@@ -141,8 +142,8 @@ def functions(flags):
         near = wp.vec2i(wp.int32(wp.cast(to_x, bits)), wp.int32(wp.cast(to_y, bits)))
         return near, wp.max(wp.abs(x - (to_x - ROUNDING)), wp.abs(y - (to_y - ROUNDING)))
 
-    # Index of such a cell of the padded table, seen from what table_origin makes of the pose's cell. Where no end point
-    # of the cloud leaves the table that is a sum and a product modulo 2^32: what is too much is taken off once for all.
+    # Return the origin for table_cell, from the pose's cell. Where no end point of the cloud leaves the table (INSIDE),
+    # an index is a sum and a product modulo 2^32, and ROUNDING_BITS are subtracted once per pose.
     @wp.func
     def table_origin(origin: wp.vec2i, cols: wp.int32):
         if INSIDE:
@@ -153,6 +154,7 @@ def functions(flags):
         else:
             return wp.vec2i(origin.x - ROUNDING_BITS, origin.y - ROUNDING_BITS)
 
+    # Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
     @wp.func
     def table_cell(near: wp.vec2i, start: wp.vec2i, rows: wp.int32, cols: wp.int32):
         if INSIDE:
@@ -166,7 +168,7 @@ def functions(flags):
         whole_cells=whole_cells,
         EndPoint=EndPoint,
         end_point=end_point,
-        sure_of=sure_of,
+        rounding_margin=rounding_margin,
         rounded_cell=rounded_cell,
         table_origin=table_origin,
         table_cell=table_cell,

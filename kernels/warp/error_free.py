@@ -1,4 +1,4 @@
-"""Error-free transformations: what a rounded operation leaves behind is kept in a second number.
+"""Error-free transformations: the rounding error of an operation is kept in a second number.
 
 Source: Knuth (two_sum), Dekker and Veltkamp (two_product). They need fuse_fp and fast_math off.
 """
@@ -10,36 +10,36 @@ import warp as wp
 
 from .prelude import precision
 
-# Sums over beams add this many terms plainly, then the block's sum to a compensated total: nearly the accuracy of
-# compensating every term, at nearly the cost of none.
+# Sums over beams add the terms of a block plainly, then the sum of the block to a compensated total. The accuracy is
+# nearly that of compensating every term, the cost nearly that of compensating none.
 BLOCK_TERMS = wp.constant(16)
 
-# A block of the beam model's sums has so many strands, each of every fourth term: a strand is added plainly, then its
-# sum to the compensated total. So work-items and lanes that share a block need not ask one another for terms.
+# A block of the beam model's sums has STRANDS strands; strand i has every fourth term from term i on. Each strand is
+# added plainly, then its sum to the compensated total. So work-items or lanes that share a block exchange no terms.
 STRANDS = wp.constant(4)
 
 
 @functools.cache
 def functions(flags):
-    """two_sum, high_half, two_product, pair_sum, pair_product, add_term and add_strands specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     SPLITTER = real(134217729.0 if "FLOAT64" in flags else 4097.0)
 
-    # a + b = sum.x + sum.y exactly.
+    # Return a + b = sum.x + sum.y exactly.
     @wp.func
     def two_sum(a: real, b: real):
         total = a + b
         shift = total - a
         return vec2(total, (a - (total - shift)) + (b - shift))
 
-    # High half of a float: its leading bits, few enough that a product of two such halves is exact.
+    # Return the leading bits of a float, few enough that a product of two such halves is exact.
     @wp.func
     def high_half(a: real):
         scaled = SPLITTER * a
         return scaled - (scaled - a)
 
-    # a * b = product.x + product.y exactly, short of overflow and underflow.
+    # Return a * b = product.x + product.y exactly, short of overflow and underflow.
     @wp.func
     def two_product(a: real, b: real):
         product = a * b
@@ -50,24 +50,25 @@ def functions(flags):
         error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
         return vec2(product, error)
 
-    # Sums and products of two numbers of two parts each, to about twice the working precision.
+    # Add two numbers of two parts each, to about twice the working precision.
     @wp.func
     def pair_sum(a: vec2, b: vec2):
         total = two_sum(a.x, b.x)
         return two_sum(total.x, total.y + (a.y + b.y))
 
+    # Multiply two numbers of two parts each, to about twice the working precision.
     @wp.func
     def pair_product(a: vec2, b: vec2):
         product = two_product(a.x, b.x)
         return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x))
 
-    # One more term in a compensated sum: total.x is the running sum, total.y what its roundings lost.
+    # Add a term to a compensated sum: total.x is the running sum, total.y the sum of its rounding errors.
     @wp.func
     def add_term(total: vec2, term: real):
         head = two_sum(total.x, term)
         return vec2(head.x, total.y + head.y)
 
-    # A block more, by its strands.
+    # Add a block to a compensated sum, by its strands.
     @wp.func
     def add_strands(total: vec2, strands: vec4):
         return add_term(add_term(add_term(add_term(total, strands[0]), strands[1]), strands[2]), strands[3])

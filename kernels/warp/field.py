@@ -1,7 +1,7 @@
 """Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 
-The table is padded by a ring of two cells that hold what lies outside the grid, so no look-up needs a bounds test.
-It has fewer than 2^31 cells, and a launch fewer than 2^31 parts, so indices fit int32.
+The table is padded by a ring of two cells for everything outside the grid, so no look-up needs a bounds test. It has
+fewer than 2^31 cells, and a launch fewer than 2^31 parts, so indices fit int32.
 """
 
 import functools
@@ -15,13 +15,13 @@ from .end_point import field_cell
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, precision, reader, work_item
 
-# Particles of a work-group of field_blocks.
+# Particles per work-group of field_blocks.
 GROUP = wp.constant(64)
 
 
 @functools.cache
 def functions(flags):
-    """between, bilinear, log_field and reading_value specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
@@ -32,13 +32,13 @@ def functions(flags):
     ALL_READINGS = "ALL_READINGS" in flags
     BILINEAR = "BILINEAR" in flags
     HIT = "HIT" in flags
+    LINEAR = "LINEAR" in flags
     LOG_TABLE = "LOG_TABLE" in flags
     SHARP = "SHARP" in flags
     ZERO, ONE = real(0.0), real(1.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
 
-    # a and b weighed by two numbers of two parts; a sum of terms that are not negative, so small values keep their
-    # digits.
+    # Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
     @wp.func
     def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
         if SHARP:
@@ -46,7 +46,7 @@ def functions(flags):
         else:
             return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
 
-    # Smooth distance between the four cell centres around an end point, in two parts.
+    # Interpolate the distance between the four cell centres around an end point, in two parts.
     @wp.func
     def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, rows: wp.int32, cols: wp.int32):
         a = vec2(number_at(table, field_cell(cell.x, cell.y, rows, cols)), ZERO)
@@ -57,9 +57,9 @@ def functions(flags):
         high = between(end.to_next_x, c, end.rest_x, d)
         return between(end.to_next_y, low, end.rest_y, high)
 
-    # terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and what rounding took from terms 0 and 1}: z_hit / (sigma
-    # sqrt(2 pi)) and z_rand / range_max, logarithms in the log domain. Where the peak is high, exponent and log peak
-    # nearly cancel.
+    # Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+    # terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma
+    # sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
     @wp.func
     def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
         if SHARP:
@@ -67,25 +67,28 @@ def functions(flags):
         else:
             return vec2(distance.x * (distance.x * terms[1]), ZERO)
 
-    @wp.func
-    def log_field_linear(distance: vec2, terms: wp.array(dtype=real)):
-        p = terms[2]
-        if HIT:
+    # Return log p of the distance from an end point to the nearest obstacle.
+    if LINEAR:
+
+        @wp.func
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+            p = terms[2]
+            if HIT:
+                exponent = field_exponent(distance, terms)
+                p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
+            return wp.log(p)
+
+    else:
+
+        @wp.func
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
             exponent = field_exponent(distance, terms)
-            p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
-        return wp.log(p)
+            hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
+            largest = wp.max(hit, terms[2])
+            return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
 
-    @wp.func
-    def log_field_log(distance: vec2, terms: wp.array(dtype=real)):
-        exponent = field_exponent(distance, terms)
-        hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
-        largest = wp.max(hit, terms[2])
-        return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
-
-    log_field = log_field_linear if "LINEAR" in flags else log_field_log
-
-    # What one reading adds: the table holds log densities, or cubes of densities whose sum's logarithm is wanted, or
-    # capped distances in metres where it is interpolated.
+    # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
+    # interpolated, capped distances in metres.
     @wp.func
     def reading_value(
         table: wp.array(dtype=real),
@@ -120,13 +123,13 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """A kernel of this file specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     reading_value = functions(flags).reading_value
     ends = end_points.functions(flags)
     end_point, rounded_cell, ROUNDING_BITS = ends.end_point, ends.rounded_cell, ends.ROUNDING_BITS
-    table_origin, table_cell, sure_of = ends.table_origin, ends.table_cell, ends.sure_of
+    table_origin, table_cell, rounding_margin = ends.table_origin, ends.table_cell, ends.rounding_margin
     add_term = error_free.functions(flags).add_term
     CAREFUL = "CAREFUL" in flags
     CUBES = "CUBES" in flags
@@ -135,15 +138,14 @@ def make(name, flags):
     QUICK = "QUICK" in flags
     SCANS = "SCANS" in flags
     ZERO, HALF = real(0.0), real(0.5)
-    # A constant for loops that Warp shall unroll.
+    # Constants of loops that Warp shall unroll.
     WHOLE_BLOCK, HALF_BLOCK = 16, 8
     number_at, cell_at, point_at, pose_at = reader(real), reader(wp.vec2i), reader(vec2), reader(vec4)
     two_at = reader(vec2, 2)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
-    # What one reading adds whose cell is found by rounding alone, and how far its place is off the cell's centre. A
-    # reading that is no range has no cell: the sensor's own is looked up in its place, and what a max reading adds is
-    # far.
+    # Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre. A
+    # missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
     @wp.func
     def quick_value(
         table: wp.array(dtype=real),
@@ -166,14 +168,14 @@ def make(name, flags):
             value = number_at(table, table_cell(near, start_cell, rows, cols))
         return value, off
 
-    # The same where that is in doubt: the cell is found with more digits.
+    # Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
     @wp.func
     def careful_value(
         table: wp.array(dtype=real),
         origin: wp.vec2i,
         lowered: vec4,
-        from_pose: vec4,
-        from_low: vec4,
+        sensor_pose: vec4,
+        sensor_low: vec4,
         to: vec2,
         to_low: vec2,
         far: real,
@@ -190,13 +192,13 @@ def make(name, flags):
         near, off = rounded_cell(lowered, to)
         cell = wp.vec2i(near.x - ROUNDING_BITS, near.y - ROUNDING_BITS)
         if off > sure:
-            exact = end_point(from_pose, from_low, to, to_low, ZERO, guard)
+            exact = end_point(sensor_pose, sensor_low, to, to_low, ZERO, guard)
             cell = exact.cell
         return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
 
-    # Values of width x height cells of the table, the first of them at begin, from squared distances by a table of all
-    # squared distances up to the cap. Cell (from_col, from_row) of the squared distances comes first; beyond them is
-    # beyond.
+    # Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value
+    # for each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the
+    # grid get beyond.
     @kernel
     def fill_field(
         squared: wp.array(dtype=wp.int32),
@@ -223,7 +225,7 @@ def make(name, flags):
             value = density[wp.min(squared[row * cols + col], cap)]
         table[begin + j * stride + i] = value
 
-    # One work-item a particle.
+    # Score scans: one work-item takes a particle.
     @kernel
     def score_field(
         table: wp.array(dtype=real),
@@ -251,28 +253,28 @@ def make(name, flags):
         if n >= particles:
             return
         origin = pose_cell[n]
-        from_pose = pose[n]
-        from_low = vec4()
+        sensor_pose = pose[n]
+        sensor_low = vec4()
         if CAREFUL:
-            from_low = pose_low[n]
+            sensor_low = pose_low[n]
         begin = int(0)
         size = readings
-        lead = fixed
+        constant_term = fixed
         if SCANS:
             scan = (n + ahead) // per_scan
             begin = start[scan]
             size = start[scan + 1] - begin
-            lead = fixed_of[scan]
-        total = vec2(lead, ZERO)
+            constant_term = fixed_of[scan]
+        total = vec2(constant_term, ZERO)
         block = real(0.0)
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
         k = int(0)
         if QUICK:
-            # A block's cells, then its look-ups. On processors the first loop becomes vectors, which takes a third of
-            # the time; with points read as vec2, or a maximum in place of a count, it would not.
-            lowered = from_pose - vec4(HALF, HALF, ZERO, ZERO)
+            # First all cells of a block, then all look-ups. On processors the first loop becomes vector code and takes
+            # a third of the time; with points read as vec2, or a maximum in place of a count, it would not.
+            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, cols)
-            sure = sure_of(guard)
+            sure = rounding_margin(guard)
             cells = block_cells()
             while k < size:
                 first = begin + k
@@ -287,7 +289,7 @@ def make(name, flags):
                 if doubtful > 0:
                     i = int(0)
                     while i < width:
-                        exact = end_point(from_pose, from_low, point[first + i], point_low[first + i], ZERO, guard)
+                        exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
                         cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, rows, cols)
                         i += 1
                 block = ZERO
@@ -306,7 +308,7 @@ def make(name, flags):
                 to_low = vec2()
                 if CAREFUL:
                     to_low = point_low[begin + k]
-                term = reading_value(table, origin, from_pose, from_low, to, to_low, terms, rows, cols, guard)
+                term = reading_value(table, origin, sensor_pose, sensor_low, to, to_low, terms, rows, cols, guard)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 block += term
@@ -323,8 +325,9 @@ def make(name, flags):
         else:
             log_p[n] = temperature * (total.x + total.y)
 
-    # For GPUs, one work-item a particle and every 2^spread-th block of readings: the block's sum, at
-    # parts[n * across + block * along]. Each block has its own guard; of several scans each has as many as the longest.
+    # Write the sums of blocks of readings to parts[n * across + block * along], for GPUs. One work-item takes a
+    # particle and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards
+    # as the longest one.
     @kernel
     def field_blocks(
         table: wp.array(dtype=real),
@@ -351,12 +354,12 @@ def make(name, flags):
         if n >= particles:
             return
         origin = cell_at(pose_cell, n)
-        own = pose_at(pose, n)
-        low = vec4()
+        sensor_pose = pose_at(pose, n)
+        sensor_low = vec4()
         if CAREFUL:
-            low = pose_at(pose_low, n)
+            sensor_low = pose_at(pose_low, n)
         if QUICK:
-            lowered = own - vec4(HALF, HALF, ZERO, ZERO)
+            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, cols)
             far = number_at(terms, 3)
         before = int(0)
@@ -372,9 +375,9 @@ def make(name, flags):
             begin = before + block * BLOCK_TERMS
             end = wp.min(begin + BLOCK_TERMS, before + size)
             total = real(0.0)
-            own_guard = number_at(guard, guards + block)
+            block_guard = number_at(guard, guards + block)
             if QUICK:
-                sure = sure_of(own_guard)
+                sure = rounding_margin(block_guard)
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
                     if SCANS:
@@ -384,13 +387,13 @@ def make(name, flags):
                             worst = wp.max(worst, off)
                             total += value
                     else:
-                        # Points of one scan begin where two of them can be read at once.
+                        # The points of one scan are aligned, so that two of them can be read at once.
                         for i in range(HALF_BLOCK):
-                            both = two_at(point, begin + 2 * i)
-                            value, off = quick_value(table, start_cell, lowered, vec2(both.x, both.y), far, rows, cols)
+                            pair = two_at(point, begin + 2 * i)
+                            value, off = quick_value(table, start_cell, lowered, vec2(pair.x, pair.y), far, rows, cols)
                             worst = wp.max(worst, off)
                             total += value
-                            value, off = quick_value(table, start_cell, lowered, vec2(both.z, both.w), far, rows, cols)
+                            value, off = quick_value(table, start_cell, lowered, vec2(pair.z, pair.w), far, rows, cols)
                             worst = wp.max(worst, off)
                             total += value
                 else:
@@ -407,8 +410,9 @@ def make(name, flags):
                     while k < end:
                         to, to_low = point_at(point, k), point_at(point_low, k)
                         total += careful_value(
-                            table, origin, lowered, own, low, to, to_low, far, rows, cols, own_guard, sure
-                        )
+                            table, origin, lowered, sensor_pose, sensor_low, to, to_low, far, rows, cols, block_guard,
+                            sure,
+                        )  # fmt: skip
                         k += 1
             else:
                 k = begin
@@ -417,7 +421,9 @@ def make(name, flags):
                     if CAREFUL:
                         to_low = point_at(point_low, k)
                     to = point_at(point, k)
-                    total += reading_value(table, origin, own, low, to, to_low, terms, rows, cols, own_guard)
+                    total += reading_value(
+                        table, origin, sensor_pose, sensor_low, to, to_low, terms, rows, cols, block_guard
+                    )
                     k += 1
             parts[n * across + block * along] = total
             block += 1 << spread

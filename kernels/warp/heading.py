@@ -1,9 +1,9 @@
 """Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits.
 
 A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
-count times pi/2 in four parts (Cody and Waite), beyond by the product with as many bits of 2/pi as matter, in integers
-(Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. ``bench/heading_constants.py``
-derives the constants.
+count times pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in
+integers (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
+``bench/derive/heading_constants.py`` derives the constants.
 """
 
 import functools
@@ -16,7 +16,7 @@ from . import error_free
 # Up to this heading the counts of quarter turns have 20 bits.
 LIMIT = wp.constant(wp.float64(1048576.0))
 TWO_OVER_PI = wp.constant(wp.float64(0.6366197723675814))
-# 1.5 * 2^52: a sum with it is rounded to a whole number.
+# 1.5 * 2^52: a sum with it is rounded to an integer.
 ROUNDER = wp.constant(wp.float64(6755399441055744.0))
 # pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
 QUARTER_1 = wp.constant(wp.float64(1.5707963267341256))
@@ -39,7 +39,7 @@ C3 = wp.constant(wp.float64(-2.7557314179308847e-07))
 C4 = wp.constant(wp.float64(2.087570084339475e-09))
 C5 = wp.constant(wp.float64(-1.1358536585312173e-11))
 ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
-# What the pieces of a turn are worth, in quarters.
+# Values of the pieces of a turn, in quarters.
 PIECE_1, PIECE_2 = wp.constant(wp.float64(2.0**-32)), wp.constant(wp.float64(2.0**-62))
 PIECE_3, PIECE_4 = wp.constant(wp.float64(2.0**-92)), wp.constant(wp.float64(2.0**-122))
 # The bits of 2/pi in words of 32 after two words of zeros.
@@ -60,12 +60,12 @@ SIGNED_MASK_30, SIGNED_EIGHTH = wp.constant(wp.int64(0x3FFFFFFF)), wp.constant(w
 
 @functools.cache
 def functions(flags):
-    """reduce_ordinary, reduce_huge and cos_sin, in float64 whatever the precision of a model."""
+    """Make the functions of the file, in float64 whatever the precision of a model."""
     transformations = error_free.functions(frozenset({"FLOAT64"}))
     two_sum, pair_product = transformations.two_sum, transformations.pair_product
     HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
-    # Quarter turns modulo 4 and the rest as the sum of two numbers, for headings of at most LIMIT.
+    # Reduce a heading of at most LIMIT to quarter turns modulo 4 and the sum of two numbers.
     @wp.func
     def reduce_ordinary(theta: wp.float64):
         count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
@@ -75,15 +75,15 @@ def functions(flags):
         low = (first.y + second.y) - count * QUARTER_4
         return int(count) & 3, two_sum(second.x, low)
 
-    # As reduce_ordinary for headings above LIMIT, up to the largest there is.
+    # Reduce a heading above LIMIT, up to the largest number.
     @wp.func
     def reduce_huge(theta: wp.float64):
         bits = wp.cast(wp.abs(theta), wp.uint64)
         mantissa = (bits & MASK_52) | ONE_52
         low_half = mantissa & MASK_32
         high_half = mantissa >> wp.uint64(32)
-        # Bits of 2/pi that make whole turns are left out: the window's first bit is worth half a turn in the
-        # mantissa's last place.
+        # Bits of 2/pi that make whole turns are left out: times the last bit of the mantissa, the window's first bit is
+        # half a turn.
         first = int(bits >> wp.uint64(52)) - (1075 - 62)
         word = first >> 5
         shift = wp.uint64(first & 31)
@@ -108,7 +108,8 @@ def functions(flags):
             turn_3 = turn_2
             turn_2 = turn_1
             turn_1 = sum_2 & MASK_32
-        # To the nearest quarter; the rest, in quarters of 2^62, is cut into pieces that are converted without rounding.
+        # Round to the nearest quarter. The rest, in units of 2^-62 quarters, is cut into pieces that convert without
+        # rounding.
         turn_high = (turn_1 << wp.uint64(32) | turn_2) + EIGHTH
         turn_low = turn_3 << wp.uint64(32) | turn_4
         quadrant = int(turn_high >> wp.uint64(62))
@@ -123,7 +124,7 @@ def functions(flags):
         back = theta < ZERO
         return wp.where(back, -quadrant, quadrant) & 3, wp.where(back, wp.vec2d(-angle.x, -angle.y), angle)
 
-    # (cosine, sine) of a heading; of no meaning, but not NaN, where it is not finite.
+    # Return (cosine, sine) of a heading; for a heading that is not finite they have no meaning but are not NaN.
     @wp.func
     def cos_sin(theta: wp.float64):
         quadrant = int(0)

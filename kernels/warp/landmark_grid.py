@@ -1,7 +1,8 @@
-"""Likelihood of features by the landmarks near to where each of them points, book table 6.5.
+"""Search for the landmarks near the end point of a feature, book table 6.5.
 
-Landmarks lie in square buckets, row by row; start has the first of each bucket. A feature looks into the buckets that a
-disc around its end point touches, and evaluates the landmarks within the disc; what is farther cannot matter.
+Landmarks lie in square buckets, row by row; start[i] is the first landmark of bucket i. A search visits the buckets
+that a disc around the feature's end point touches, and evaluates the landmarks within the disc; others have a
+negligible density.
 """
 
 import functools
@@ -28,7 +29,7 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """bucket_at, near, with_landmark and search specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
@@ -37,73 +38,74 @@ def functions(flags):
     MARGINAL = "MARGINAL" in flags
     ZERO, ONE = real(0.0), real(1.0)
     NEVER = real(-math.inf)
-    # A sum of densities is kept relative to one of them until another is e to this larger.
+    # A sum of densities is relative to one of them, until another is larger by a factor of e^RELATIVE.
     RELATIVE = real(4.0)
     WIDER = real(1.01)
 
-    # What a search finds: log density of the likeliest landmark, or with MARGINAL of all, that one's, and its place;
-    # and the sum of densities relative to found.
+    # Result of a search: the log density, of the likeliest landmark or with MARGINAL of all of them; the log density of
+    # the likeliest one, and its index; and the sum of densities relative to log_p.
     @wp.struct
     class Match:
-        found: real
+        log_p: real
         best: real
         chosen: wp.int32
         total: vec2
 
-    # Row or column of the bucket at a position; the nearest one outside.
+    # Return the row or column of the bucket at a position, the nearest one for positions outside.
     @wp.func
     def bucket_at(position: real, size: real, count: wp.int32):
         return int(wp.clamp(wp.floor(position / size), ZERO, real(count - 1)))
 
-    # Whether a landmark lies in a feature's disc, no farther than what may still matter (squared), and within the
-    # limits of the sensor that it does not measure.
+    # Return whether a landmark lies in a feature's disc, within the limits of the sensor that the feature does not
+    # measure, and no farther from the end point than the square root of most.
     @wp.func
-    def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), one: wp.int32, most: real):
-        reach = feature[one + REACH]
-        radius = feature[one + RADIUS]
-        hole = feature[one + HOLE]
+    def near(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, most: real):
+        reach = feature[base + REACH]
+        radius = feature[base + RADIUS]
+        hole = feature[base + HOLE]
         x = off[0] - reach * turned[0]
         y = off[2] - reach * turned[2]
         squared = off[0] * off[0] + off[2] * off[2]
         apart = x * x + y * y
         if apart > radius * radius or squared < hole * hole:
             return False
-        # That bound is for the end point itself.
-        if reach > ZERO and reach == feature[one + RANGE_AT] and apart > most:
+        # The bound most holds for a disc around the end point itself.
+        if reach > ZERO and reach == feature[base + RANGE_AT] and apart > most:
             return False
         d = wp.sqrt(squared)
-        return d <= feature[one + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[one + AXIS] * d
+        return d <= feature[base + FARTHEST] and turned[0] * off[0] + turned[2] * off[2] >= feature[base + AXIS] * d
 
-    # Square of the radius around a feature's end point outside which exponents are larger than some: with r the error
-    # of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away, and 2 (1 - cos b)
-    # is at most b^2. A little is added for what rounding takes from such distances.
+    # Return the square of the radius around a feature's end point outside which exponents are larger than exponent.
+    # With r the error of the range and b that of the bearing, a landmark is sqrt(r^2 + 2 z (z + r) (1 - cos b)) away,
+    # and 2 (1 - cos b) is at most b^2. A factor and SLACK cover rounding errors of such distances.
     @wp.func
-    def squared_reach(exponent: real, feature: wp.array(dtype=real), one: wp.int32):
-        found = real(0.0)
+    def squared_reach(exponent: real, feature: wp.array(dtype=real), base: wp.int32):
+        squared = real(0.0)
         if exponent > ZERO:
-            r = wp.sqrt(exponent) * feature[one + RANGE_SPREAD]
-            b = wp.sqrt(exponent) * feature[one + BEARING_SPREAD]
-            z = feature[one + RANGE_AT]
-            found = WIDER * (r * r + z * (z + r) * (b * b)) + feature[one + SLACK]
-        return found
+            r = wp.sqrt(exponent) * feature[base + RANGE_SPREAD]
+            b = wp.sqrt(exponent) * feature[base + BEARING_SPREAD]
+            z = feature[base + RANGE_AT]
+            squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + SLACK]
+        return squared
 
-    # A match and one more landmark.
+    # Update a match by one more landmark.
     @wp.func
     def with_landmark(match: Match, log_p: real, j: wp.int32):
         if MARGINAL:
-            if wp.isinf(match.found):
-                match.found = log_p
+            if wp.isinf(match.log_p):
+                match.log_p = log_p
                 match.total = vec2(wp.where(wp.isinf(log_p), ZERO, ONE), ZERO)
-            elif log_p > match.found + RELATIVE:
-                match.total = match.total * wp.exp(match.found - log_p) + vec2(ONE, ZERO)
-                match.found = log_p
+            elif log_p > match.log_p + RELATIVE:
+                match.total = match.total * wp.exp(match.log_p - log_p) + vec2(ONE, ZERO)
+                match.log_p = log_p
             else:
-                match.total = add_term(match.total, wp.exp(log_p - match.found))
+                match.total = add_term(match.total, wp.exp(log_p - match.log_p))
         if log_p > match.best:
             match.best = log_p
             match.chosen = j
         return match
 
+    # Return the match of a feature among the landmarks within its disc.
     @wp.func
     def search(
         landmark: wp.array(dtype=vec4),
@@ -112,7 +114,7 @@ def functions(flags):
         place: vec4,
         turned: vec4,
         feature: wp.array(dtype=real),
-        one: wp.int32,
+        base: wp.int32,
         terms: wp.array(dtype=real),
         arcs: wp.array(dtype=vec2),
         rows: wp.int32,
@@ -120,15 +122,15 @@ def functions(flags):
         size: real,
     ):
         match = Match()
-        match.found = NEVER
+        match.log_p = NEVER
         match.best = NEVER
         match.chosen = -1
         match.total = vec2(ZERO, ZERO)
-        reach = feature[one + REACH]
-        radius = feature[one + RADIUS]
+        reach = feature[base + REACH]
+        radius = feature[base + RADIUS]
         if radius < ZERO:
             return match
-        # What cannot be likelier than the best so far is not evaluated.
+        # Landmarks that cannot be likelier than the best so far are not evaluated.
         most = real(math.inf)
         x = place[0] + reach * turned[0]
         y = place[2] + reach * turned[2]
@@ -141,17 +143,19 @@ def functions(flags):
             last = start[row * cols + right + 1]
             while j < last:
                 off = offset(landmark[j], place)
-                if near(off, turned, feature, one, most):
-                    match = with_landmark(match, log_detection(off, turned, feature, one, signature[j], terms, arcs), j)
+                if near(off, turned, feature, base, most):
+                    match = with_landmark(
+                        match, log_detection(off, turned, feature, base, signature[j], terms, arcs), j
+                    )
                     if not MARGINAL:
-                        most = squared_reach(feature[one + MOST] - match.best, feature, one)
+                        most = squared_reach(feature[base + MOST] - match.best, feature, base)
                 j += 1
             row += 1
         if MARGINAL:
-            if not wp.isinf(match.found):
-                match.found = match.found + wp.log(match.total[0] + match.total[1])
+            if not wp.isinf(match.log_p):
+                match.log_p = match.log_p + wp.log(match.total[0] + match.total[1])
         else:
-            match.found = match.best
+            match.log_p = match.best
         return match
 
     return SimpleNamespace(bucket_at=bucket_at, near=near, search=search)

@@ -1,8 +1,8 @@
-"""The likeliest joint association of a few features, in which no two of them are the same landmark.
+"""The likeliest joint association of a few features, in which no two features have the same landmark.
 
-Features without a landmark are false positives. Landmarks are taken one after the other; best[s] is the largest sum of
-log p over a set s of features, a number of as many bits, that have one of the landmarks so far. Each landmark may
-join one feature to a set: 2^features * features steps a landmark, and the maximum is exact.
+Features without a landmark are false positives. Landmarks are processed one after the other. A set s of features is a
+bit mask; best[s] is the largest sum of log p over the features of s when all of them have landmarks that were
+processed. A landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
 """
 
 import functools
@@ -17,7 +17,7 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """The kernel joint_features specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"}
@@ -27,11 +27,11 @@ def make(name, flags):
     near = landmark_grid.functions(shape).near
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER, EVERYWHERE = real(0.0), real(-math.inf), real(math.inf)
-    # Features that a work-item has room for.
+    # Largest number of features.
     LogEach = wp.types.vector(length=8, dtype=real)
 
-    # One work-item a particle. choice[s] has the landmark of each feature of a set, and its log p at value; sets is
-    # 2^features.
+    # Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set
+    # s, and value[s] its log p; sets is 2^features.
     @kernel
     def joint_features(
         landmark: wp.array(dtype=vec4),
@@ -59,19 +59,19 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
+        high = pose[n]
         low = pose_low[n]
-        place = sensor_place(pose_cell[n], own, low, size)
+        place = sensor_place(pose_cell[n], high, low, size)
         sums = n * sets
-        who = n * sets * features
+        begin = n * sets * features
         i = int(0)
         while i < sets:
             best[sums + i] = wp.where(i == 0, ZERO, NEVER)
             i += 1
         i = int(0)
         while i < sets * features:
-            choice[who + i] = -1
-            value[who + i] = NEVER
+            choice[begin + i] = -1
+            value[begin + i] = NEVER
             i += 1
         log_each = LogEach()
         j = int(0)
@@ -79,15 +79,15 @@ def make(name, flags):
             off = offset(landmark[j], place)
             k = int(0)
             while k < features:
-                one = FEATURE * k
-                turned = direction(own, low, feature, one)
+                base = FEATURE * k
+                turned = direction(high, low, feature, base)
                 log_each[k] = NEVER
-                if feature[one + RADIUS] >= ZERO:
-                    if near(off, turned, feature, one, EVERYWHERE):
-                        found = log_detection(off, turned, feature, one, signature[j], terms, arcs)
-                        log_each[k] = either(found, feature[one + FALSE_POSITIVE])
+                if feature[base + RADIUS] >= ZERO:
+                    if near(off, turned, feature, base, EVERYWHERE):
+                        detected = log_detection(off, turned, feature, base, signature[j], terms, arcs)
+                        log_each[k] = either(detected, feature[base + FALSE_POSITIVE])
                 k += 1
-            # From the full set down: the smaller sets do not have this landmark yet.
+            # From the full set down, since smaller sets must not yet contain this landmark.
             s = sets - 1
             while s > 0:
                 k = int(0)
@@ -100,11 +100,11 @@ def make(name, flags):
                             i = int(0)
                             while i < features:
                                 if i == k:
-                                    choice[who + s * features + i] = j
-                                    value[who + s * features + i] = log_each[k]
+                                    choice[begin + s * features + i] = j
+                                    value[begin + s * features + i] = log_each[k]
                                 else:
-                                    choice[who + s * features + i] = choice[who + less * features + i]
-                                    value[who + s * features + i] = value[who + less * features + i]
+                                    choice[begin + s * features + i] = choice[begin + less * features + i]
+                                    value[begin + s * features + i] = value[begin + less * features + i]
                                 i += 1
                     k += 1
                 s -= 1
@@ -127,10 +127,10 @@ def make(name, flags):
         if PER_BEAM:
             k = int(0)
             while k < features:
-                j = choice[who + chosen * features + k]
+                j = choice[begin + chosen * features + k]
                 which[n * features + k] = j
                 parts[n * features + k] = wp.where(
-                    j >= 0, value[who + chosen * features + k], feature[FEATURE * k + FALSE_POSITIVE]
+                    j >= 0, value[begin + chosen * features + k], feature[FEATURE * k + FALSE_POSITIVE]
                 )
                 k += 1
 

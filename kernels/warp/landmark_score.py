@@ -12,7 +12,7 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """The kernel score_features specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
@@ -24,10 +24,10 @@ def make(name, flags):
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER = real(0.0), real(-math.inf)
 
-    # One work-item a particle: the sum of log p over features, with the partner that is KNOWN, of all landmarks
-    # (MARGINAL), or of the likeliest one. With PER_BEAM also what each feature adds, and its likeliest landmark's place
-    # in the buckets, -1 where a false positive is likelier. share is log(1 / landmarks), the prior of each one with
-    # MARGINAL and else 0.
+    # Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item
+    # takes a particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest
+    # landmark, -1 where a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a
+    # landmark, else 0.
     @kernel
     def score_features(
         landmark: wp.array(dtype=vec4),
@@ -56,37 +56,37 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
+        high = pose[n]
         low = pose_low[n]
-        place = sensor_place(pose_cell[n], own, low, size)
+        place = sensor_place(pose_cell[n], high, low, size)
         total = vec2(fixed, ZERO)
-        lost = bool(False)
+        impossible = bool(False)
         first = int(0)
         while first < features:
             last = wp.min(first + error_free.BLOCK_TERMS, features)
             block = real(0.0)
             k = first
             while k < last:
-                one = FEATURE * k
-                turned = direction(own, low, feature, one)
-                found = real(0.0)
+                base = FEATURE * k
+                turned = direction(high, low, feature, base)
+                detected = real(0.0)
                 best = real(0.0)
                 chosen = int(0)
                 if KNOWN:
                     chosen = partner[k]
-                    found = log_detection(
-                        offset(landmark[chosen], place), turned, feature, one, signature[chosen], terms, arcs
+                    detected = log_detection(
+                        offset(landmark[chosen], place), turned, feature, base, signature[chosen], terms, arcs
                     )
                 else:
                     match = search(
-                        landmark, signature, start, place, turned, feature, one, terms, arcs, rows, cols, size
+                        landmark, signature, start, place, turned, feature, base, terms, arcs, rows, cols, size
                     )
-                    found = match.found
+                    detected = match.log_p
                     best = match.best
                     chosen = match.chosen
-                value = either(found + share, feature[one + FALSE_POSITIVE])
+                value = either(detected + share, feature[base + FALSE_POSITIVE])
                 if wp.isinf(value):
-                    lost = True
+                    impossible = True
                 else:
                     block += value
                 if PER_BEAM:
@@ -94,10 +94,10 @@ def make(name, flags):
                     if KNOWN:
                         which[n * features + k] = chosen
                     else:
-                        which[n * features + k] = wp.where(best + share >= feature[one + FALSE_POSITIVE], chosen, -1)
+                        which[n * features + k] = wp.where(best + share >= feature[base + FALSE_POSITIVE], chosen, -1)
                 k += 1
             total = add_term(total, block)
             first = last
-        log_p[n] = wp.where(lost, NEVER, temperature * (total[0] + total[1]))
+        log_p[n] = wp.where(impossible, NEVER, temperature * (total[0] + total[1]))
 
     return {"score_features": score_features}[name]

@@ -1,4 +1,4 @@
-"""Negative information: landmarks that the sensor should see from a pose, and that no feature is."""
+"""Negative information: landmarks that the sensor should see from a pose, but that belong to no feature."""
 
 import functools
 
@@ -10,20 +10,20 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """The kernel count_unseen specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     density = landmarks.functions(flags & {"FLOAT64"})
     sensor_place, offset = density.sensor_place, density.offset
     bucket_at = landmark_grid.functions(flags & {"FLOAT64"}).bucket_at
 
-    # Whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
+    # Return whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
     @wp.func
     def in_view(off: vec4, cosine: real, sine: real, range_max: real, least: real):
         d = wp.sqrt(off[0] * off[0] + off[2] * off[2])
         return d <= range_max and cosine * off[0] + sine * off[2] >= least * d
 
-    # One work-item a particle: add log_missed to log_p for every landmark in view that none of its features is.
+    # Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
     @kernel
     def count_unseen(
         landmark: wp.array(dtype=vec4),
@@ -47,10 +47,10 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        own = pose[n]
-        place = sensor_place(pose_cell[n], own, pose_low[n], size)
-        cosine = own[2] * axis_cosine - own[3] * axis_sine
-        sine = own[3] * axis_cosine + own[2] * axis_sine
+        sensor_pose = pose[n]
+        place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], size)
+        cosine = sensor_pose[2] * axis_cosine - sensor_pose[3] * axis_sine
+        sine = sensor_pose[3] * axis_cosine + sensor_pose[2] * axis_sine
         left = bucket_at(place[0] - range_max, size, cols)
         right = bucket_at(place[0] + range_max, size, cols)
         high = bucket_at(place[2] + range_max, size, rows)

@@ -3,13 +3,13 @@
     p(f | j) = N(r; d, sigma_r) / m_r  *  N(b; b_j, sigma_b) / m_b  *  N(s; s_j, sigma_s) / m_s
 
 d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
-is the mass that a component has on what can be measured: [0, range_max], the field of view, the signatures' span. A
-part that was not measured is left out. Positions, directions and what is made of them are sums of two numbers, since an
-error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
+Components that were not measured are left out. Positions, directions and quantities derived from them are sums of two
+numbers, since a relative error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
 
-A feature is FEATURE numbers; what they are is named here, and in the same order in the other two languages. A place is
-(x, its low part, y, its low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of
-view, density of a bearing at zero range over that of its peak and scale}.
+A feature is FEATURE numbers, which are named below, in the same order in all three languages. A place is (x, its low
+part, y, its low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view,
+density of a bearing at zero range over that of its peak and scale}.
 """
 
 import functools
@@ -24,20 +24,21 @@ from .prelude import precision
 RANGE_AT, RANGE_LOW = wp.constant(0), wp.constant(1)
 COSINE, SINE, COSINE_LOW, SINE_LOW = wp.constant(2), wp.constant(3), wp.constant(4), wp.constant(5)
 SIGNATURE_AT, SIGNATURE_LOW = wp.constant(6), wp.constant(7)
-# 1 / (sigma sqrt 2), 0 for what was not measured; logs of z_detect and the components' peaks, of the false positive.
+# 1 / (sigma sqrt 2), 0 for components that were not measured; logs of z_detect and the components' peaks, of the false
+# positive.
 RANGE_SCALE, RANGE_SCALE_LOW = wp.constant(8), wp.constant(9)
 BEARING_SCALE, BEARING_SCALE_LOW = wp.constant(10), wp.constant(11)
 SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = wp.constant(12), wp.constant(13)
 PEAK, PEAK_LOW, FALSE_POSITIVE = wp.constant(14), wp.constant(15), wp.constant(16)
 # From the bearing to the upper end of the field of view.
 UPPER, UPPER_LOW = wp.constant(17), wp.constant(18)
-# Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, can matter; RADIUS is
-# negative where none can.
+# Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is not
+# negligible; RADIUS is negative where none has.
 REACH, RADIUS, HOLE = wp.constant(19), wp.constant(20), wp.constant(21)
-# What a feature does not measure must be within the sensor's limits: the distance, the cosine of the angle to the axis.
+# The sensor's limits for components that a feature does not measure: the distance, the cosine of the angle to the axis.
 FARTHEST, AXIS = wp.constant(22), wp.constant(23)
-# sigma sqrt 2 of range and bearing, infinite for what was not measured; the log of the largest density there can be;
-# and what squares of distances are off at most.
+# sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
+# density; and the largest error of squared distances.
 RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = wp.constant(24), wp.constant(25), wp.constant(26), wp.constant(27)
 FEATURE = wp.constant(28)
 # Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
@@ -47,7 +48,7 @@ QUARTER_TURN, HALF_TURN = wp.constant(9), wp.constant(10)
 
 @functools.cache
 def functions(flags):
-    """The functions of the file, from sensor_place to either, specialised by the flags."""
+    """Make the functions of the file for a set of flags, and either."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags & {"FLOAT64"})
@@ -59,27 +60,28 @@ def functions(flags):
     SIGNATURE = "SIGNATURE" in flags
     FIELD = "FIELD" in flags
     ZERO, HALF, ONE, TWO, STEPS = real(0.0), real(0.5), real(1.0), real(2.0), real(8.0)
-    # Nearer than a micrometre every bearing is as likely.
+    # Below this distance [m] all bearings are equally likely.
     ZERO_RANGE = real(1e-6)
-    # Above this the error function is 1 to the last bit.
+    # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
     A1, A2, A3, A4 = real(-1.0 / 3.0), real(1.0 / 5.0), real(-1.0 / 7.0), real(1.0 / 9.0)
     A5, A6, A7 = real(-1.0 / 11.0), real(1.0 / 13.0), real(-1.0 / 15.0)
 
-    # Sensors in metres from the origin of the buckets, whose side, a power of two, is size.
+    # Return the place of a sensor in metres from the origin of the buckets; size, a power of two, is the side of a
+    # bucket.
     @wp.func
     def sensor_place(cell: wp.vec2i, pose: vec4, low: vec4, size: real):
         x = two_sum(real(cell[0]), pose[0])
         y = two_sum(real(cell[1]), pose[1])
         return vec4(size * x[0], size * (x[1] + low[0]), size * y[0], size * (y[1] + low[1]))
 
-    # Direction in the world in which a feature was seen: the heading, turned by the bearing.
+    # Return the direction of a feature in the world: the heading, turned by the bearing.
     @wp.func
-    def direction(pose: vec4, pose_low: vec4, feature: wp.array(dtype=real), one: wp.int32):
-        c = feature[one + COSINE]
-        s = feature[one + SINE]
-        c_low = feature[one + COSINE_LOW]
-        s_low = feature[one + SINE_LOW]
+    def direction(pose: vec4, pose_low: vec4, feature: wp.array(dtype=real), base: wp.int32):
+        c = feature[base + COSINE]
+        s = feature[base + SINE]
+        c_low = feature[base + COSINE_LOW]
+        s_low = feature[base + SINE_LOW]
         cc = two_product(pose[2], c)
         ss = two_product(pose[3], s)
         cs = two_product(pose[2], s)
@@ -90,7 +92,7 @@ def functions(flags):
         y_low = (pose[3] * c_low + pose_low[3] * c) + (pose[2] * s_low + pose_low[2] * s)
         return vec4(x[0], x[1] + ((cc[1] - ss[1]) + x_low), y[0], y[1] + ((sc[1] + cs[1]) + y_low))
 
-    # Part of an offset to the left of a direction.
+    # Return the component of an offset to the left of a direction.
     @wp.func
     def across(off: vec4, turned: vec4):
         right = two_product(turned[0], off[2])
@@ -99,7 +101,7 @@ def functions(flags):
         low = (turned[0] * off[3] + turned[1] * off[2]) - (turned[2] * off[1] + turned[3] * off[0])
         return vec2(total[0], total[1] + ((right[1] - left[1]) + low))
 
-    # Part of an offset along a direction.
+    # Return the component of an offset along a direction.
     @wp.func
     def along(off: vec4, turned: vec4):
         x = two_product(turned[0], off[0])
@@ -108,13 +110,13 @@ def functions(flags):
         low = (turned[0] * off[1] + turned[1] * off[0]) + (turned[2] * off[3] + turned[3] * off[2])
         return vec2(total[0], total[1] + ((x[1] + y[1]) + low))
 
-    # arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
+    # Return arctan t / t - 1 for |t| <= 1 / 16, by its power series in t^2.
     @wp.func
     def arc_series(t: real):
         z = t * t
         return z * (A1 + z * (A2 + z * (A3 + z * (A4 + z * (A5 + z * (A6 + z * A7))))))
 
-    # Angle of an offset in (-pi, pi]: the arc of the nearest i / 8, and that of what is left, a series.
+    # Return the angle of an offset in (-pi, pi]: the arc of the nearest slope i / 8, and a series for the rest.
     @wp.func
     def angle_pair(side: vec2, ahead: vec2, arcs: wp.array(dtype=vec2)):
         a = ahead
@@ -152,7 +154,7 @@ def functions(flags):
             arc = -arc
         return arc
 
-    # Mass of the normal around d on [0, range_max]; that of range_max itself where d is beyond.
+    # Return the mass of the normal around d on [0, range_max]; d is clamped to range_max.
     @wp.func
     def range_mass(d: vec2, scale: real, terms: wp.array(dtype=real)):
         below = wp.min(d[0], terms[0]) * scale
@@ -161,8 +163,8 @@ def functions(flags):
             return ONE
         return HALF * (wp.erf(below) + wp.erf(above))
 
-    # Mass of the normal around a landmark's bearing on the field of view; at its end where the landmark is beyond. A
-    # part of the field more than half a turn away from the landmark is nearer the other way round.
+    # Return the mass of the normal around a landmark's bearing on the field of view; the bearing is clamped to its
+    # ends. Parts of the field more than half a turn away from the landmark are nearer in the other direction.
     @wp.func
     def field_mass(
         angle: vec2, upper: real, upper_low: real, scale: real, terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2)
@@ -185,21 +187,21 @@ def functions(flags):
             mass = mass + (wp.erf(half_turn * scale) - wp.erf((whole - right) * scale))
         return HALF * mass
 
-    # An exponent and one more (residual * scale)^2; in two parts, since exponents and peaks may nearly cancel.
+    # Add (residual * scale)^2 to an exponent, in two parts, since exponents and peaks may nearly cancel.
     @wp.func
     def add_square(total: vec2, residual: vec2, scale: real, scale_low: real):
         u = pair_product(residual, vec2(scale, scale_low))
         more = pair_sum(total, pair_product(u, u))
-        # What overflows has no low part.
+        # After an overflow there is no low part.
         return vec2(more[0], wp.where(wp.isfinite(more[1]), more[1], ZERO))
 
-    # log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
+    # Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
     @wp.func
     def log_detection(
         off: vec4,
         turned: vec4,
         feature: wp.array(dtype=real),
-        one: wp.int32,
+        base: wp.int32,
         signature: vec4,
         terms: wp.array(dtype=real),
         arcs: wp.array(dtype=vec2),
@@ -209,37 +211,37 @@ def functions(flags):
         norm = real(0.0)
         d = distance_pair(off)
         if RANGE:
-            if feature[one + RANGE_SCALE] > ZERO:
-                first = two_sum(d[0], -feature[one + RANGE_AT])
-                r = two_sum(first[0], first[1] + (d[1] - feature[one + RANGE_LOW]))
-                exponent = add_square(exponent, r, feature[one + RANGE_SCALE], feature[one + RANGE_SCALE_LOW])
-                mass = range_mass(d, feature[one + RANGE_SCALE], terms)
+            if feature[base + RANGE_SCALE] > ZERO:
+                first = two_sum(d[0], -feature[base + RANGE_AT])
+                r = two_sum(first[0], first[1] + (d[1] - feature[base + RANGE_LOW]))
+                exponent = add_square(exponent, r, feature[base + RANGE_SCALE], feature[base + RANGE_SCALE_LOW])
+                mass = range_mass(d, feature[base + RANGE_SCALE], terms)
         if BEARING:
-            if feature[one + BEARING_SCALE] > ZERO:
+            if feature[base + BEARING_SCALE] > ZERO:
                 if d[0] > ZERO_RANGE:
                     angle = angle_pair(across(off, turned), along(off, turned), arcs)
                     exponent = add_square(
-                        exponent, angle, feature[one + BEARING_SCALE], feature[one + BEARING_SCALE_LOW]
+                        exponent, angle, feature[base + BEARING_SCALE], feature[base + BEARING_SCALE_LOW]
                     )
                     if FIELD:
                         mass = mass * field_mass(
                             angle,
-                            feature[one + UPPER],
-                            feature[one + UPPER_LOW],
-                            feature[one + BEARING_SCALE],
+                            feature[base + UPPER],
+                            feature[base + UPPER_LOW],
+                            feature[base + BEARING_SCALE],
                             terms,
                             arcs,
                         )
                 else:
-                    # The density is 1 / field, which is the peak over that.
-                    mass = mass * (terms[3] * feature[one + BEARING_SCALE])
+                    # The density is 1 / field: the peak times terms[3] and the scale.
+                    mass = mass * (terms[3] * feature[base + BEARING_SCALE])
         if SIGNATURE:
-            if feature[one + SIGNATURE_SCALE] > ZERO:
-                away = two_sum(feature[one + SIGNATURE_AT], -signature[0])
-                s = two_sum(away[0], away[1] + (feature[one + SIGNATURE_LOW] - signature[1]))
-                exponent = add_square(exponent, s, feature[one + SIGNATURE_SCALE], feature[one + SIGNATURE_SCALE_LOW])
+            if feature[base + SIGNATURE_SCALE] > ZERO:
+                away = two_sum(feature[base + SIGNATURE_AT], -signature[0])
+                s = two_sum(away[0], away[1] + (feature[base + SIGNATURE_LOW] - signature[1]))
+                exponent = add_square(exponent, s, feature[base + SIGNATURE_SCALE], feature[base + SIGNATURE_SCALE_LOW])
                 norm = signature[2]
-        log_p = (feature[one + PEAK] - exponent[0]) + ((feature[one + PEAK_LOW] - exponent[1]) + norm)
+        log_p = (feature[base + PEAK] - exponent[0]) + ((feature[base + PEAK_LOW] - exponent[1]) + norm)
         if mass != ONE:
             log_p = log_p - wp.log(mass)
         return log_p

@@ -1,9 +1,9 @@
 """Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
 
-terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN only fills up a
-block. p_hit has its mean at z* + range_bias, held within [0, range_max]; p_short's obstacles lie before z*.
-r are the responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances
-x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is padding. The
+mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
+responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
+and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
 
     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
     Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
@@ -29,7 +29,7 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """The kernel e_step or pair_causes specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     INFORMATION = "INFORMATION" in flags
@@ -45,12 +45,12 @@ def make(name, flags):
     ROOT_2PI = real(2.5066282746310002)
     NOTHING = real(math.nan)
 
-    # Where p_hit has its mean.
+    # Return the mean of p_hit.
     @wp.func
     def hit_mean(expected: real, terms: wp.array(dtype=real)):
         return wp.min(wp.max(expected + terms[10], ZERO), terms[6])
 
-    # log p(z | z*) and the responsibilities of hit, short and rand for it: 0 where the density is 0.
+    # Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
     @wp.func
     def responsibilities(z: real, expected: real, terms: wp.array(dtype=real)):
         hit = log_hit(z, hit_mean(expected, terms), terms)
@@ -64,10 +64,10 @@ def make(name, flags):
         p = p_hit + p_short + p_rand
         return vec4(largest + wp.log(p), p_hit / p, p_short / p, p_rand / p)
 
-    # What a pair adds to the sums: log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm,
-    # r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the
-    # upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2,
-    # r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+    # Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
+    # r_hit h_mm, r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest
+    # cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit
+    # h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
     @wp.func
     def add_pair(z: real, expected: real, terms: wp.array(dtype=real), before: sums_type):
         sums = before
@@ -101,7 +101,7 @@ def make(name, flags):
             h_ss = MINUS_TWO * u * u - t + w + t * t
             h_sm = MINUS_TWO * u - p + q
             h_mm = MINUS_ONE + t + p * p
-            # A mean that is held does not move with the bias.
+            # A mean that is clamped does not move with the bias.
             if mean != expected + terms[10]:
                 h_m = ZERO
                 h_sm = ZERO
@@ -146,7 +146,7 @@ def make(name, flags):
             sums[39] += r[2] * s_l * s_l
         return sums
 
-    # One work-item a block of pairs, each along farther than the last, from number block * across on.
+    # Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
     @kernel
     def e_step(
         reading: wp.array(dtype=real),
@@ -163,7 +163,7 @@ def make(name, flags):
         if block >= blocks:
             return
         total = sums_type()
-        lost = sums_type()
+        total_low = sums_type()
         first = int(0)
         while first < readings:
             last = wp.min(first + BLOCK_TERMS, readings)
@@ -174,18 +174,18 @@ def make(name, flags):
                 if not wp.isnan(reading[n]):
                     part = add_pair(reading[n], expected[n], terms, part)
                 k += 1
-            # add_term of all sums at once.
+            # add_term, for all sums at once.
             head = total + part
             shift = head - total
-            lost += (total - (head - shift)) + (part - shift)
+            total_low += (total - (head - shift)) + (part - shift)
             total = head
             first += BLOCK_TERMS
         j = int(0)
         while j < SUMS:
-            sums[block * width + j] = total[j] + lost[j]
+            sums[block * width + j] = total[j] + total_low[j]
             j += 1
 
-    # One work-item a block of pairs: log p and the responsibilities of each; NaN for what only fills up.
+    # Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
     @kernel
     def pair_causes(
         reading: wp.array(dtype=real),

@@ -1,4 +1,4 @@
-"""Exponents and logarithms that the densities of absolute, radio and contact sensors share.
+"""Exponents and logarithms for the densities of absolute, radio and contact sensors.
 
 Where a density's peak is high, exponent and log peak are large and nearly cancel: both are sums of two numbers.
 """
@@ -14,14 +14,14 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """bounded_square, log_one_plus and either in the precision of the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     pair_product = error_free.functions(flags).pair_product
     ZERO, ONE = real(0.0), real(1.0)
     LARGEST_ROOT = real(1e140 if "FLOAT64" in flags else 1e17)
 
-    # The square of a sum of two numbers. Roots above a bound are held there, so that nothing becomes infinite.
+    # Return the square of a sum of two numbers; roots are clamped, so that nothing becomes infinite.
     @wp.func
     def bounded_square(u: vec2):
         held = u
@@ -29,20 +29,20 @@ def functions(flags):
             held = vec2(LARGEST_ROOT, ZERO)
         return pair_product(held, held)
 
-    # log(1 + x), x > -1: what the sum with 1 rounds away is put back, to the first order.
+    # Return log(1 + x) for x > -1; the rounding error of 1 + x is corrected to first order.
     @wp.func
     def log_one_plus(x: real):
         more = ONE + x
         return wp.log(more) + (x - (more - ONE)) / more
 
-    # Logarithm of the sum of two probabilities that are given as logarithms; -inf only where both are 0.
+    # Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
     @wp.func
     def either(a: real, b: real):
         high = wp.max(a, b)
         low = wp.min(a, b)
-        found = high
+        log_sum = high
         if not wp.isinf(high):
-            found = high + log_one_plus(wp.exp(low - high))
-        return found
+            log_sum = high + log_one_plus(wp.exp(low - high))
+        return log_sum
 
     return SimpleNamespace(bounded_square=bounded_square, log_one_plus=log_one_plus, either=either)

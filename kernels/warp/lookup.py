@@ -1,5 +1,5 @@
 """Expected range by a look-up table over cells and angle bins (the book's "expected distances can be pre-processed"):
-for each cell and bin the range from the cell's centre in the bin's direction, in 65 535ths of the limit.
+for each cell and bin the range from the cell's centre in the bin's direction, in units of limit / 65 535.
 """
 
 import functools
@@ -15,7 +15,7 @@ ENTRY = wp.uint16
 
 @functools.cache
 def functions(flags):
-    """cast_ray specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
@@ -26,7 +26,7 @@ def functions(flags):
     ZERO = real(0.0)
     PARTS = real(65535.0)
 
-    # Distance in cells as the table has it, or limit where there is no obstacle nearer.
+    # Return the distance in cells from the table, limit where no obstacle is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),

@@ -10,14 +10,15 @@ from .prelude import kernel, precision
 
 @functools.cache
 def make(name, flags):
-    """The kernel fill_lookup specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     cast_ray = raycast.functions(flags).cast_ray
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     PARTS = real(65535.0)
 
-    # One work-item a bin and cell; a hit is 65 534 parts of the limit at most. The table has fewer than 2^31 entries.
+    # Fill rows of the table: one work-item takes a bin and cell. A hit is at most 65 534; 65 535 means no hit. The
+    # table has fewer than 2^31 entries.
     @kernel
     def fill_lookup(
         rectangles: wp.array(dtype=wp.uint16),

@@ -1,8 +1,8 @@
-"""Expected range by marching through the distance field (sphere tracing): at each place the ray steps by the distance
-from the cell's centre to the nearest obstacle's centre, less slack, and by tolerance at least.
+"""Expected range by marching through the distance field (sphere tracing): each step is the distance from the current
+cell's centre to the nearest obstacle's centre less slack, and at least tolerance.
 
-With slack sqrt(2) no step passes an obstacle but the least one, so a range is too long by at most tolerance, and an
-obstacle is missed only where the ray's way through it is shorter than that. With slack 0 (what other programs do) a
+With slack sqrt(2) only steps of length tolerance may pass an obstacle: a range is too long by at most tolerance, and an
+obstacle is missed only where the ray's path through it is shorter than that. With slack 0, as in other programs, any
 step may pass obstacles.
 """
 
@@ -19,7 +19,7 @@ ENTRY = wp.float32
 
 @functools.cache
 def functions(flags):
-    """cast_ray specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
@@ -27,10 +27,10 @@ def functions(flags):
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
-    # A step that is told from none at any distance, as a part of it.
+    # Smallest step relative to the distance, so that every step changes the distance.
     LEAST_STEP = real(2.0**-22)
 
-    # Distance in cells to a place in an occupied cell, or limit where none is found nearer.
+    # Return the distance in cells to a point in an occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),

@@ -1,8 +1,8 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and what rounding took
-from terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is
-z_rand / range_max; in the log domain their logarithms.
+terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of
+terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max;
+in the log domain they are the logarithms of these.
 """
 
 import functools
@@ -17,26 +17,28 @@ from .prelude import precision, reader
 
 @functools.cache
 def functions(flags):
-    """hit_mass, short_factor, log_hit, log_short and log_density specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
     two_product = error_free.functions(flags).two_product
     SHARP = "SHARP" in flags
     at = reader(real)
     HIT = "HIT" in flags
+    LINEAR = "LINEAR" in flags
     SHORT = "SHORT" in flags
     RAND = "RAND" in flags
     SINGLE = "SINGLE" in flags
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     NEVER = real(-math.inf)
-    # Above this the error function is 1 to the last bit.
+    # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
     # Keep 2 / x and 1 / z* finite.
     TINY = real(1e-30)
     SMALLEST_RANGE = real(1e-37)
 
-    # Mass that the untruncated normal around z* has on [0, range_max]: a sum of positive terms, so nothing cancels.
-    # Most ranges are far from both ends, most others far from one of them, and rays without an obstacle are at one.
+    # Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing
+    # cancels. Most ranges are far from both ends and most others far from one of them; rays without an obstacle are at
+    # one end.
     @wp.func
     def hit_mass(expected: real, erf_scale: real, range_max: real):
         below = expected * erf_scale
@@ -52,8 +54,8 @@ def functions(flags):
             rest += wp.erf(nearer)
         return HALF * rest
 
-    # (z - z*)^2 / (2 sigma^2) as a sum of two reals. Where the density's peak is high, exponent and log peak are large
-    # and nearly cancel, and the second part keeps the digits that are left.
+    # Return (z - z*)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak
+    # are large and nearly cancel; the second part keeps the digits that remain.
     @wp.func
     def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
         off = z - expected
@@ -64,7 +66,7 @@ def functions(flags):
         else:
             return vec2(off * (off * at(terms, 1)), ZERO)
 
-    # Terms of the log domain: log of z_hit p_hit(z | z*).
+    # Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
         exponent = hit_exponent(z, expected, terms)
@@ -74,7 +76,7 @@ def functions(flags):
             return log_p
         return log_p - wp.log(mass)
 
-    # x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
+    # Return x / (1 - exp(-x)) for x >= 0 as h / tanh(h) + h with h = x / 2: exact at 0 and without cancellation.
     @wp.func
     def short_factor(x: real):
         h = HALF * x
@@ -82,14 +84,14 @@ def functions(flags):
             return h / wp.tanh(h) + h
         return ONE
 
-    # Terms of the log domain: log of z_short p_short(z | z*).
+    # Return log(z_short p_short(z | z*)); terms are those of the log domain.
     @wp.func
     def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
         if z <= expected and expected > ZERO:
             return at(terms, 3) + wp.log(short_factor(at(terms, 4) * expected)) - wp.log(expected) - at(terms, 4) * z
         return NEVER
 
-    # short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
+    # Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
     @wp.func
     def short_peak(rate: real, expected: real):
         h = HALF * (rate * expected)
@@ -101,52 +103,55 @@ def functions(flags):
             below = t + t
         return above / below
 
-    # p_rand > 0 bounds the sum from below, so components may underflow one by one and one logarithm is enough.
-    @wp.func
-    def log_density_linear(z: real, expected: real, terms: wp.array(dtype=real)):
-        p = real(0.0)
-        if HIT:
-            exponent = hit_exponent(z, expected, terms)
-            hit = at(terms, 0) * wp.exp(-exponent.x) * (ONE - exponent.y)
-            mass = hit_mass(expected, at(terms, 2), at(terms, 6))
-            if mass == ONE:
-                p += hit
-            else:
-                p += hit / mass
-        if SHORT:
-            if z <= expected and expected > ZERO:
-                p += at(terms, 3) * wp.exp(-at(terms, 4) * z) * short_peak(at(terms, 4), expected)
-        return wp.log(p + at(terms, 5))
-
-    # Without a useful p_rand every component stays a logarithm; -inf only where the mixture is 0.
-    @wp.func
-    def log_density_log(z: real, expected: real, terms: wp.array(dtype=real)):
-        hit = NEVER
-        shorter = NEVER
-        largest = NEVER
-        if HIT:
-            hit = log_hit(z, expected, terms)
-            largest = hit
-        if SHORT:
-            shorter = log_short(z, expected, terms)
-            largest = wp.max(largest, shorter)
-        if RAND:
-            largest = wp.max(largest, at(terms, 5))
-        if SINGLE:
-            return largest
-        else:
-            if wp.isinf(largest):
-                return largest
+    if LINEAR:
+        # Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm
+        # is enough.
+        @wp.func
+        def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
             p = real(0.0)
             if HIT:
-                p += wp.exp(hit - largest)
+                exponent = hit_exponent(z, expected, terms)
+                hit = at(terms, 0) * wp.exp(-exponent.x) * (ONE - exponent.y)
+                mass = hit_mass(expected, at(terms, 2), at(terms, 6))
+                if mass == ONE:
+                    p += hit
+                else:
+                    p += hit / mass
             if SHORT:
-                p += wp.exp(shorter - largest)
-            if RAND:
-                p += wp.exp(at(terms, 5) - largest)
-            return largest + wp.log(p)
+                if z <= expected and expected > ZERO:
+                    p += at(terms, 3) * wp.exp(-at(terms, 4) * z) * short_peak(at(terms, 4), expected)
+            return wp.log(p + at(terms, 5))
 
-    log_density = log_density_linear if "LINEAR" in flags else log_density_log
+    else:
+        # Return log p(z | z*). Without a sufficient p_rand every component stays a logarithm; -inf only where the
+        # mixture is 0.
+        @wp.func
+        def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
+            hit = NEVER
+            shorter = NEVER
+            largest = NEVER
+            if HIT:
+                hit = log_hit(z, expected, terms)
+                largest = hit
+            if SHORT:
+                shorter = log_short(z, expected, terms)
+                largest = wp.max(largest, shorter)
+            if RAND:
+                largest = wp.max(largest, at(terms, 5))
+            if SINGLE:
+                return largest
+            else:
+                if wp.isinf(largest):
+                    return largest
+                p = real(0.0)
+                if HIT:
+                    p += wp.exp(hit - largest)
+                if SHORT:
+                    p += wp.exp(shorter - largest)
+                if RAND:
+                    p += wp.exp(at(terms, 5) - largest)
+                return largest + wp.log(p)
+
     return SimpleNamespace(
         hit_mass=hit_mass, short_factor=short_factor, log_hit=log_hit, log_short=log_short, log_density=log_density
     )

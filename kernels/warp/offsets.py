@@ -1,4 +1,5 @@
-"""Offsets between places in sums of two numbers: an error of eps in 20 m is too much beside a deviation of 1 cm.
+"""Offsets between places in sums of two numbers: a relative error of eps in 20 m is too much beside a deviation of 1
+cm.
 
 A place is (x, its low part, y, its low part), and so is an offset.
 """
@@ -14,14 +15,14 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """offset and distance_pair in the precision of the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
     two_sum, two_product = exact.two_sum, exact.two_product
     ZERO, TWO = real(0.0), real(2.0)
 
-    # From a sensor to a landmark or beacon, which is x, y, and the low parts of both.
+    # Return the offset from a sensor to a landmark or beacon, which has x, y, and the low parts of both.
     @wp.func
     def offset(landmark: vec4, place: vec4):
         x = two_sum(landmark[0], -place[0])
@@ -30,7 +31,7 @@ def functions(flags):
         y = two_sum(y[0], y[1] + (landmark[3] - place[3]))
         return vec4(x[0], x[1], y[0], y[1])
 
-    # Length of an offset: the rounded root, and what one step of Newton's method adds.
+    # Return the length of an offset: the rounded root, and the correction of one step of Newton's method.
     @wp.func
     def distance_pair(off: vec4):
         xx = two_product(off[0], off[0])

@@ -1,5 +1,5 @@
-"""An order of particles in which neighbours have much the same position and heading: then their rays meet the same
-cells, and none waits long for another. Which order it is changes no result.
+"""An order of particles in which neighbours have similar positions and headings. Their rays then meet the same cells,
+and none waits long for another. The order changes no result.
 """
 
 import functools
@@ -9,70 +9,37 @@ import warp as wp
 from . import ray as ray_file
 from .prelude import kernel, precision, work_item
 
-# Samples of the particles; bins of rows, of columns and of headings; work-items that count starts.
+# Sampled particles; bins per axis (rows, columns, headings); and bins per work-item of order_starts.
 SAMPLES = wp.constant(256)
 BINS = wp.constant(32)
 ALL_BINS = wp.constant(32768)
 STRETCH = wp.constant(16)
-# The same, for loops that Warp shall unroll.
+# STRETCH as a constant of loops that Warp shall unroll.
 EACH = 16
 stretch_counts = wp.types.vector(length=16, dtype=wp.int32)
 
 
-# One work-item a stretch of bins, which lie together: from how many particles each has to where they begin.
-@kernel
-def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
-    stretch = work_item(wp.tid())
-    if stretch >= ALL_BINS // STRETCH:
-        return
-    own = stretch * STRETCH
-    # All are read before any is added, so that a work-item waits once for them.
-    counts = stretch_counts()
-    for i in range(EACH):
-        counts[i] = bins[own + i]
-    total = int(0)
-    for i in range(EACH):
-        total += counts[i]
-    start = int(wp.atomic_add(bounds, 6, total))
-    for i in range(EACH):
-        bins[own + i] = start
-        start += counts[i]
-
-
-# One work-item a particle: it takes the next place of its bin.
-@kernel
-def order_fill(
-    bin_of: wp.array(dtype=wp.int32),
-    bins: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
-    particles: wp.int32,
-):
-    n = work_item(wp.tid())
-    if n >= particles:
-        return
-    order[wp.atomic_add(bins, bin_of[n], 1)] = n
-
-
 @functools.cache
 def make(name, flags):
-    """A kernel of this file specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     turn_of = ray_file.functions(flags).turn_of
     ZERO, ONE = real(0.0), real(1.0)
-    # Parts of a turn.
+    # Units of a turn.
     TURN = real(65536.0)
     HALF_TURN, WHOLE_TURN = 32768, 65536
     PARTS = real(32.0)
 
-    # Heading relative to the first particle's, from -TURN / 2 to TURN / 2.
+    # Return the heading relative to that of the first particle, from -TURN / 2 to TURN / 2.
     @wp.func
     def relative_turn(pose: vec4, other: vec4):
         turn = int(turn_of(vec2(pose.z * other.z + pose.w * other.w, pose.w * other.z - pose.z * other.w)) * TURN)
         return wp.where(turn > HALF_TURN, turn - WHOLE_TURN, turn)
 
-    # One work-item a bin, which it empties; some of them look at a particle each. bounds, which the caller sets to
-    # -2^31, become the largest of minus the smallest and the largest row, column and heading of those, and last 0.
+    # Clear the bins and find the bounds: one work-item takes a bin, and the first SAMPLES of them a particle each.
+    # bounds, which the caller sets to -2^31, become the negated smallest and the largest row, column and heading of
+    # these particles; the last one becomes 0.
     @kernel
     def order_bounds(
         pose_cell: wp.array(dtype=wp.vec2i),
@@ -98,13 +65,13 @@ def make(name, flags):
         wp.atomic_max(bounds, 4, -turn)
         wp.atomic_max(bounds, 5, turn)
 
-    # Which of BINS equal parts of the bounds; what is beyond them belongs to the outermost.
+    # Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost.
     @wp.func
     def part_of(value: wp.int32, least: wp.int32, most: wp.int32):
         part = (real(value) - real(least)) * (PARTS / (real(most) - real(least) + ONE))
         return wp.where(part < ZERO, 0, wp.where(part >= PARTS, BINS - 1, int(part)))
 
-    # One work-item a particle: its bin, which counts it.
+    # Find the bin of each particle, and count it there. One work-item takes a particle.
     @kernel
     def order_count(
         pose_cell: wp.array(dtype=wp.vec2i),
@@ -126,3 +93,37 @@ def make(name, flags):
 
     kernels = {"order_bounds": order_bounds, "order_count": order_count}
     return (kernels | {"order_starts": order_starts, "order_fill": order_fill})[name]
+
+
+# Replace the counts of bins by the indices at which they begin. One work-item takes a stretch of neighbouring bins.
+@kernel
+def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
+    stretch = work_item(wp.tid())
+    if stretch >= ALL_BINS // STRETCH:
+        return
+    begin = stretch * STRETCH
+    # All are read before any is used, so that a work-item waits once for them.
+    counts = stretch_counts()
+    for i in range(EACH):
+        counts[i] = bins[begin + i]
+    total = int(0)
+    for i in range(EACH):
+        total += counts[i]
+    start = int(wp.atomic_add(bounds, 6, total))
+    for i in range(EACH):
+        bins[begin + i] = start
+        start += counts[i]
+
+
+# Put each particle at the next index of its bin. One work-item takes a particle.
+@kernel
+def order_fill(
+    bin_of: wp.array(dtype=wp.int32),
+    bins: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
+    particles: wp.int32,
+):
+    n = work_item(wp.tid())
+    if n >= particles:
+        return
+    order[wp.atomic_add(bins, bin_of[n], 1)] = n

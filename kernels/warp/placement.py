@@ -1,6 +1,6 @@
-"""Poses on their way into a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
+"""Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading.
 
-Only +, -, *, /, floor and comparisons are used, so that every device places a pose alike to the last bit.
+Only +, -, *, /, floor and comparisons are used, so that every device gives the same bits.
 """
 
 import functools
@@ -11,12 +11,12 @@ import warp as wp
 from . import heading
 from .prelude import kernel, precision, work_item
 
-# Cells farther off than this are as good as here: no range reaches them, and sums of two stay within int32.
+# Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
 FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 
-# What is not a number, as after an overflow, is far away too.
+# Clamp a coordinate to +-FARTHEST cells; NaN, as after an overflow, becomes -FARTHEST.
 @wp.func
 def within_reach(position: wp.float64):
     above = wp.where(position > MINUS_FARTHEST, position, MINUS_FARTHEST)
@@ -25,7 +25,7 @@ def within_reach(position: wp.float64):
 
 @functools.cache
 def functions(flags):
-    """The functions of this file specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
@@ -33,10 +33,10 @@ def functions(flags):
     CAREFUL = "CAREFUL" in flags
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
 
-    # A pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low takes what rounding
-    # took from pose. verdict, which the caller clears, becomes 1 where (0) a pose is not finite, (1) a sensor is
-    # outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading (1, 0): it sees
-    # nothing, and no index made of it is out of bounds.
+    # Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets
+    # the rounding errors (low parts) of pose. verdict, which the caller clears, becomes 1 at (0) if a pose is not
+    # finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell,
+    # fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     @wp.func
     def place_pose(
         particle: wp.int32,
@@ -108,11 +108,11 @@ def functions(flags):
 
 @functools.cache
 def make(name, flags):
-    """The kernel place_poses specialised by the flags."""
-    vec4, own = precision(flags).vec4, functions(flags)
-    place_pose, coordinate = own.place_pose, own.coordinate
+    """Make a kernel of the file for a set of flags."""
+    vec4, placing = precision(flags).vec4, functions(flags)
+    place_pose, coordinate = placing.place_pose, placing.coordinate
 
-    # One work-item a particle.
+    # Place poses: one work-item takes a particle.
     @kernel
     def place_poses(
         poses: wp.array(dtype=coordinate),

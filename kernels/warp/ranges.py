@@ -13,13 +13,13 @@ CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LO
 
 
 def caster_of(flags):
-    """The kernel file whose cast_ray a set of flags means."""
+    """Return the kernel file of the caster of a set of flags."""
     return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
 
 
 @functools.cache
 def make(name, flags):
-    """The kernel cast_ranges or cast_tiles specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     caster = caster_of(flags)
@@ -29,7 +29,7 @@ def make(name, flags):
     ORDERED = "ORDERED" in flags
     cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
 
-    # One work-item a particle and ray, fewer than 2^31 in a launch.
+    # Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31.
     @kernel
     def cast_ranges(
         map_table: wp.array(dtype=ENTRY),
@@ -65,7 +65,7 @@ def make(name, flags):
         )
         put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
 
-    # For GPUs, tiles of particles and rays.
+    # Cast rays in tiles of particles and rays, for GPUs.
     @kernel
     def cast_tiles(
         map_table: wp.array(dtype=ENTRY),
@@ -94,10 +94,10 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         cell = cell_at(pose_cell, n)
-        own = pose_at(pose, n)
+        sensor_pose = pose_at(pose, n)
         k = tile_ray(item, spread)
         while k < rays:
-            t = cast_ray(map_table, rows, cols, cell, own, ray_at(ray, k), limit, bins, slack, tolerance)
+            t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray_at(ray, k), limit, bins, slack, tolerance)
             put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
             k += tile_step(spread)
 

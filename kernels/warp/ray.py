@@ -1,6 +1,6 @@
 """A ray on the grid and the walk along it, which all casters share.
 
-Crossing distances are (k + a) * inv with an integer count k of boundaries, never accumulated.
+Distances of boundaries are (k + a) * inv with an integer count k of boundaries; they are never accumulated.
 """
 
 import functools
@@ -11,7 +11,7 @@ import warp as wp
 from .prelude import precision
 
 
-# Whether a cell is none of the grid's.
+# Return whether a cell lies outside the grid.
 @wp.func
 def off_grid(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
     return col < 0 or col >= cols or row < 0 or row >= rows
@@ -19,7 +19,7 @@ def off_grid(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
 
 @functools.cache
 def functions(flags):
-    """The functions and the structs Ray and Walk, specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
@@ -27,17 +27,17 @@ def functions(flags):
     QUARTER, HALF = real(0.25), real(0.5)
     # Abramowitz and Stegun 4.4.49 for the arc tangent, in turns.
     C1, C3, C5, C7, C9 = (real(c) for c in (0.15913362, -0.05256880, 0.02867033, -0.01354934, 0.00331601))
-    # Smallest direction component that is told from zero: its inverse must be finite.
+    # Smaller components of a direction count as 0, so that inverses are finite.
     TINY = real(1e-30)
-    # Counts k of boundaries are real numbers from COUNT on, where numbers are whole: what is added to COUNT is rounded
-    # to nearest, and the last bits are those of k and FIRST, so that a count is an index without a conversion.
+    # Counts k of boundaries are floating-point numbers COUNT + k. From COUNT on all numbers are integers, so a sum with
+    # COUNT is rounded to nearest. The last bits of a count are k + FIRST, so a count is an index without a conversion.
     FLOAT64 = "FLOAT64" in flags
     COUNT = real(4503599627370496.0 if FLOAT64 else 8388608.0)
     FIRST = wp.uint32(0 if FLOAT64 else 0x4B000000)
     bits = wp.uint64 if FLOAT64 else wp.uint32
 
-    # Direction of a ray in the grid's frame, of unit length: sign, size and inverse of each component, and the distance
-    # in x and y to the first boundaries.
+    # A ray in the grid's frame: its unit direction; sign, absolute value and inverse of each component; and the
+    # distances in x and y to the first boundaries.
     @wp.struct
     class Ray:
         direction: vec2
@@ -52,20 +52,21 @@ def functions(flags):
         a_x: real
         a_y: real
 
-    # How far a walk is: boundaries crossed in x and y, and the distance in cells.
+    # State of a walk: boundaries crossed in x and y, and the distance in cells.
     @wp.struct
     class Walk:
         k_x: wp.int32
         k_y: wp.int32
         t: real
 
-    # pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
+    # Return the unit direction in the grid's frame: pose (frac x, frac y, cos, sin) turned by the beam's (cos, sin).
     @wp.func
     def ray_direction(pose: vec4, ray: vec2):
         dx = pose.z * ray.x - pose.w * ray.y
         dy = pose.w * ray.x + pose.z * ray.y
         return vec2(wp.where(wp.abs(dx) < TINY, ZERO, dx), wp.where(wp.abs(dy) < TINY, ZERO, dy))
 
+    # Return the ray of a pose and a beam.
     @wp.func
     def make_ray(pose: vec4, ray: vec2):
         r = Ray()
@@ -82,31 +83,31 @@ def functions(flags):
         r.a_y = wp.where(r.up, ONE - pose.y, pose.y)
         return r
 
-    # The last 32 bits of a count.
+    # Return the last 32 bits of a count.
     @wp.func
     def as_bits(count: real):
         return wp.uint32(wp.cast(count, bits))
 
-    # The count of so many boundaries more.
+    # Add a number of boundaries to a count.
     @wp.func
     def farther(count: real, more: wp.uint32):
         return wp.cast(wp.cast(count, bits) + bits(more), real)
 
-    # k of a count.
+    # Return k of a count.
     @wp.func
     def whole(count: real):
         return wp.int32(as_bits(count) - FIRST)
 
-    # Count of the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or until t where that counts as
-    # well. Rounded to nearest, the place on the axis names the only boundary that can be in doubt.
+    # Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t. The
+    # coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
     @wp.func
     def crossed(t: real, speed: real, a: real, inv: real, until: wp.bool):
         count = wp.max((t * speed - a) + COUNT, COUNT)
         here = ((count - COUNT) + a) * inv
         return wp.where(here < t or (until and here == t), count + ONE, count)
 
-    # The walk at the ray's origin, or, where that lies outside the grid, at the first cell inside; t is limit where a
-    # ray from outside meets the grid no nearer.
+    # Return the walk at the ray's origin or, where that lies outside the grid, at the first cell inside; t is limit
+    # where a ray from outside does not meet the grid before limit.
     @wp.func
     def start_walk(r: Ray, cell: wp.vec2i, rows: wp.int32, cols: wp.int32, limit: real):
         walk = Walk()
@@ -129,7 +130,7 @@ def functions(flags):
                         walk.t = t
         return walk
 
-    # Direction as a part of a full turn in [0, 1], to 2e-6.
+    # Return a direction as a part of a full turn in [0, 1], within 2e-6.
     @wp.func
     def turn_of(direction: vec2):
         x = wp.abs(direction.x)
@@ -142,13 +143,13 @@ def functions(flags):
         upper = wp.where(direction.x >= ZERO, quarter, HALF - quarter)
         return wp.where(direction.y >= ZERO, upper, ONE - upper)
 
-    # Angle bin whose centre is nearest; centres are at 0, 1 / bins, ... of a turn.
+    # Return the angle bin with the nearest centre; centres are at 0, 1 / bins, ... of a turn.
     @wp.func
     def angle_bin(direction: vec2, bins: wp.int32):
-        found = int(turn_of(direction) * real(bins) + HALF)
-        return wp.where(found >= bins, found - bins, found)
+        index = int(turn_of(direction) * real(bins) + HALF)
+        return wp.where(index >= bins, index - bins, index)
 
-    # Metres from cells: exactly range_max where nothing is nearer.
+    # Convert a distance in cells to metres, exactly range_max where nothing is nearer.
     @wp.func
     def expected_range(t: real, limit: real, resolution: real, range_max: real):
         return wp.where(t >= limit, range_max, wp.min(t * resolution, range_max))

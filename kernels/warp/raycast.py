@@ -1,7 +1,7 @@
-"""Expected range z*: distance from a beam's origin to the first occupied cell, exactly (book section 6.3).
+"""Expected range z*: the exact distance from a beam's origin to the first occupied cell (book section 6.3).
 
-An Amanatides-Woo walk that crosses a whole empty rectangle at a time and visits the same cells; ties (corners) step in
-x first.
+It is an Amanatides-Woo walk that crosses a whole empty rectangle at a time, with the same result. At ties (corners) it
+steps in x first.
 """
 
 import functools
@@ -18,7 +18,7 @@ ENTRY = wp.uint16
 
 @functools.cache
 def functions(flags):
-    """cast_ray specialised by the flags."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
@@ -36,7 +36,8 @@ def functions(flags):
     ZERO, ABOVE_COUNT = real(0.0), real(float(COUNT) + 1.0)
     FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
 
-    # Sector of a quadrant's directions, from flat to steep. Any would do; the right one has the longest steps.
+    # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not
+    # change the result.
     @wp.func
     def sector_of(speed_x: real, speed_y: real):
         sector = int(0)
@@ -48,7 +49,7 @@ def functions(flags):
             sector += wp.where(speed_y > wp.where(steep, STEEPEST, FLATTEST) * speed_x, 1, 0)
         return sector
 
-    # Distance in cells to the first occupied cell, or limit where there is none nearer.
+    # Return the distance in cells to the first occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
@@ -78,7 +79,7 @@ def functions(flags):
         k_y = COUNT + real(start.k_y)
         t = real(start.t)
         sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
-        # A step beyond limit still ends in the table. One way out of the loop is what GPUs are fastest with.
+        # A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.
         while sides > OCCUPIED and t < limit:
             end_x = farther(k_x, sides & wp.uint32(255))
             end_y = farther(k_y, sides >> wp.uint32(8))

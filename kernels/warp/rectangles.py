@@ -1,15 +1,16 @@
 """Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
-the cell at its corner and grows that way; each at most 255, as width + 256 height. A ray may cross it in one step
-without missing an obstacle. Of all such rectangles it is the one that the ray in the middle of the sector stays in
-longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares.
+the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
+cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the one in which the ray in
+the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
+have squares.
 
-Planes are padded by a ring of zeros, so a walk that leaves the grid stops there. Quadrant q grows to (+x, +y),
-(-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, a plane each. All planes
+Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x, +y), (-x, +y),
+(+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for each. All planes
 have fewer than 2^31 cells, so indices fit int32.
 
-Planes may be made anew where only the cells in rows [top, bottom) and columns [left, right) of the map changed: then
-only cells whose rectangles can hold one of these are. Made at first, all of them have changed. What is known of
-occupied cells is a band of whole rows of the map from row first on.
+Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
+whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a band of
+whole rows of the map, from row first on.
 """
 
 from types import SimpleNamespace
@@ -20,32 +21,34 @@ from .bits import cells_left, cells_right
 from .prelude import kernel
 
 LONGEST = wp.constant(255)
-# Of a cell that is no rectangle's; the ring has 0.
+# The entry of an occupied cell; the ring has 0.
 OCCUPIED = wp.constant(1)
-# Cells from a changed cell to the farthest one whose rectangle holds it.
+# Distance from a changed cell to the farthest cell whose rectangle contains it.
 RECTANGLE_REACH = wp.constant(254)
-# Room for the columns that may bound a rectangle.
+# Capacity of the stack of columns that may bound a rectangle.
 STACK = wp.constant(256)
 
 
+# Return the index of a cell in a padded plane.
 @wp.func
 def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
     return (row + 1) * (cols + 2) + col + 1
 
 
-# Along an axis: the cells whose rectangles, growing to larger (way 1) or smaller (way -1) indices, can hold one of
-# those in [low, high) are those from reach_begin to before reach_end.
+# Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
+# larger (way 1) or smaller (way -1) indices.
 @wp.func
 def reach_begin(way: wp.int32, low: wp.int32):
     return wp.where(way > 0, wp.max(low - RECTANGLE_REACH, 0), low)
 
 
+# Return one beyond the last cell whose rectangle can contain a cell before high.
 @wp.func
 def reach_end(way: wp.int32, high: wp.int32, size: wp.int32):
     return wp.where(way > 0, high, wp.min(high + RECTANGLE_REACH, size))
 
 
-# Height and width in the proportion of the ray in the middle of a sector.
+# Return height and width in the proportion of the ray in the middle of a sector.
 @wp.func
 def slope(sectors: wp.int32, sector: wp.int32):
     if sectors == 1:
@@ -63,8 +66,8 @@ def slope(sectors: wp.int32, sector: wp.int32):
     return wp.vec2i(5, 1)
 
 
-# For serial devices, one work-item 64 columns and a direction: free cells of the band in the column, to larger
-# (direction 0) or smaller rows (direction 1), at columns from begin to before end.
+# Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
+# columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
 @kernel
 def free_columns(
     occupied: wp.array(dtype=wp.uint8),
@@ -89,9 +92,10 @@ def free_columns(
             runs[out + row * cols + col] = wp.uint8(free)
 
 
-# For serial devices, one work-item a row and quadrant, from the far end of the row to its begin. The widest rectangle
-# of enough height is at most one column wider than its neighbour's; the stack has the columns that bound its height,
-# each lower than all before it, with their free cells above the column's last 16 bits, which tell their distance.
+# Find the rectangles along rows, from the far end of a row to its begin. For processors: one work-item takes a row and
+# quadrant. The widest rectangle of sufficient height is at most one column wider than that of its neighbour. The stack
+# has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last 16
+# bits of the column, which give the distance.
 @kernel
 def rectangles_rows(
     runs: wp.array(dtype=wp.uint8),
@@ -148,14 +152,14 @@ def rectangles_rows(
                 lower = int(0)
                 if width < LONGEST and other >= 0 and other < cols:
                     lower = wp.min(height, int(runs[run + other]))
-                found = wp.where(width > 0, width + 256 * height, OCCUPIED)
+                sides = wp.where(width > 0, width + 256 * height, OCCUPIED)
                 if lower * middle[1] > width * middle[0]:
-                    found = width + 1 + 256 * lower
-                rectangles[out + padded(row, col, cols)] = wp.uint16(found)
+                    sides = width + 1 + 256 * lower
+                rectangles[out + padded(row, col, cols)] = wp.uint16(sides)
 
 
-# For parallel devices, one work-item a cell from begin to before end: free cells of the row, to the right (direction 0)
-# or left (direction 1).
+# Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
+# end). For GPUs: one work-item takes a cell.
 @kernel
 def free_rows(
     bits: wp.array(dtype=wp.int32),
@@ -177,8 +181,8 @@ def free_rows(
     runs[band * cols + cell] = wp.uint8(wp.min(left, LONGEST))
 
 
-# For parallel devices, one work-item a cell and quadrant, which looks along the column: the higher a rectangle, the
-# narrower. The first work-item of a quadrant has the first of its cells.
+# Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
+# quadrant; the first work-item of a quadrant takes the first of its cells.
 @kernel
 def rectangles_scan(
     runs: wp.array(dtype=wp.uint8),
@@ -210,7 +214,7 @@ def rectangles_scan(
     middle = slope(sectors, 0)
     step = dy * cols
     while sector < sectors:
-        # While no sector can end, four rows between two decisions, so that reads need not wait for one another.
+        # While no sector can end, read four rows between two decisions, so that reads need not wait for one another.
         if height + 3 <= room:
             first_of = run + (height - 1) * step
             a = wp.min(int(runs[first_of]), int(runs[first_of + step]))
@@ -224,10 +228,10 @@ def rectangles_scan(
         if height <= room:
             narrower = wp.min(width, int(runs[run + (height - 1) * step]))
         while sector < sectors and narrower * middle[0] < height * middle[1]:
-            found = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
+            sides = wp.where(height > 1, width + 256 * (height - 1), OCCUPIED)
             if narrower * middle[0] > (height - 1) * middle[1]:
-                found = narrower + 256 * height
-            rectangles[out + sector * plane] = wp.uint16(found)
+                sides = narrower + 256 * height
+            rectangles[out + sector * plane] = wp.uint16(sides)
             sector += 1
             middle = slope(sectors, sector)
         width = narrower
@@ -243,10 +247,10 @@ _KERNELS = {
 
 
 def functions(flags):
-    """padded; no flag changes it."""
+    """Return the functions of the file; no flag changes them."""
     return SimpleNamespace(padded=padded)
 
 
 def make(name, flags):
-    """A kernel of this file; no flag changes it."""
+    """Return a kernel of the file; no flag changes it."""
     return _KERNELS[name]

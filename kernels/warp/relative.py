@@ -1,6 +1,6 @@
 """Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded.
 
-What is left of a large coordinate or of many turns is small, and small numbers keep their digits in any precision.
+The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any precision.
 """
 
 import functools
@@ -10,7 +10,7 @@ import warp as wp
 from . import error_free, heading
 from .prelude import kernel, precision
 
-# Farther off than this is as good as here; squares of it are finite in float32.
+# Coordinates are clamped to this; its square is finite in float32.
 FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(2.0**60)), wp.constant(wp.float64(-(2.0**60)))
 QUARTER, QUARTER_LOW = wp.constant(wp.float64(1.5707963267948966)), wp.constant(wp.float64(6.123233995736766e-17))
 HALF_TURN, MINUS_HALF_TURN = wp.constant(wp.float64(3.141592653589793)), wp.constant(wp.float64(-3.141592653589793))
@@ -21,7 +21,7 @@ LIMIT = wp.constant(wp.float64(1048576.0))
 
 @functools.cache
 def make(name, flags):
-    """A kernel of the file specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     turning = heading.functions(flags & {"HUGE_HEADINGS"})
@@ -31,7 +31,7 @@ def make(name, flags):
     coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
     HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
-    # theta - target in [-pi, pi]; the target is in there already.
+    # Return theta - target in [-pi, pi]; the target is in that interval.
     @wp.func
     def wrapped_difference(theta: wp.float64, target: wp.vec2d):
         quadrant = int(0)
@@ -43,14 +43,14 @@ def make(name, flags):
                 quadrant, rest = reduce_huge(theta)
         else:
             quadrant, rest = reduce_ordinary(theta)
-        # Up to three quarters are exact: the last bits of one are 0.
+        # Up to three quarters are exact: the last bits of QUARTER are 0.
         quarters = wp.float64(quadrant)
         angle = pair_sum(wp.vec2d(quarters * QUARTER, quarters * QUARTER_LOW), rest)
         angle = pair_sum(angle, -target)
         turns = wp.where(angle.x > HALF_TURN, MINUS_FOUR, wp.where(angle.x < MINUS_HALF_TURN, FOUR, ZERO))
         return pair_sum(angle, wp.vec2d(turns * QUARTER, turns * QUARTER_LOW))
 
-    # A coordinate as a sum of two numbers in the model's precision.
+    # Round a coordinate to a sum of two numbers in the model's precision.
     @wp.func
     def rounded_place(at: wp.vec2d):
         high = wp.min(wp.max(at.x, MINUS_FARTHEST), FARTHEST)
@@ -58,8 +58,8 @@ def make(name, flags):
         rounded = real(high)
         return vec2(rounded, real((high - wp.float64(rounded)) + low))
 
-    # One work-item a particle: the place of its sensor relative to an origin as x, its low part, y, its low part.
-    # verdict, which the caller clears, becomes 1 at (0) where a pose is not finite; its place is the origin.
+    # Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. verdict,
+    # which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
     @kernel
     def place_relative(
         poses: wp.array(dtype=coordinate),
@@ -74,15 +74,15 @@ def make(name, flags):
         n = wp.tid()
         if n >= particles:
             return
-        given_x = wp.float64(poses[3 * n])
-        given_y = wp.float64(poses[3 * n + 1])
+        pose_x = wp.float64(poses[3 * n])
+        pose_y = wp.float64(poses[3 * n + 1])
         theta = wp.float64(poses[3 * n + 2])
-        if not ((given_x - given_x) + (given_y - given_y) + (theta - theta) == ZERO):
+        if not ((pose_x - pose_x) + (pose_y - pose_y) + (theta - theta) == ZERO):
             wp.atomic_max(verdict, 0, 1)
             place[n] = vec4()
             return
-        x = two_sum(given_x, -origin_x)
-        y = two_sum(given_y, -origin_y)
+        x = two_sum(pose_x, -origin_x)
+        y = two_sum(pose_y, -origin_y)
         near = wp.abs(x.x) <= FARTHEST and wp.abs(y.x) <= FARTHEST
         if near and (mount_x != ZERO or mount_y != ZERO):
             turned = cos_sin(theta)
@@ -94,8 +94,8 @@ def make(name, flags):
         at_y = rounded_place(y)
         place[n] = vec4(at_x.x, at_x.y, at_y.x, at_y.y)
 
-    # One work-item a particle: its heading minus the target, a sum of two numbers in [-pi, pi], wrapped there; verdict
-    # as for places.
+    # Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
+    # verdict is as for place_relative.
     @kernel
     def wrap_headings(
         poses: wp.array(dtype=coordinate),

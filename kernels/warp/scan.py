@@ -1,8 +1,8 @@
-"""Poses and readings that are on the device.
+"""Placement of poses and readings that lie on the device.
 
-Which readings count and where they go is as gpusense/scan.py finds it on the host.
-Readings that say nothing are left out and the others move up, so that sums over blocks of them have the same bits; what
-is left at the end are missing readings (nan), which add nothing.
+Readings are selected and placed as gpusense.models.scan.classed does it on the host. Uninformative readings are left
+out and the others move up, so that sums over blocks of readings have the same bits. The places that remain at the end
+get missing readings (nan), which add nothing.
 """
 
 import functools
@@ -14,13 +14,14 @@ from . import placement
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, popcount, precision, work_item
 
-# What max readings are: left out, in the constant, or evaluated like others.
+# Max readings are left out, part of the constant term, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = wp.constant(0), wp.constant(1), wp.constant(2)
 ZERO = wp.constant(wp.float64(0.0))
 MISSING, FAR = wp.constant(wp.float64(math.nan)), wp.constant(wp.float64(math.inf))
 
 
-# Whether an even choice of so many informative readings has that of a rank: some i * informative / chosen is it.
+# Return whether an even choice of informative readings includes one of this rank: some i * informative / chosen is the
+# rank.
 @wp.func
 def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
     if chosen >= informative:
@@ -35,7 +36,7 @@ def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
 
 @functools.cache
 def make(name, flags):
-    """The kernel place_inputs specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types, place = precision(flags), placement.functions(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     coordinate, place_pose = place.coordinate, place.place_pose
@@ -47,7 +48,7 @@ def make(name, flags):
     NOTHING, NEVER = real(0.0), real(-math.inf)
     NO_READING, AHEAD = real(math.nan), vec2(1.0, 0.0)
 
-    # The reading with a number among so many, of some beams; nan beyond the last.
+    # Return reading k of the chosen beams, nan beyond the last.
     @wp.func
     def reading_of(k: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), beams: wp.int32):
         z = wp.float64(MISSING)
@@ -58,14 +59,15 @@ def make(name, flags):
                 z = wp.float64(ranges[k])
         return z
 
-    # A reading's and a place's own part: it looks at all readings, of which 16 are read before any is looked at, finds
-    # the place of its own and fills it. A place gets its reading, at most top, and as points the vectors of its beam,
-    # each of them; with END_POINTS a point is the reading times its vector, in cells, and what rounding took from it. A
-    # max reading is inf. The guard is guard_scale (longest + 2 cells) of a block of places. Fixed is what max readings
-    # add that have no place; -inf where a range is there and none is possible.
+    # Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
+    # place at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points
+    # the vectors of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and
+    # point_low its rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2
+    # cells). fixed is the constant term of max readings that have no place, -inf if there is a range where none is
+    # possible.
     @wp.func
     def place_reading(
-        own: wp.int32,
+        item: wp.int32,
         ranges: wp.array(dtype=measured),
         beam: wp.array(dtype=wp.int32),
         vector: wp.array(dtype=wp.float64),
@@ -87,12 +89,12 @@ def make(name, flags):
         top: wp.float64,
         guard_scale: wp.float64,
     ):
-        # What is needed last is read first, so that nothing waits for it.
-        source = 2 * own * each
-        z_own = reading_of(own, ranges, beam, beams)
+        # Values that are needed last are read first, so that nothing waits for them.
+        source = 2 * item * each
+        item_reading = reading_of(item, ranges, beam, beams)
         vector_x = wp.float64(1.0)
         vector_y = wp.float64(0.0)
-        if own < beams:
+        if item < beams:
             vector_x = vector[source]
             vector_y = vector[source + 1]
         informative = int(beams)
@@ -104,11 +106,11 @@ def make(name, flags):
                     informative += 1
         rank = int(0)
         place = int(0)
-        own_place = int(places)
+        item_place = int(places)
         far_count = int(0)
         impossible = bool(False)
-        own_value = wp.float64(MISSING)
-        # Of the readings in the block of places that begins with the own one, if one does.
+        item_value = wp.float64(MISSING)
+        # The longest reading in the block of places that begins with this item's place, if a block begins there.
         longest = wp.float64(0.0)
         first = int(0)
         while first < beams:
@@ -121,14 +123,14 @@ def make(name, flags):
             for i in range(BLOCK_TERMS):
                 hits = hits | (int(several[i] >= nearest and several[i] < farthest) << i)
                 fars = fars | (int(several[i] >= farthest) << i)
-            told = int(hits)
+            telling = int(hits)
             if max_readings != MAX_LEFT_OUT:
-                told = hits | fars
-            used = int(told)
+                telling = hits | fars
+            used = int(telling)
             if chosen < informative:
                 for i in range(BLOCK_TERMS):
-                    its_rank = rank + popcount(told & ((1 << i) - 1))
-                    if not is_chosen(its_rank, informative, chosen):
+                    rank_of_i = rank + popcount(telling & ((1 << i) - 1))
+                    if not is_chosen(rank_of_i, informative, chosen):
                         used = used & ~(1 << i)
             as_range = int(0)
             if possible != 0:
@@ -139,61 +141,61 @@ def make(name, flags):
             placed = as_range | as_far
             if ALL_READINGS:
                 placed = (1 << wp.min(beams - first, BLOCK_TERMS)) - 1
-            i_own = own - first
-            if i_own >= 0 and i_own < BLOCK_TERMS:
-                if (placed >> i_own) & 1 != 0:
-                    own_place = place + popcount(placed & ((1 << i_own) - 1))
-                    if (as_range >> i_own) & 1 != 0:
-                        own_value = z_own
-                    if (as_far >> i_own) & 1 != 0:
-                        own_value = wp.float64(FAR)
+            item_bit = item - first
+            if item_bit >= 0 and item_bit < BLOCK_TERMS:
+                if (placed >> item_bit) & 1 != 0:
+                    item_place = place + popcount(placed & ((1 << item_bit) - 1))
+                    if (as_range >> item_bit) & 1 != 0:
+                        item_value = item_reading
+                    if (as_far >> item_bit) & 1 != 0:
+                        item_value = wp.float64(FAR)
             if END_POINTS:
-                begins = own_place < places and own_place % BLOCK_TERMS == 0
-                if begins and place < own_place + BLOCK_TERMS:
+                begins = item_place < places and item_place % BLOCK_TERMS == 0
+                if begins and place < item_place + BLOCK_TERMS:
                     for i in range(BLOCK_TERMS):
                         other = place + popcount(placed & ((1 << i) - 1))
-                        beside = other >= own_place and other < own_place + BLOCK_TERMS
+                        beside = other >= item_place and other < item_place + BLOCK_TERMS
                         if (as_range >> i) & 1 != 0 and beside:
                             longest = wp.max(longest, several[i])
-            rank += popcount(told)
+            rank += popcount(telling)
             far_count += popcount(used & fars)
             if possible == 0 and (used & hits) != 0:
                 impossible = True
             place += popcount(placed)
             first += BLOCK_TERMS
-        left_over = own >= place and own < places
+        left_over = item >= place and item < places
         if END_POINTS:
-            if own_place < places:
-                cells = own_value / resolution
+            if item_place < places:
+                cells = item_value / resolution
                 length = wp.where(wp.isfinite(cells), cells, ZERO)
                 x = vector_x * length
                 y = vector_y * length
                 high = vec2(real(x), real(y))
-                point_low[own_place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
+                point_low[item_place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
                 if not wp.isfinite(cells):
                     high = vec2(real(cells), real(cells))
-                point[own_place] = high
-                if own_place % BLOCK_TERMS == 0:
-                    guard[own_place // BLOCK_TERMS] = real(guard_scale * (longest / resolution + wp.float64(2.0)))
+                point[item_place] = high
+                if item_place % BLOCK_TERMS == 0:
+                    guard[item_place // BLOCK_TERMS] = real(guard_scale * (longest / resolution + wp.float64(2.0)))
             if left_over:
-                point[own] = vec2(NO_READING, NO_READING)
-                point_low[own] = vec2(NOTHING, NOTHING)
-                if own % BLOCK_TERMS == 0:
-                    guard[own // BLOCK_TERMS] = real(guard_scale * wp.float64(2.0))
+                point[item] = vec2(NO_READING, NO_READING)
+                point_low[item] = vec2(NOTHING, NOTHING)
+                if item % BLOCK_TERMS == 0:
+                    guard[item // BLOCK_TERMS] = real(guard_scale * wp.float64(2.0))
         else:
-            if own_place < places:
-                point[own_place * each] = vec2(real(vector_x), real(vector_y))
+            if item_place < places:
+                point[item_place * each] = vec2(real(vector_x), real(vector_y))
                 for j in range(1, each):
-                    point[own_place * each + j] = vec2(real(vector[source + 2 * j]), real(vector[source + 2 * j + 1]))
-                rounded = real(own_value)
+                    point[item_place * each + j] = vec2(real(vector[source + 2 * j]), real(vector[source + 2 * j + 1]))
+                rounded = real(item_value)
                 if rounded > real(top) and not wp.isinf(rounded):
                     rounded = real(top)
-                reading[own_place] = rounded
+                reading[item_place] = rounded
             if left_over:
                 for j in range(each):
-                    point[own * each + j] = AHEAD
-                reading[own] = NO_READING
-        if own == 0:
+                    point[item * each + j] = AHEAD
+                reading[item] = NO_READING
+        if item == 0:
             constant = NOTHING
             if max_readings == MAX_FIXED:
                 constant = real(wp.float64(far_count) * log_max)
@@ -201,7 +203,8 @@ def make(name, flags):
                 constant = NEVER
             fixed[0] = constant
 
-    # One work-item a beam and place, in whole groups, and after these one a particle.
+    # Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a
+    # particle.
     @kernel
     def place_inputs(
         poses: wp.array(dtype=coordinate),

@@ -1,7 +1,7 @@
-"""The density of one reading from a table of log p over bins of readings and expected ranges, instead of a formula.
+"""Density of one reading from a table of log p over bins of readings and expected ranges.
 
-Row i is a bin of readings, the last row for max readings (log probabilities); column j a bin of expected ranges, the
-last column for rays without an obstacle. The table has fewer than 2^31 entries.
+Row i is a bin of readings; the last row is for max readings (log probabilities). Column j is a bin of expected ranges;
+the last column is for rays without an obstacle. The table has fewer than 2^31 entries.
 """
 
 import functools
@@ -14,16 +14,17 @@ from .prelude import precision
 
 @functools.cache
 def functions(flags):
-    """range_bin and tabulated_density in the precision of the flags."""
+    """Make the functions of the file for a set of flags."""
     real = precision(flags).real
 
-    # Bin of a range; the last one, after the cells, is for range_max and more.
+    # Return the bin of a range; the last one, after the cells, is for range_max and more.
     @wp.func
     def range_bin(distance: real, per_metre: real, cells: wp.int32, range_max: real):
         if distance >= range_max:
             return cells
         return wp.min(int(distance * per_metre), cells - 1)
 
+    # Return log p of a reading for an expected range.
     @wp.func
     def tabulated_density(
         z: real, expected: real, sensor: wp.array(dtype=real), cells: wp.int32, per_metre: real, range_max: real

@@ -1,4 +1,4 @@
-"""Sums of what single readings, or blocks of them, add to a scan's logarithm, in the order of the readings."""
+"""Sums of the terms of readings, or of blocks of readings, in the order of the readings."""
 
 import functools
 
@@ -11,7 +11,7 @@ from .prelude import kernel, precision, reader, work_item
 
 @functools.cache
 def make(name, flags):
-    """The kernel sum_parts specialised by the flags."""
+    """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
@@ -24,11 +24,11 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     ZERO = real(0.0)
 
-    # One work-item a particle: count numbers, each along farther than the last, from parts[place * across] on. They are
-    # sums of blocks or strands, and block is 1, or single terms in blocks of BLOCK_TERMS, whose strands are added
-    # plainly first. All go to a compensated total. BLOCK_TERMS numbers are read before any is added, so that a
-    # work-item waits once for all of them; what lies beyond the last counts as 0, which changes no sum. Of several
-    # scans each has a count of its own, with STRANDED of readings, whose strands are added.
+    # Sum count numbers, number k at parts[place * across + k * along]: one work-item takes a particle. They are sums of
+    # blocks or strands (block is 1), or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first.
+    # All are added to a compensated total. BLOCK_TERMS numbers are read before any is added, so that a work-item waits
+    # once for all of them; numbers beyond the last count as 0, which changes no sum. With SCANS each scan has a count
+    # of its own; with STRANDED it is a count of readings, and the numbers are sums of their strands.
     @kernel
     def sum_parts(
         parts: wp.array(dtype=real),
@@ -52,19 +52,19 @@ def make(name, flags):
         if ORDERED:
             n = order[place]
         part = place * across
-        own = count
-        lead = fixed
+        size = count
+        constant_term = fixed
         if SCANS:
-            own = counts[n // per_scan]
+            size = counts[n // per_scan]
             if STRANDED:
-                own = own // BLOCK_TERMS * STRANDS + wp.min(own % BLOCK_TERMS, STRANDS)
-            lead = fixed_of[n // per_scan]
-        total = vec2(lead, ZERO)
+                size = size // BLOCK_TERMS * STRANDS + wp.min(size % BLOCK_TERMS, STRANDS)
+            constant_term = fixed_of[n // per_scan]
+        total = vec2(constant_term, ZERO)
         first = int(0)
-        while first < own:
+        while first < size:
             term = block_terms()
             for i in range(BLOCK_TERMS):
-                if first + i < own:
+                if first + i < size:
                     term[i] = number_at(parts, part + (first + i) * along)
             if block == 1:
                 for i in range(BLOCK_TERMS):

@@ -1,6 +1,6 @@
-"""Work-items for GPUs: a work-group takes a tile of neighbouring particles and rays, so that its rays take much the
-same way. With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays: few particles fill a
-device, too. Particles come in the order of the kernel file order where that was made.
+"""Tiles of work-items for GPUs: a work-group takes a tile of neighbouring particles and rays, whose paths are similar.
+With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays, so that few particles fill a
+device, too. Particles are in the order of the file order, if it was computed.
 """
 
 import warp as wp
@@ -10,23 +10,25 @@ TILE_PARTICLES = wp.constant(16)
 TILE = wp.constant(64)
 
 
-# Place in the order of a work-item's particle, which of the groups of its tile of particles it belongs to, its first
-# ray, and how many rays farther the next one is.
+# Return the place of a work-item's particle in the order.
 @wp.func
 def tile_place(item: wp.int32, spread: wp.int32):
     return ((item // TILE) >> spread) * TILE_PARTICLES + item % TILE // TILE_RAYS
 
 
+# Return a work-item's group within its tile of particles.
 @wp.func
 def tile_group(item: wp.int32, spread: wp.int32):
     return (item // TILE) & ((1 << spread) - 1)
 
 
+# Return the first ray of a work-item.
 @wp.func
 def tile_ray(item: wp.int32, spread: wp.int32):
     return ((item // TILE) & ((1 << spread) - 1)) * TILE_RAYS + item % TILE_RAYS
 
 
+# Return the step from one ray of a work-item to its next.
 @wp.func
 def tile_step(spread: wp.int32):
     return TILE_RAYS << spread

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import BackendInfo, Launcher
+from gpusense.backends.base import Backend, BackendInfo, Launcher
 from gpusense.interface.signatures import KERNELS
 
 
@@ -19,7 +19,7 @@ def _memory() -> int:
         return 4 << 30
 
 
-class NumpyBackend:
+class NumpyBackend(Backend):
     """Runs the reference kernels on the host."""
 
     def __init__(self) -> None:

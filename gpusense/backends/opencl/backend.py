@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends.base import Adopted, BackendInfo, Buffer, Launcher, ProcessBound
+from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
 from gpusense.backends.cache import ProgramCache
 from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
@@ -27,7 +27,8 @@ from gpusense.backends.opencl.devices import (
 from gpusense.backends.opencl.drivers import as_job as drivers_as_job
 from gpusense.backends.opencl.launch import Launch
 from gpusense.backends.opencl.memory import DeviceBuffer, SharedBuffer, driver_errors
-from gpusense.backends.opencl.replay import KeptLaunch, Repeated
+from gpusense.backends.opencl.replay import Repeated
+from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant, uses_double, with_places
 
@@ -50,7 +51,7 @@ def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
     return None if pocl.is_pocl(device) else ProgramCache(info)
 
 
-class OpenCLBackend(ProcessBound):
+class OpenCLBackend(ProcessBound, Backend):
     """One OpenCL device: a context, an in-order queue and the programs compiled for it.
 
     A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, copies are
@@ -69,8 +70,6 @@ class OpenCLBackend(ProcessBound):
         # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
         self._count = threading.RLock()
         self._queued = self._ended = 0
-        # The launches that a thread records, if it does.
-        self._thread = threading.local()
         self.alignment = arrays.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
@@ -93,7 +92,6 @@ class OpenCLBackend(ProcessBound):
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
         self.check_process()
-        self._check_recording()
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             array = np.ascontiguousarray(array)
@@ -138,7 +136,6 @@ class OpenCLBackend(ProcessBound):
 
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
-        self._check_recording()
         if out.size:
             if isinstance(buffer, SharedBuffer):
                 self._settle()
@@ -154,19 +151,18 @@ class OpenCLBackend(ProcessBound):
         return arrays.part_of(buffer, first * size, count * size, self.alignment)
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """See Sharing.adopt."""
+        """See Backend.adopt."""
         return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """See Sharing.blank; not memory that is shared, of which arrays may not outlive the backend's launches."""
+        """See Backend.blank; not memory that is shared, of which arrays may not outlive the backend's launches."""
         size = max(count, 1) * np.dtype(dtype).itemsize
         self._check_size(size)
         with driver_errors():
             return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Sharing.copy."""
-        self._check_recording()
+        """See Backend.copy."""
         if not size:
             return
         with driver_errors():
@@ -177,25 +173,20 @@ class OpenCLBackend(ProcessBound):
                 cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
 
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        """See Sharing.lend."""
+        """See Backend.lend."""
         return arrays.lent(buffer, self._queue, shape, dtype)
 
     @property
-    def stages(self) -> bool:
-        """See Recording.stages."""
+    def replays(self) -> bool:
+        """See Backend.replays."""
         return self.info.kind == "gpu"
 
-    def record(self, run: Callable[[], None]) -> Repeated:
-        """See Recording.record."""
-        kept: list[KeptLaunch] = []
-        self._thread.kept = kept
-        try:
-            run()
-        finally:
-            self._thread.kept = None
-        return Repeated(self._queue, kept, self._counted)
+    def record(self, program: Program) -> Repeated:
+        """See Backend.record."""
+        launches = [self.compile(one.kernel, one.flags).bind(one.size, one.arguments) for one in program]
+        return Repeated(self._queue, launches, self._counted)
 
-    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launch:
         """See Backend.compile."""
         self.check_process()
         launcher = self._launchers.get((kernel, flags))
@@ -213,14 +204,6 @@ class OpenCLBackend(ProcessBound):
             self._ended = max(self._ended, queued)
         if self._pocl is not None and self._pocl.changed:
             self._pocl.save()
-
-    def _check_recording(self) -> None:
-        if self.recording() is not None:
-            raise RuntimeError("only launches can be recorded")
-
-    def recording(self) -> list[KeptLaunch] | None:
-        """Where this thread keeps launches in place of starting them, if it does."""
-        return getattr(self._thread, "kept", None)
 
     def _settle(self) -> None:
         """Wait until no command of this thread can be under way."""

@@ -1,4 +1,4 @@
-"""Launches that are started again and again with the same arguments: each is a kernel object of its own."""
+"""Recordings: launches with the same arguments each time, each a kernel object of its own."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def is_unordered(queue: cl.CommandQueue) -> bool:
 
 
 @dataclass(frozen=True)
-class KeptLaunch:
-    """A kernel whose arguments are set, with its sizes, and what keeps its arguments' memory alive."""
+class BoundLaunch:
+    """A kernel whose arguments are set, its size and group, and its arguments, whose memory it keeps alive."""
 
     kernel: cl.Kernel
     size: tuple[int, ...]
@@ -29,16 +29,16 @@ class KeptLaunch:
 
 
 class Repeated:
-    """See Replay; a stream is a queue of the same context."""
+    """See Recording; a stream is a queue of the same context."""
 
-    def __init__(self, queue: cl.CommandQueue, launches: list[KeptLaunch], count: Callable[[int], None]) -> None:
+    def __init__(self, queue: cl.CommandQueue, launches: list[BoundLaunch], count: Callable[[int], None]) -> None:
         self._queue, self._launches, self._count = queue, launches, count
         # Queues of others on which they were started since the last wait.
         self._used: list[cl.CommandQueue] = []
         self._lock = threading.Lock()
 
     def __call__(self, stream: Any = None) -> None:
-        """See Replay.__call__."""
+        """See Recording.__call__."""
         queue = self._queue if stream is None else self._checked(stream)
         # Two threads' launches must not be mixed.
         with self._lock, driver_errors():
@@ -56,7 +56,7 @@ class Repeated:
             self.wait()
 
     def wait(self) -> None:
-        """See Replay.wait."""
+        """See Recording.wait."""
         with self._lock:
             used, self._used = [self._queue, *self._used], []
         with driver_errors():

@@ -7,20 +7,20 @@ kernels unpack ``wp.tid()`` in that order.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from gpusense.backends.base import Adopted, BackendInfo, Launcher, ProcessBound
+from gpusense.backends.base import Adopted, Backend, BackendInfo, ProcessBound, Recording
 from gpusense.backends.numpy.backend import _memory
 from gpusense.backends.warp.arrays import adopted
-from gpusense.backends.warp.launch import SCALARS, Launch, LaunchStep, host_view
-from gpusense.backends.warp.pieces import shared
-from gpusense.backends.warp.queue import Graphs, Group, Queue, Recording, Repeated, Step
+from gpusense.backends.warp.launch import SCALARS, Launch, host_view
+from gpusense.backends.warp.pieces import SharedLaunch, shared
+from gpusense.backends.warp.queue import Graphs, Queue, Recorded
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
 from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS, Kernel
 from gpusense.interface.sources import relevant
 
@@ -48,10 +48,11 @@ def _describe(device: wp.Device) -> BackendInfo:
         max_buffer=memory,
         float64=True,
         vector_loops=not device.is_cuda,
+        graphs=device.is_cuda,
     )
 
 
-class WarpBackend(ProcessBound):
+class WarpBackend(ProcessBound, Backend):
     """One Warp device: flat arrays of numbers as buffers, launches on the device's current stream."""
 
     alignment = 1
@@ -61,14 +62,13 @@ class WarpBackend(ProcessBound):
         initialize()
         self.info = info
         self._device = wp.get_device(device)
-        self._gathers = self._device.is_cuda
         self._graphs = Graphs(self._device)
         # One for each thread of a call, and those that no call has now.
         self._thread = threading.local()
         self._queues: list[Queue] = []
         # By the flags that change code, and by those that were asked for.
-        self._launchers: dict[tuple[str, frozenset[str]], Launcher] = {}
-        self._asked: dict[tuple[str, frozenset[str]], Launcher] = {}
+        self._launchers: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
+        self._asked: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
 
     def upload(self, array: np.ndarray, out: wp.array | None = None, *, wait: bool = True) -> wp.array:
         """See Backend.upload."""
@@ -129,15 +129,15 @@ class WarpBackend(ProcessBound):
         return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """See Sharing.adopt; all that lies on the device can be used in place."""
+        """See Backend.adopt; all that lies on the device can be used in place."""
         return adopted(array, self._device, name)
 
     def blank(self, count: int, dtype: np.dtype) -> wp.array:
-        """See Sharing.blank."""
+        """See Backend.blank."""
         return self.part(self.empty(count, dtype), 0, count, dtype)
 
     def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Sharing.copy."""
+        """See Backend.copy."""
         if not size:
             # To Warp a count of 0 is all.
             return
@@ -149,15 +149,15 @@ class WarpBackend(ProcessBound):
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
 
     def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
-        """See Sharing.lend."""
+        """See Backend.lend."""
         return buffer if buffer.shape == shape else buffer.reshape(shape)
 
     @property
-    def stages(self) -> bool:
-        """See Recording.stages."""
-        return self._gathers
+    def replays(self) -> bool:
+        """See Backend.replays."""
+        return self.info.graphs
 
-    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
+    def compile(self, kernel: str, flags: frozenset[str]) -> Launch | SharedLaunch:
         """See Backend.compile."""
         self.check_process()
         launcher = self._asked.get((kernel, flags))
@@ -181,8 +181,8 @@ class WarpBackend(ProcessBound):
             queue.deliver()
 
     def gather(self) -> None:
-        """See Gathering.gather."""
-        if not self._gathers:
+        """See Backend.gather."""
+        if not self.info.graphs:
             return
         try:
             queue = self._queues.pop()
@@ -195,13 +195,13 @@ class WarpBackend(ProcessBound):
         self._thread.queue = queue
 
     def start(self) -> None:
-        """See Gathering.start."""
+        """See Backend.start."""
         queue = self.gathering()
         if queue is not None:
             self._flush(queue)
 
     def scatter(self) -> None:
-        """See Gathering.scatter."""
+        """See Backend.scatter."""
         queue = self.gathering()
         if queue is not None:
             self._thread.queue = None
@@ -210,45 +210,27 @@ class WarpBackend(ProcessBound):
             finally:
                 self._queues.append(queue)
 
-    def mark(self) -> object | None:
-        """See Gathering.mark."""
-        queue = self.gathering()
-        return None if queue is None else (queue.started, len(queue.steps))
+    @property
+    def gathers(self) -> bool:
+        """See Backend.gathers."""
+        return self.gathering() is not None
 
-    def kept(self, mark: object) -> object | None:
-        """See Gathering.kept."""
-        queue = self.gathering()
-        assert queue is not None and isinstance(mark, tuple)
-        started, first = mark
-        steps = queue.steps[first:]
-        if started != queue.started or not all(isinstance(step, LaunchStep) for step in steps):
-            return None
-        group = Group([step.alone() for step in steps if isinstance(step, LaunchStep)])
-        queue.steps[first:] = [group]
-        return group
+    def record(self, program: Program) -> Recorded:
+        """See Backend.record; launches know their buffers by address and keep none alive."""
+        steps = [self.compile(one.kernel, one.flags).step(one.size, one.arguments) for one in program]
+        return Recorded(self._device, self._graphs, [step for step in steps if step is not None])
 
-    def repeat(self, kept: object) -> None:
-        """See Gathering.repeat."""
+    def replay(self, recording: Recording) -> None:
+        """See Backend.replay."""
         queue = self.gathering()
-        assert queue is not None and isinstance(kept, Group)
-        queue.steps.append(kept)
+        if queue is None or not isinstance(recording, Recorded):
+            recording()
+        else:
+            queue.steps.append(recording)
 
     def address(self, buffer: wp.array) -> int:
-        """See Gathering.address."""
+        """See Backend.address."""
         return int(buffer.ptr or 0)
-
-    def record(self, run: Callable[[], None]) -> Repeated:
-        """See Recording.record."""
-        before, recording = self.gathering(), Recording()
-        self._thread.queue = recording
-        try:
-            run()
-        finally:
-            self._thread.queue = before
-        steps: list[Step] = [step.alone() for step in recording.steps if isinstance(step, LaunchStep)]
-        if recording.started or len(steps) < len(recording.steps):
-            raise RuntimeError("only launches can be recorded")
-        return Repeated(self._device, self._graphs, steps)
 
     def gathering(self) -> Queue | None:
         """What this thread gathers in, if it does."""
@@ -258,7 +240,6 @@ class WarpBackend(ProcessBound):
         """Start what was gathered."""
         if queue.steps:
             steps, queue.steps = queue.steps, []
-            queue.started += 1
             self._graphs.start(steps)
 
     def _wait(self) -> None:
@@ -266,7 +247,7 @@ class WarpBackend(ProcessBound):
         if self._device.is_cuda:
             wp.synchronize_stream(self._device)
 
-    def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launcher:
+    def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launch | SharedLaunch:
         group = row.group if self._device.is_cuda else 1
         with settings():
             made = warp_module(row.file).make(kernel, flags)

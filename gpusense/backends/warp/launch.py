@@ -52,12 +52,18 @@ class Launch:
         """See Launcher.__call__."""
         if 0 in size:
             return
-        keys = [(value.ptr, value.size) if isinstance(value, wp.array) else value for value in arguments]
         queue = self._gathering()
         if queue is None:
-            self.start(size, arguments, keys, None)
+            self.start(size, arguments, _keys(arguments), None)
         else:
-            queue.steps.append(LaunchStep(self, size, arguments, keys))
+            queue.steps.append(LaunchStep(self, size, arguments, _keys(arguments)))
+
+    def step(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> LaunchStep | None:
+        """Return a launch that keeps no array alive, and start nothing; None without work-items."""
+        if 0 in size:
+            return None
+        views = [slice_of(value, 0, value.size) if isinstance(value, wp.array) else value for value in arguments]
+        return LaunchStep(self, size, tuple(views), _keys(arguments))
 
     def start(self, size: tuple[int, ...], arguments: tuple[Any, ...], keys: list[Any], stream: Any) -> None:
         """Launch on a stream, or on the device's current one; the keys are those of the arguments."""
@@ -79,6 +85,11 @@ class Launch:
         self._thread.recorded = (command, size, keys)
 
 
+def _keys(arguments: tuple[Any, ...]) -> list[Any]:
+    """Return numbers as they are, and arrays by their memory."""
+    return [(value.ptr, value.size) if isinstance(value, wp.array) else value for value in arguments]
+
+
 class LaunchStep:
     """A launch that is gathered; see Step."""
 
@@ -86,12 +97,6 @@ class LaunchStep:
         self._given = (size, arguments, keys)
         self._launch = launch
         self.key: Hashable = (id(launch), size, *keys)
-
-    def alone(self) -> LaunchStep:
-        """The same launch, which keeps no array alive."""
-        size, arguments, keys = self._given
-        own = [slice_of(value, 0, value.size) if isinstance(value, wp.array) else value for value in arguments]
-        return LaunchStep(self._launch, size, tuple(own), keys)
 
     def start(self, stream: wp.Stream | None) -> None:
         """See Step.start."""

@@ -15,8 +15,7 @@ import os
 import threading
 from typing import Any
 
-from gpusense.backends.base import Launcher
-from gpusense.backends.warp.launch import Launch, slice_of
+from gpusense.backends.warp.launch import Launch, LaunchStep, slice_of
 from gpusense.backends.warp.queue import HELPERS
 from gpusense.interface.signatures import Argument, Kernel
 
@@ -28,9 +27,9 @@ _PIECE_WORK = 1 << 16
 _PIECES = 2
 
 
-def shared(launch: Launch, row: Kernel) -> Launcher:
+def shared(launch: Launch, row: Kernel) -> Launch | SharedLaunch:
     """The launch, in pieces where several threads may share it."""
-    return launch if _threads() == 1 or not _independent(row) else _Pieces(launch, row)
+    return launch if _threads() == 1 or not _independent(row) else SharedLaunch(launch, row)
 
 
 def _shared_axis(row: Kernel) -> str | None:
@@ -61,7 +60,7 @@ def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
     return concurrent.futures.ThreadPoolExecutor(_threads() - 1, HELPERS)
 
 
-class _Pieces:
+class SharedLaunch:
     """A launch over particles or blocks of pairs, cut into pieces that several threads take one after the other."""
 
     def __init__(self, launch: Launch, row: Kernel) -> None:
@@ -76,6 +75,7 @@ class _Pieces:
         ]
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
+        """See Launcher.__call__."""
         particles = size[self._axis]
         work = particles * max((int(arguments[i]) for i in self._work), default=1)
         count = min(_PIECES * _threads(), work // _PIECE_WORK, particles)
@@ -113,6 +113,10 @@ class _Pieces:
         for helper in helpers:
             if not helper.cancelled():
                 helper.result()
+
+    def step(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> LaunchStep | None:
+        """See Launch.step; a recording is started by one thread."""
+        return self._launch.step(size, arguments)
 
     def _rows(self, arguments: tuple[Any, ...]) -> list[tuple[int, int]]:
         """The arrays that hold something of every particle or block, and how many numbers of each."""

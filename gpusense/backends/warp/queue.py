@@ -9,12 +9,15 @@ replayed from a graph: one start for all. Pointers and numbers are what a graph 
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 from collections.abc import Hashable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
+
+_log = logging.getLogger(__name__)
 
 # Page-locked bytes of a call, and the largest array that takes this way.
 _MEMORY = 16 << 20
@@ -56,27 +59,11 @@ class Copy:
         wp.copy(target, source, count=count, stream=stream)
 
 
-class Group:
-    """Steps that belong together: one for whoever compares them."""
-
-    _numbers = itertools.count()
-
-    def __init__(self, steps: list[Step]) -> None:
-        self._steps = steps
-        self.key: Hashable = next(self._numbers)
-
-    def start(self, stream: wp.Stream | None) -> None:
-        """See Step.start."""
-        _start_each(self._steps, stream)
-
-
 class Queue:
     """What one call has gathered."""
 
     def __init__(self, device: wp.Device, types: Mapping[Any, Any]) -> None:
         self.steps: list[Step] = []
-        # How often steps were started.
-        self.started = 0
         # False while the device may still read or write the page-locked memory.
         self.settled = True
         self._types = types
@@ -135,23 +122,6 @@ class Queue:
         return found
 
 
-class Recording(Queue):
-    """Launches that are to be kept, and not to be started now."""
-
-    def __init__(self) -> None:
-        # Without the memory for copies, of which there are none.
-        self.steps: list[Step] = []
-        self.started = 0
-
-    def upload(self, array: np.ndarray, out: wp.array) -> bool:
-        """Refuse."""
-        return False
-
-    def download(self, buffer: wp.array, out: np.ndarray) -> bool:
-        """Refuse."""
-        return False
-
-
 class Graphs:
     """Graphs of what was done more than once."""
 
@@ -163,11 +133,12 @@ class Graphs:
         self._seen: dict[Hashable, None] = {}
         self._lock = threading.Lock()
         self._stream: wp.Stream | None = None
-        self.failed = False
+        # Why the driver captures no graphs; empty where it does.
+        self.failure = ""
 
     def start(self, steps: list[Step]) -> None:
         """Start steps in their order."""
-        if not 1 < len(steps) <= _MOST_STEPS or self.failed:
+        if not 1 < len(steps) <= _MOST_STEPS or self.failure:
             _start_each(steps, None)
             return
         key = tuple([step.key for step in steps])
@@ -187,7 +158,7 @@ class Graphs:
 
     def recorded(self, steps: list[Step]) -> Any:
         """A graph of steps for whoever keeps it; None where there can be none now."""
-        if self.failed or len(steps) < 2:
+        if self.failure or len(steps) < 2:
             return None
         with self._lock:
             return self._record(steps)
@@ -216,18 +187,25 @@ class Graphs:
                 _start_each(steps, self._stream)
             finally:
                 graph = wp.capture_end(**where)
-        except RuntimeError:
+        except RuntimeError as error:
             # A driver that cannot: every step is started on its own from now on.
-            self.failed = True
+            self.failure = str(error)
+            _log.warning("%s captures no CUDA graph, so launches are started one by one: %s", self._device, error)
             return None
         return graph
 
 
-class Repeated:
-    """Launches that are started again and again; see Replay. They are a graph as soon as there can be one."""
+class Recorded:
+    """A recording: steps that belong together, and are one step to a call that gathers them.
+
+    They are a graph as soon as there can be one.
+    """
+
+    _numbers = itertools.count()
 
     def __init__(self, device: wp.Device, graphs: Graphs, steps: list[Step]) -> None:
         self._device, self._graphs, self._steps = device, graphs, steps
+        self.key: Hashable = next(self._numbers)
         self._graph: Any = None
         # Whether they were started, each on its own, which loads what a graph must not wait for.
         self._begun = False
@@ -236,8 +214,12 @@ class Repeated:
         self._used: set[wp.Stream | None] = set()
         self._lock = threading.Lock()
 
+    def start(self, stream: wp.Stream | None) -> None:
+        """See Step.start."""
+        _start_each(self._steps, stream)
+
     def __call__(self, stream: Any = None) -> None:
-        """See Replay.__call__."""
+        """See Recording.__call__."""
         if stream is None:
             where = self._device.stream if self._device.is_cuda else None
         else:
@@ -255,7 +237,7 @@ class Repeated:
                 wp.capture_launch(graph, where)
 
     def wait(self) -> None:
-        """See Replay.wait."""
+        """See Recording.wait."""
         used, self._used = self._used, set()
         for stream in used:
             if stream is not None:

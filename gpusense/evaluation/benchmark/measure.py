@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.backends.base import Buffer, Launcher
+from gpusense.backends.base import Buffer, Launcher, Proxy
 
 LONG = 2.0
 """Duration of a call above which it is not repeated [s]."""
@@ -34,27 +34,20 @@ _LIST = [object()]
 _ALONE = sys.getrefcount(_LIST[0])
 
 
-class Meter:
+class Meter(Proxy):
     """A backend that forwards every call to another one, counts bytes, sums seconds and records launches.
 
-    Pass it to a model as ``backend=``. Seconds and launches are recorded between :meth:`start` and :meth:`stop` only.
+    Pass it to a model as ``backend=``. Seconds and launches are recorded between :meth:`begin` and :meth:`end` only.
     """
 
     def __init__(self, backend: Backend) -> None:
-        self._backend = backend
+        super().__init__(backend)
         self._held: list[Any] = []
         self._bytes: list[int] = []
         self.peak = 0
         self._on = False
         self.seconds = {"upload": 0.0, "launch": 0.0, "download": 0.0}
         self.launches: list[Callable[[], None]] = []
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._backend, name)
-
-    def mark(self) -> object | None:
-        """See Gathering.mark; None while the meter measures, so that no launch is replayed unseen."""
-        return None if self._on else getattr(self._backend, "mark", lambda: None)()
 
     @property
     def live(self) -> int:
@@ -120,11 +113,16 @@ class Meter:
         if self._on:
             self.seconds["launch"] += time.perf_counter() - begin
 
-    def start(self) -> None:
+    @property
+    def gathers(self) -> bool:
+        """See Backend.gathers; False while the meter measures, so that it sees every copy and launch."""
+        return not self._on and super().gathers
+
+    def begin(self) -> None:
         """Start to record seconds and launches."""
         self._on = True
 
-    def stop(self) -> None:
+    def end(self) -> None:
         """Stop recording."""
         self._on = False
 
@@ -249,9 +247,9 @@ def _seconds(run: Callable[[], object]) -> float:
 
 def _apart(meter: Meter, runner: Runner, poses: np.ndarray, repeats: int) -> dict[str, Any]:
     """Time the transfers of one call, and its launches alone with all arrays on the device."""
-    meter.start()
+    meter.begin()
     runner.run(poses)
-    meter.stop()
+    meter.end()
     launches, backend = meter.launches, meter._backend
 
     def launch() -> None:

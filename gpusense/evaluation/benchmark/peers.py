@@ -1,8 +1,8 @@
 """Load outside candidates: other implementations, measured in the same run.
 
-A Python file outside the package defines them: ``bench/baselines.py`` of a checkout, or a file that the user names. Its
-function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set; their ``make`` is
-called with the scene, None and the candidate's precision.
+A Python file outside the package defines them: ``bench/speed/baselines.py`` of a checkout, or a file that the user
+names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set; their
+``make`` is called with the scene, None and the candidate's precision.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import gpusense
 from gpusense._util.checks import existing_file
 from gpusense.evaluation.benchmark.candidates import PROBLEMS, Candidate
 
-FILE = "bench/baselines.py"
+FILE = "bench/speed/baselines.py"
 _MODULE = "gpusense_bench_peers"
 
 

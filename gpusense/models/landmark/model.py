@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, cast
@@ -12,9 +13,9 @@ from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.lanes import widened
+from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.terms import log_weight
-from gpusense.models.cloud import Cloud, Placed
 from gpusense.models.landmark.features import (
     PreparedFeatures,
     check_correspondence,
@@ -25,10 +26,11 @@ from gpusense.models.landmark.features import (
 )
 from gpusense.models.landmark.plan import feature_omissions, looked_at, parameter_omissions
 from gpusense.models.landmark.tables import upload_tables
-from gpusense.models.point.base import Part, PointModel
+from gpusense.models.point.base import PointModel
+from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
 from gpusense.world.landmarks import LandmarkMap, make_buckets
 from gpusense.world.parameters import LandmarkParameters
-from gpusense.world.windows import Region
+from gpusense.world.windows import Window
 
 # Limits of the joint association: 2^features sets, and every landmark is tried with each of them.
 JOINT_FEATURES = 8
@@ -219,13 +221,14 @@ class LandmarkModel(PointModel):
         nobody = np.empty((0, len(full)))
         pieces = {-1: (nobody.astype(_INT), nobody.astype(self._real))}
 
-        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
-            chosen, parts = self._launch_all(call, cloud, part, result)
+        def after(part: Part) -> None:
             if each:
-                pieces[part[0]] = self._download(call, part[1] - part[0], len(full), chosen, parts)
+                pieces[part[0]] = self._download(call, part[1] - part[0], len(full))
 
         items, itemsize = self._cost(call, known)
-        log_p = self._score(poses, out, launch, left_out, items=items, itemsize=itemsize)
+        log_p = self._score(
+            poses, out, functools.partial(self._program, call), left_out, items=items, itemsize=itemsize, after=after
+        )
         which, added = zip(*(pieces[first] for first in sorted(pieces)), strict=True)
         return log_p, np.concatenate(which), np.concatenate(added)
 
@@ -240,70 +243,70 @@ class LandmarkModel(PointModel):
         work = min(work, 1e9)
         return math.ceil(work), self._real.itemsize * kept / work
 
-    def _launch_all(self, call: _Call, cloud: Cloud, part: Part, result: Buffer) -> tuple[Buffer, Buffer]:
-        """Start to score some particles into a buffer; places of landmarks and what features add, where wanted."""
-        space, backend, real = self._workspace, self._backend, self._real
-        count, features = part[1] - part[0], call.count
-        given = cloud.given(backend, space, part)
-        frame = (Region(0, 0, *self._buckets.shape), self._buckets, self.mount)
-        placed = cloud.place(backend, space, given, part, frame, real, careful=True)
-        numbers = call.prepared.numbers
-        feature = space.upload("feature", np.resize(numbers, (max(features, 1), numbers.shape[1])))
-        size = count * features if "PER_BEAM" in call.flags else 1
-        parts, chosen = space.empty("parts", size, real), space.empty("which", size, _INT)
-        start = self._launch_joint if call.joint else self._launch_each
-        start(call, cloud, placed, feature, (result, parts, chosen), (count, features))
-        if self.negative:
-            self._launch_unseen(placed, chosen, result, (count, features))
-        return chosen, parts
+    def _program(self, call: _Call, poses: Poses, part: Part, log_p: Buffer) -> Program:
+        """Return the launches that score some poses into a buffer."""
+        space, real, features = self._workspace, self._real, call.count
+        frame = Frame(Window(0, 0, *self._buckets.shape), self._buckets, self.mount)
+        placed = place(poses, part, frame, self._backend, space, real, careful=True)
+        numbers, count = call.prepared.numbers, placed.count
+        result = self._results(call, count)
+        common = dict(
+            landmark=self._tables.landmark, signature=self._tables.signature, pose_cell=placed.cell, pose=placed.pose,
+            pose_low=placed.low, terms=self._tables.terms, arcs=self._tables.arcs, log_p=log_p, **result,
+            feature=space.upload("feature", np.resize(numbers, (max(features, 1), numbers.shape[1]))),
+            landmarks=len(self.landmarks), particles=count, features=features, size=self._buckets.resolution,
+            fixed=call.fixed, temperature=self.temperature,
+        )  # fmt: skip
+        score = (self._joint_launch if call.joint else self._each_launch)(call, common)
+        unseen = (self._unseen_launch(placed, result["which"], log_p, features),) if self.negative else ()
+        return (*placed.launches(), score, *unseen)
 
-    def _download(
-        self, call: _Call, count: int, given: int, chosen: Buffer, parts: Buffer
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(n, F) landmarks in the map and what features add; -1 and 0 for those that are not evaluated."""
-        which, added = np.full((count, given), -1, _INT), np.zeros((count, given), self._real)
+    def _results(self, call: _Call, count: int) -> dict[str, Buffer]:
+        """Return the buffers of the log-likelihoods of features, and of their landmarks."""
+        size = count * call.count if "PER_BEAM" in call.flags else 1
+        space = self._workspace
+        return dict(parts=space.empty("parts", size, self._real), which=space.empty("which", size, _INT))
+
+    def _download(self, call: _Call, count: int, features: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n, F) landmarks in the map and log-likelihoods; -1 and 0 for features that are not evaluated."""
+        which, added = np.full((count, features), -1, _INT), np.zeros((count, features), self._real)
         if call.count:
-            place = self._backend.download(chosen, np.empty((count, call.count), _INT))
+            result = self._results(call, count)
+            place = self._backend.download(result["which"], np.empty((count, call.count), _INT))
             index = self._buckets.index[place] if len(self.landmarks) else -1
             which[:, call.prepared.columns] = np.where(place >= 0, index, -1)
-            added[:, call.prepared.columns] = self._backend.download(parts, np.empty((count, call.count), self._real))
+            parts = self._backend.download(result["parts"], np.empty((count, call.count), self._real))
+            added[:, call.prepared.columns] = parts
         return which, added
 
-    def _launch_each(
-        self, call: _Call, cloud: Cloud, placed: Placed, feature: Buffer, outputs: tuple[Buffer, Buffer, Buffer],
-        counts: tuple[int, int],
-    ) -> None:  # fmt: skip
-        t, b, landmarks = self._tables, self._buckets, len(self.landmarks)
+    def _each_launch(self, call: _Call, common: dict[str, Any]) -> Launch:
+        """Return the launch in which every feature chooses its landmark, or sums over them, by itself."""
+        landmarks, (rows, cols) = len(self.landmarks), self._buckets.shape
         prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
         partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
-        self._launch(
-            "score_features", widened(self._backend.info.lanes, "score_features", call.flags), cloud, counts[0],
-            t.landmark, t.signature, t.start, placed.cell, placed.pose, placed.low, feature, partner, t.terms, t.arcs,
-            *outputs, *b.shape, landmarks, *counts, b.resolution, prior, call.fixed,
+        flags = widened(self._backend.info.lanes, "score_features", call.flags)
+        return launch(
+            "score_features", flags, (common["particles"],), **common, start=self._tables.start, partner=partner,
+            rows=rows, cols=cols, share=prior,
         )  # fmt: skip
 
-    def _launch_joint(
-        self, call: _Call, cloud: Cloud, placed: Placed, feature: Buffer, outputs: tuple[Buffer, Buffer, Buffer],
-        counts: tuple[int, int],
-    ) -> None:  # fmt: skip
-        t, b, space = self._tables, self._buckets, self._workspace
-        sets = 1 << counts[1]
-        scratch = (
-            space.empty("best", counts[0] * sets, self._real),
-            space.empty("choice", counts[0] * sets * counts[1], _INT),
-            space.empty("value", counts[0] * sets * counts[1], self._real),
-        )
-        self._launch(
-            "joint_features", call.flags, cloud, counts[0], t.landmark, t.signature, placed.cell, placed.pose,
-            placed.low, feature, t.terms, t.arcs, *scratch, *outputs, len(self.landmarks), *counts, sets, b.resolution,
-            call.fixed,
+    def _joint_launch(self, call: _Call, common: dict[str, Any]) -> Launch:
+        """Return the launch that finds the likeliest joint assignment."""
+        space, sets, count = self._workspace, 1 << call.count, common["particles"]
+        return launch(
+            "joint_features", call.flags, (count,), **common, best=space.empty("best", count * sets, self._real),
+            choice=space.empty("choice", count * sets * call.count, _INT),
+            value=space.empty("value", count * sets * call.count, self._real), sets=sets,
         )  # fmt: skip
 
-    def _launch_unseen(self, placed: Placed, chosen: Buffer, result: Buffer, counts: tuple[int, int]) -> None:
-        p, t, b = self.parameters, self._tables, self._buckets
-        least = -2.0 if full_circle(p) else math.cos(p.field_of_view / 2)
-        log_missed = self.temperature * log_weight(1 - p.p_detect)
-        self._backend.compile("count_unseen", self._flags)(
-            (counts[0],), t.landmark, t.start, placed.cell, placed.pose, placed.low, chosen, result, *b.shape,
-            *counts, b.resolution, p.range_max, math.cos(self.mount[2]), math.sin(self.mount[2]), least, log_missed,
+    def _unseen_launch(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Launch:
+        """Return the launch that adds the landmarks in view that no feature is."""
+        p, (rows, cols) = self.parameters, self._buckets.shape
+        return launch(
+            "count_unseen", self._flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
+            pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p, rows=rows,
+            cols=cols, particles=placed.count, features=features, size=self._buckets.resolution, range_max=p.range_max,
+            axis_cosine=math.cos(self.mount[2]), axis_sine=math.sin(self.mount[2]),
+            least=-2.0 if full_circle(p) else math.cos(p.field_of_view / 2),
+            log_missed=self.temperature * log_weight(1 - p.p_detect),
         )  # fmt: skip

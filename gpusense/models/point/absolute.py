@@ -11,11 +11,12 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.terms import log_weight
-from gpusense.models.cloud import Cloud
-from gpusense.models.point.base import MISSING, Part, PointModel, rand_omission, relative_omissions
+from gpusense.models.point.base import MISSING, PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.models.poses import Part, Poses
 from gpusense.reference.absolute import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
@@ -93,12 +94,19 @@ class PositionModel(PointModel):
         flags = self._flags if impossible else self._flags | {"RAND"}
         left_out = [rand_omission("the fix is outside the region")] if impossible and self.parameters.z_rand else []
 
-        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
-            place = self._relative(cloud, part, "place_relative", (x, y, *self.parameters.mount))
-            numbers, count = self._workspace.upload("terms", terms), part[1] - part[0]
-            self._launch("score_position", flags, cloud, count, place, numbers, result, count)
+        mount_x, mount_y = self.parameters.mount
 
-        return cast(np.ndarray, self._score(poses, out, launch, left_out))
+        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
+            fix = dict(origin_x=x, origin_y=y, mount_x=mount_x, mount_y=mount_y)
+            place, placing = self._relative(some, part, "place_relative", fix)
+            count = part[1] - part[0]
+            score = launch(
+                "score_position", flags, (count,), place=place, terms=self._workspace.upload("terms", terms),
+                log_p=log_p, particles=count, temperature=self.temperature,
+            )  # fmt: skip
+            return (*placing, score)
+
+        return cast(np.ndarray, self._score(poses, out, program, left_out))
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
@@ -183,15 +191,18 @@ class HeadingModel(PointModel):
         zero = np.zeros(1)
         turned = wrapped_difference(np.array([self.parameters.offset]), (zero, zero))
         high, low = wrapped_difference(np.array([reading]), turned)
-        target = float(high[0]), float(low[0])
+        target = dict(target=float(high[0]), target_low=float(low[0]))
 
-        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
-            residual = self._relative(cloud, part, "wrap_headings", target)
+        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
+            residual, wrapping = self._relative(some, part, "wrap_headings", target)
             count = part[1] - part[0]
-            numbers = residual, self._terms_there
-            self._launch("score_heading", self._flags, cloud, count, *numbers, result, count, self._kind)
+            score = launch(
+                "score_heading", self._flags, (count,), residual=residual, terms=self._terms_there, log_p=log_p,
+                particles=count, kind=self._kind, temperature=self.temperature,
+            )  # fmt: skip
+            return (*wrapping, score)
 
-        return cast(np.ndarray, self._score(poses, out, launch, []))
+        return cast(np.ndarray, self._score(poses, out, program, []))
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters

@@ -13,15 +13,16 @@ from gpusense._util import checks
 from gpusense.backends import BackendInfo, Selection, arrays, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.models.arguments import real_dtype
-from gpusense.models.chunks import chunk_of, in_chunks
-from gpusense.models.cloud import Cloud, finish
+from gpusense.models.poses import Part, Poses, pose_status
+from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.reference import relative
 
-Part = tuple[int, int]
-Launch = Callable[[Cloud, Part, Buffer], None]
-_INT = np.dtype(np.int32)
+Programmer = Callable[[Poses, Part, Buffer], Program]
+"""Makes the program that writes log p of some poses into a buffer."""
+ORIGIN = dict(origin_x=0.0, origin_y=0.0, mount_x=0.0, mount_y=0.0)
 MISSING = Omission("reading", "it is not finite, so it is missing", "everything but a look at the poses")
 
 
@@ -100,73 +101,76 @@ class PointModel(ABC):
         self,
         poses: object,
         out: object,
-        launch: Launch | None,
+        program: Programmer | None,
         left_out: list[Omission],
         *,
         items: int = 1,
         itemsize: float = 0,
+        after: Callable[[Part], None] = lambda part: None,
     ) -> Any:
-        """log p of each pose by launches over parts of them; 0 without a launch.
+        """Return log p of each pose by programs over parts of them; 0 without a program.
 
         Args:
             poses: (N, 3) poses.
             out: Where the result is to be, or None.
-            launch: Starts to write log p of some poses of a cloud into a buffer.
+            program: Makes the program that writes log p of some poses into a buffer.
             left_out: What these readings do not need.
-            items: What each pose costs, in readings of a scan.
+            items: Cost of each pose, in readings of a scan.
             itemsize: Bytes that are kept for each pose and item.
+            after: Called with each part once its program is started.
 
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers, or an unfit place for the result.
         """
-        backend, space = self._backend, self._workspace
-        cloud = Cloud(poses, backend)
-        flat = arrays.check_out(out, (cloud.count,), self._real, poses, backend)
+        backend, space, real = self._backend, self._workspace, self._real
+        checked = Poses(poses, backend)
+        count, on_device = checked.count, checked.on_device
+        flat = arrays.check_out(out, (count,), real, poses, backend)
         if flat is None:
-            flat = (
-                arrays.blank(backend, cloud.count, self._real) if cloud.on_device else np.empty(cloud.count, self._real)
-            )
+            flat = arrays.blank(backend, count, real) if on_device else np.empty(count, real)
 
-        def run(begin: int, end: int) -> None:
-            if launch is None and not cloud.on_device:
-                return
-            with space.result("log_p", flat, begin, end - begin, self._real) as result:
-                if launch is None:
+        def score(piece: Piece) -> None:
+            with space.result("log_p", flat, piece.begin, piece.count, real) as result:
+                if program is None:
                     # Nothing is measured, but poses that are not finite are refused as ever.
-                    self._relative(cloud, (begin, end), "place_relative", (0.0,) * 4)
-                    backend.upload(np.zeros(end - begin, self._real), result)
+                    _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)
+                    backend.run(launches)
+                    backend.upload(np.zeros(piece.count, real), result)
                 else:
-                    launch(cloud, (begin, end), result)
+                    made = program(checked, piece.part, result)
+                    self._last_code = flags_of(made)
+                    backend.run(made)
+            after(piece.part)
 
         with self._lock, space:
             self._last_code, self._last_left_out = None, left_out
-            if launch is None and not cloud.on_device:
+            if program is None and not on_device:
                 flat[:] = 0
-            in_chunks(cloud.count, chunk_of(backend, max(items, 1), itemsize), space, run)
-            finish(space, cloud.on_device)
+            else:
+                run_pieces(space, Piece(0, count, count), chunk_of(backend, max(items, 1), itemsize), score)
+            finish(space, on_device)
         if out is not None:
             return out
-        if cloud.on_device:
-            return arrays.lent(poses, backend, flat, (cloud.count,), self._real)
-        return arrays.like(poses, flat)
+        return arrays.lent(poses, backend, flat, (count,), real) if on_device else arrays.like(poses, flat)
 
-    def _launch(self, kernel: str, flags: frozenset[str], cloud: Cloud, count: int, *arguments: Any) -> None:
-        """Start a kernel with a work-item for each of ``count`` particles, whose last argument is the temperature."""
-        self._last_code = flags | cloud.headings()
-        self._backend.compile(kernel, flags)((count,), *arguments, self.temperature)
+    def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
+        """Return the places or residuals of some poses, and the launch of the file ``relative`` that finds them.
 
-    def _relative(self, cloud: Cloud, part: Part, kernel: str, scalars: tuple[float, ...]) -> Buffer:
-        """Places or residuals of some poses, as a kernel of the file ``relative`` finds them."""
+        Args:
+            poses: The poses.
+            part: The first of them and the one after the last.
+            kernel: ``"place_relative"`` or ``"wrap_headings"``.
+            numbers: The kernel's real numbers.
+        """
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
-        width = {"place_relative": 4, "wrap_headings": 2}[kernel]
-        given = cloud.given(backend, space, part)
-        if given is None:
-            assert cloud.host is not None
-            found = np.empty((count, width), self._real)
+        name, width = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}[kernel]
+        source = poses.buffer(backend, space, part)
+        if source is None:
+            assert poses.host is not None
+            placed = np.empty((count, width), self._real)
             body = getattr(relative, kernel)
-            body(frozenset(), cloud.host[slice(*part)], found, np.zeros(2, _INT), *scalars, count)
-            return space.upload(kernel, found)
-        found_there = space.empty(kernel, width * count, self._real)
-        verdict = space.empty("verdict", 2, _INT, zero=True)
-        backend.compile(kernel, self._flags | cloud.code())((count,), given, found_there, verdict, *scalars, count)
-        return found_there
+            body(frozenset(), poses.host[slice(*part)], placed, np.zeros(2, np.int32), *numbers.values(), count)
+            return space.upload(kernel, placed), ()
+        result = space.empty(kernel, width * count, self._real)
+        arguments = {"poses": source, name: result, "verdict": pose_status(space), "particles": count}
+        return result, (launch(kernel, self._flags | poses.flags, (count,), **arguments, **numbers),)

@@ -11,11 +11,12 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.terms import log_weight
-from gpusense.models.cloud import Cloud
-from gpusense.models.point.base import Part, PointModel, rand_omission, relative_omissions
+from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.models.poses import Part, Poses
 from gpusense.reference.beacons import BEACON, NORMAL, STUDENT_T, TERMS, TWO_NORMALS
 from gpusense.reference.relative import FARTHEST
 from gpusense.world.sensor_parameters import BeaconParameters
@@ -90,15 +91,21 @@ class BeaconModel(PointModel):
         if count == 0:
             return cast(np.ndarray, self._score(poses, out, None, left_out))
 
-        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
-            place = self._relative(cloud, part, "place_relative", (*self._origin, *self.parameters.mount))
-            numbers, particles = self._workspace.upload("beacon", beacon), part[1] - part[0]
-            self._launch(
-                "score_beacons", self._flags, cloud, particles, place, numbers, self._terms_there, self._series_there,
-                result, particles, count, self._count, self._kind,
-            )  # fmt: skip
+        (origin_x, origin_y), (mount_x, mount_y) = self._origin, self.parameters.mount
 
-        return cast(np.ndarray, self._score(poses, out, launch, left_out, items=count))
+        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
+            middle = dict(origin_x=origin_x, origin_y=origin_y, mount_x=mount_x, mount_y=mount_y)
+            place, placing = self._relative(some, part, "place_relative", middle)
+            particles = part[1] - part[0]
+            score = launch(
+                "score_beacons", self._flags, (particles,), place=place,
+                beacon=self._workspace.upload("beacon", beacon), terms=self._terms_there, series=self._series_there,
+                log_p=log_p, particles=particles, beacons=count, count=self._count, kind=self._kind,
+                temperature=self.temperature,
+            )  # fmt: skip
+            return (*placing, score)
+
+        return cast(np.ndarray, self._score(poses, out, program, left_out, items=count))
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters

@@ -11,10 +11,11 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
-from gpusense.models.cloud import Cloud
-from gpusense.models.point.base import Part, PointModel
+from gpusense.models.point.base import PointModel
 from gpusense.models.point.pairs import DIGITS, exact, two_parts
+from gpusense.models.poses import Frame, Part, Poses, place
 from gpusense.reference.end_point import FIELD_RING
 from gpusense.tables.distances import squared_distances
 from gpusense.world.frames import split
@@ -131,17 +132,19 @@ class BumperModel(PointModel):
         flags = self._flags | (frozenset({"CAREFUL"}) if self._real == np.float32 else frozenset())
         region, space = self._region, self._workspace
 
-        def launch(cloud: Cloud, part: Part, result: Buffer) -> None:
-            given, count = cloud.given(self._backend, space, part), part[1] - part[0]
-            frame = (region, self.grid, (0.0, 0.0, 0.0))
-            placed = cloud.place(self._backend, space, given, part, frame, self._real, careful="CAREFUL" in flags)
-            self._launch(
-                "score_contact", flags, cloud, count, self._table, placed.cell, placed.pose, placed.low, *points,
-                space.upload("start", start), space.upload("pressed", own), self._terms_there, result, region.rows,
-                region.cols, count, len(own), self._guard,
+        def program(some: Poses, part: Part, log_p: Buffer) -> Program:
+            frame, careful = Frame(region, self.grid, (0.0, 0.0, 0.0)), "CAREFUL" in flags
+            placed = place(some, part, frame, self._backend, space, self._real, careful=careful)
+            score = launch(
+                "score_contact", flags, (placed.count,), table=self._table, pose_cell=placed.cell, pose=placed.pose,
+                pose_low=placed.low, point=points[0], point_low=points[1], start=space.upload("start", start),
+                pressed=space.upload("pressed", own), terms=self._terms_there, log_p=log_p, rows=region.rows,
+                cols=region.cols, particles=placed.count, segments=len(own), guard=self._guard,
+                temperature=self.temperature,
             )  # fmt: skip
+            return (*placed.launches(), score)
 
-        return cast(np.ndarray, self._score(poses, out, launch, left_out, items=int(kept.sum())))
+        return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
 
     def _describe(self) -> tuple[str, list[Omission]]:
         found = []

@@ -1,27 +1,26 @@
-"""``bind`` of a model: which way a bound call goes, and the ways of arrays in host memory.
+"""``bind`` of a model: the choice among bound calls, and those of arrays in host memory.
 
-A call that waits is the ordinary one, but for NumPy arrays of few particles on a GPU: they are copied to the device and
-the launches of ``bound.DeviceCall`` follow, so that readings are classed there and nothing is looked at on the host.
-With CUDA copies and launches are one graph.
+A call that waits is the ordinary one, except for NumPy arrays of few particles on a GPU. They are copied to the device,
+and the recording of ``bound.DeviceCall`` follows: the device classes the readings, and the host inspects nothing. With
+CUDA copies and launches are one graph.
 """
 
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING, Any, cast
+from collections.abc import Callable
+from typing import Any, cast
 
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import arrays
+from gpusense.backends import Backend, arrays
 from gpusense.backends.workspace import Workspace
-from gpusense.models.cloud import LEAST_ORDERED
 from gpusense.models.scan.bound import BoundCall, DeviceCall
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.tiles import LEAST_ORDERED
 
-if TYPE_CHECKING:
-    from gpusense.models.scan.model import ScanModel
-
-# Cells of a map whose table is made as a whole for them.
+# Cells of a map whose table is made as a whole for a short call.
 _MOST_CELLS = 1 << 22
 # Bytes of what is copied with the launches; more is copied in the ordinary way.
 _LARGEST = 256 << 10
@@ -30,22 +29,33 @@ _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 _ALIGNED = 1024
 
 
-def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
-    """See ``ScanModel.bind``."""
-    for name, given in (("poses", poses), ("ranges", ranges)):
-        if not (isinstance(given, np.ndarray) or hasattr(given, "__dlpack__") or arrays.on_device(given)):
-            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(given)}")
-        if type(given).__module__.startswith("jax"):
+def bind(
+    pipeline: ScanPipeline, lock: threading.Lock, score: Callable[..., Any], poses: Any, ranges: Any, out: Any
+) -> BoundCall:
+    """Bind arrays; see ``ScanModel.bind``.
+
+    Args:
+        pipeline: The stages of the model.
+        lock: Held while the model's buffers are in use.
+        score: ``log_likelihood`` of the model.
+        poses: (N, 3) poses.
+        ranges: (K,) readings.
+        out: Where log-likelihoods go, or None.
+    """
+    for name, array in (("poses", poses), ("ranges", ranges)):
+        if not (isinstance(array, np.ndarray) or hasattr(array, "__dlpack__") or arrays.on_device(array)):
+            raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(array)}")
+        if type(array).__module__.startswith("jax"):
             raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
-    there = arrays.on_device(poses) and arrays.on_device(ranges)
-    # Readings as other programs see them are made on the host, and poses are placed there where float64 is missing. On
-    # processors, scans prepared on the host are scored by kernels in vectors.
-    if there and model.compat is None and model.device.float64 and model.device.kind == "gpu":
-        return DeviceCall(model, poses, ranges, out)
-    host = _HostCall(model, poses, ranges, out)
-    if model.compat is None and host.is_short():
+    info, likelihood = pipeline.backend.info, pipeline.setting.peer is None
+    # The host classes readings for other programs' weights, and places poses where float64 is missing. Processors score
+    # scans that the host prepares by kernels in vectors.
+    if arrays.on_device(poses) and arrays.on_device(ranges) and likelihood and info.float64 and info.kind == "gpu":
+        return DeviceCall(pipeline, lock, poses, ranges, out)
+    host = _HostCall(pipeline, score, poses, ranges, out)
+    if likelihood and host.is_short():
         try:
-            return _StagedCall(host)
+            return _StagedCall(host, lock)
         except MemoryError:
             # The ordinary call needs but a part of the map's table.
             pass
@@ -53,12 +63,12 @@ def bind(model: ScanModel, poses: Any, ranges: Any, out: Any) -> BoundCall:
 
 
 class _HostCall(BoundCall):
-    """The ordinary way."""
+    """An ordinary call of ``log_likelihood``."""
 
     waits = True
 
-    def __init__(self, model: ScanModel, poses: Any, ranges: Any, out: Any) -> None:
-        backend, beams = model._backend, model.scanner.count
+    def __init__(self, pipeline: ScanPipeline, score: Callable[..., Any], poses: Any, ranges: Any, out: Any) -> None:
+        backend, real, beams = pipeline.backend, pipeline.real, pipeline.scanner.count
         if arrays.on_device(poses):
             count = arrays.adopt_poses(poses, backend, "poses")[1]
         else:
@@ -67,32 +77,32 @@ class _HostCall(BoundCall):
             arrays.adopt_readings(ranges, backend, beams, in_place=False)
         else:
             _shape_of("ranges", ranges, (beams,))
-        arrays.check_out(out, (count,), model._real, poses, backend)
+        arrays.check_out(out, (count,), real, poses, backend)
         if out is None and arrays.on_device(poses):
-            out = arrays.lent(poses, backend, arrays.blank(backend, count, model._real), (count,), model._real)
+            out = arrays.lent(poses, backend, arrays.blank(backend, count, real), (count,), real)
         elif out is None:
-            out = arrays.like(poses, np.empty(count, model._real))
-        self.out, self._model, self._given = out, model, (poses, ranges)
+            out = arrays.like(poses, np.empty(count, real))
+        self.out, self.pipeline, self.arrays, self._score = out, pipeline, (poses, ranges), score
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""
         if stream is not None:
             raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
-        return self._model.log_likelihood(*self._given, out=self.out)
+        return self._score(*self.arrays, out=self.out)
 
     def check(self) -> None:
         """See BoundCall.check."""
 
     def is_short(self) -> bool:
-        """Whether arrays are NumPy's, all is small, and the device gains by starting launches that it knows."""
-        backend = self._model._backend
-        if not getattr(backend, "stages", False) or not backend.info.float64:
+        """Return whether arrays are NumPy's, all is small, and the device gains by a recording."""
+        backend = self.pipeline.backend
+        if not backend.replays or not backend.info.float64:
             return False
-        poses, ranges = self._given
-        given, reals = (poses, ranges, self.out), (np.float32, np.float64)
-        short = all(type(a) is np.ndarray and a.dtype in reals for a in given)
+        poses, ranges = self.arrays
+        short = all(type(a) is np.ndarray and a.dtype in (np.float32, np.float64) for a in (poses, ranges, self.out))
         short = short and _DOUBLE.itemsize * (poses.size + ranges.size) <= _LARGEST
-        return short and self._model.grid.cells.size <= _MOST_CELLS and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
+        small = self.pipeline.grid.cells.size <= _MOST_CELLS
+        return short and small and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
 
 
 class _Pack:
@@ -105,7 +115,7 @@ class _Pack:
         parts: The arrays on the device.
     """
 
-    def __init__(self, backend: Any, dtype: np.dtype, *arrays: tuple[int, np.dtype]) -> None:
+    def __init__(self, backend: Backend, dtype: np.dtype, *arrays: tuple[int, np.dtype]) -> None:
         begins, size = [], 0
         for count, own in arrays:
             begins.append(size)
@@ -120,7 +130,7 @@ class _Pack:
 
 
 class _StagedCall(BoundCall):
-    """A call of few particles: what it is given goes to the device as one array, and what it finds comes back as one.
+    """A call of few particles: inputs go to the device as one array, and results come back as one.
 
     A copy of few numbers takes as long as a launch. Poses and readings are float64 on the device, which keeps float32
     as it is; limits of readings are rounded to the readings' own precision, as on the host.
@@ -128,18 +138,18 @@ class _StagedCall(BoundCall):
 
     waits = True
 
-    def __init__(self, host: _HostCall) -> None:
-        self._host, self.out, (self._poses, self._ranges) = host, host.out, host._given
-        model = host._model
-        self._backend = backend = cast(Any, model._backend)
-        count, readings = len(self._poses), len(self._ranges)
+    def __init__(self, host: _HostCall, lock: threading.Lock) -> None:
+        self._host, self.out, (self._poses, self._ranges) = host, host.out, host.arrays
+        pipeline = host.pipeline
+        self._backend = backend = pipeline.backend
+        count, readings, real = len(self._poses), len(self._ranges), pipeline.real
         self._inputs = _Pack(backend, _DOUBLE, (3 * count, _DOUBLE), (readings, _DOUBLE))
-        self._outputs = _Pack(backend, model._real, (count, model._real), (2, _INT))
+        self._outputs = _Pack(backend, real, (count, real), (2, _INT))
         poses, ranges = self._inputs.parts
-        found, verdict = self._outputs.parts
+        log_p, status = self._outputs.parts
         self._device = DeviceCall(
-            model, backend.lend(poses, (count, 3), _DOUBLE), backend.lend(ranges, (readings,), _DOUBLE),
-            backend.lend(found, (count,), model._real), verdict, self._ranges.dtype,
+            pipeline, lock, backend.lend(poses, (count, 3), _DOUBLE), backend.lend(ranges, (readings,), _DOUBLE),
+            backend.lend(log_p, (count,), real), status, self._ranges.dtype,
         )  # fmt: skip
         self._space, self._lock = Workspace(backend), threading.Lock()
 
@@ -147,39 +157,35 @@ class _StagedCall(BoundCall):
         """See BoundCall.__call__."""
         if stream is not None:
             return self._host(stream)
-        backend, given, outputs = self._backend, self._inputs, self._outputs
-        (poses, ranges), (found, verdict) = given.views, outputs.views
+        backend, inputs, outputs = self._backend, self._inputs, self._outputs
+        (poses, ranges), (log_p, status) = inputs.views, outputs.views
         with self._lock:
             poses.reshape(self._poses.shape)[...] = self._poses
             ranges[...] = self._ranges
             try:
                 with self._space:
-                    backend.upload(given.host, given.there, wait=False)
+                    backend.upload(inputs.host, inputs.there, wait=False)
                     self._device.begin()
-                    backend.download(outputs.there, outputs.host, wait=not self._gathers())
-                    if self._gathers():
+                    backend.download(outputs.there, outputs.host, wait=not backend.gathers)
+                    if backend.gathers:
                         backend.synchronize()
             except MemoryError:
                 # The whole table of a map that has changed; the ordinary call needs but a part of it.
                 return self._host()
-            if not verdict[0]:
-                self.out[...] = found
+            if not status[0]:
+                self.out[...] = log_p
                 return self.out
-            verdict[...] = 0
-            backend.upload(verdict, outputs.parts[1])
-        # It says which pose is not finite.
+            status[...] = 0
+            backend.upload(status, outputs.parts[1])
+        # Its message names the pose that is not finite.
         return self._host()
-
-    def _gathers(self) -> bool:
-        """Whether copies wait for others, to be done in one go."""
-        return hasattr(self._backend, "mark") and self._backend.mark() is not None
 
     def check(self) -> None:
         """See BoundCall.check."""
 
 
 def _shape_of(name: str, given: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
-    """The shape of an array in host memory; its numbers are looked at by each call."""
+    """Return the shape of an array in host memory; each call reads its numbers anew."""
     found = np.shape(cast(Any, arrays.to_host(given, name)))
     if len(found) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, found, strict=True)):
         raise ValueError(f"{name}: shape must be {checks.shape_text(shape)}, got {checks.shape_text(found)}")

@@ -4,15 +4,87 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.sensor_table import SensorTable
 
 # Bins of a sensor's table along each axis: 268 MB in float32.
 _MOST_BINS = 8192
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """The mixture of a beam model as kernels take it.
+
+    Attributes:
+        flags: Flags of its components.
+        terms: Its numbers, for each bin of angles of incidence.
+        cosines: Cosines between these bins.
+        table: Log densities over readings and expected ranges; None where the mixture is evaluated.
+    """
+
+    flags: frozenset[str]
+    terms: np.ndarray
+    cosines: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    table: np.ndarray | None = None
+
+    @property
+    def bins(self) -> int:
+        """Bins of angles of incidence."""
+        return len(self.cosines)
+
+    @property
+    def cells(self) -> int:
+        """Bins of a range in the table; 0 without one."""
+        return 0 if self.table is None else len(self.table) - 1
+
+
+def mixture_on_device(
+    mixtures: Sequence[BeamParameters],
+    cosines: np.ndarray,
+    table: SensorTable | None,
+    range_max: float,
+    real: np.dtype,
+    *,
+    width: float | None,
+    compat: str | None,
+    specialize: bool,
+    max_depends: bool,
+) -> Mixture:
+    """Return a beam model's mixture as kernels take it.
+
+    Args:
+        mixtures: Parameters of each bin of angles of incidence.
+        cosines: Cosines between these bins.
+        table: The table of a sensor in place of a mixture, or None.
+        range_max: Longest range [m].
+        real: Precision.
+        width: Width of the bins in which the mixture is tabulated [m]; None evaluates it.
+        compat: The program whose weights are computed, or None.
+        specialize: False leaves nothing out.
+        max_depends: Whether the probability of a max reading depends on the pose.
+
+    Raises:
+        ValueError: a number is beyond what the precision can hold.
+        TypeError, ValueError: a width that is no number, too small or more than range_max.
+    """
+    if compat is not None:
+        return Mixture(*peer_mixture(mixtures[0], range_max, real, amcl=compat == "amcl"), cosines)
+    flags, terms = mixture_of(mixtures, range_max, real, specialize=specialize, max_depends=max_depends)
+    if table is not None:
+        values = table.sensor_table(real)
+        # Sums of finite numbers need no check for impossible readings.
+        flags = frozenset({"SENSOR_TABLE", "LINEAR"} if np.isfinite(values).all() else {"SENSOR_TABLE"})
+        return Mixture(flags, terms, cosines, values)
+    if width is None:
+        return Mixture(flags, terms, cosines)
+    values = tabulated(mixtures[0], width, range_max, real)
+    return Mixture((flags & {"LINEAR"}) | {"SENSOR_TABLE"}, terms, cosines, values)
 
 
 def mixture_of(

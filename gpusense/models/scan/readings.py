@@ -1,248 +1,187 @@
-"""A scan on its way to a device: which readings depend on the pose, which rays they share, what is constant.
-
-Readings are classed first and thinned afterwards, so that ``beams=60`` means 60 informative beams.
-"""
+"""Readings of scans on the device, as kernels that score them take them."""
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from gpusense._util.checks import array, as_array, integer, show
-from gpusense.world.scanner import Reading, Scanner, classify
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.launches import Program, launch
+from gpusense.models.poses import PlacedPoses
+from gpusense.models.scan.classed import Beams
+from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
+from gpusense.world.scanner import Scanner
 
-Beams = int | Sequence[int] | np.ndarray | None
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Where each of S scans has its own among the readings of all.
-
-    Attributes:
-        start: (S + 1,) int32; rays of scan s are start[s] to start[s + 1] - 1.
-        counts: (S,) int32 readings that are evaluated of each scan.
-        constants: (S,) log-likelihoods of the readings that do not depend on the pose.
-    """
-
-    start: np.ndarray
-    counts: np.ndarray
-    constants: np.ndarray
-
-    @property
-    def start_readings(self) -> np.ndarray:
-        """(S + 1,) int32; readings of scan s are start_readings[s] to start_readings[s + 1] - 1."""
-        start = np.zeros(len(self.counts) + 1, np.int32)
-        np.cumsum(self.counts, out=start[1:])
-        return start
+_INT = np.dtype(np.int32)
+_NO_FLAGS = frozenset[str]()
+# The kernel places readings by whole groups of work-items, so that those of poses begin with a group.
+_GROUP = 64
 
 
 @dataclass(frozen=True)
-class PreparedScan:
-    """What a launch needs of a scan, or of several one after the other.
+class Readings:
+    """Readings of S scans on the device.
 
     Attributes:
-        columns: (M,) positions in the scan of the readings that are evaluated, in the order of their rays.
-        readings: (M,) their ranges in metres; NaN (missing) and inf (max) only where nothing is left out.
-        vectors: (M, 2) float64 cosine and sine of their bearings.
-        rays: (R, 2) the bearings that are cast.
-        first: (R + 1,) int32; readings of ray r are first[r] to first[r + 1] - 1.
-        constant: Log-likelihood of the readings that do not depend on the pose.
-        max_columns: Positions of max readings that are in the constant.
-        missing: Missing readings, left out.
-        ignored_max: Max readings that say nothing because z_max = 0, left out.
-        thinned: Informative readings left out by ``beams=``.
-        batch: Where several scans lie; the constant, the positions of max readings and the numbers of those left out
-            are then not filled in.
+        scans: S.
+        rays: Rays of the scan that has most.
+        readings: Readings of the scan that has most.
+        flags: Flags of kernels that score them.
+        arguments: Their arguments of scoring kernels, by name.
+        sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms.
+        key: Everything but buffers on which the launches depend.
+        reach: Longest range in cells, and a bound of its error; infinite where it is not known.
+        constants_there: Whether a constant term of a single scan is in ``fixed_of`` on the device.
+        placing: The launch that places them, where the device does.
     """
 
-    columns: np.ndarray
-    readings: np.ndarray
-    vectors: np.ndarray
-    rays: np.ndarray
-    first: np.ndarray
-    constant: float
-    max_columns: np.ndarray
-    missing: int
-    ignored_max: int
-    thinned: int
-    batch: Batch | None = None
+    scans: int
+    rays: int
+    readings: int
+    flags: frozenset[str]
+    arguments: dict[str, Any]
+    sums: dict[str, Any]
+    key: Hashable = None
+    reach: float = np.inf
+    constants_there: bool = False
+    placing: Placing | None = None
 
     @property
-    def shared(self) -> bool:
-        """Whether several readings share a ray."""
-        return len(self.rays) < len(self.readings)
-
-    @property
-    def most_readings(self) -> int:
-        """Readings of the scan, or of the one that has most."""
-        return len(self.readings) if self.batch is None else int(self.batch.counts.max(initial=0))
-
-    @property
-    def most_rays(self) -> int:
-        """Rays of the scan, or of the one that has most."""
-        return len(self.rays) if self.batch is None else int(np.diff(self.batch.start).max(initial=0))
+    def sum_flags(self) -> frozenset[str]:
+        """Flags of ``sum_parts``."""
+        return frozenset({"SCANS"}) if self.constants_there else _NO_FLAGS
 
 
-def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:
-    """Whether each reading is used: all, an even choice of ``beams`` informative ones, or those of given indices."""
-    informative = (kinds == Reading.HIT) | ((kinds == Reading.MAX) & informative_max)
-    if beams is None:
-        return informative
-    if isinstance(beams, (int, np.integer)):
-        places = np.flatnonzero(informative)
-        if len(places) <= beams:
-            return informative
-        chosen = np.zeros(len(kinds), bool)
-        chosen[places[(np.arange(beams) * len(places)) // max(int(beams), 1)]] = True
-        return chosen
-    chosen = np.zeros(len(kinds), bool)
-    chosen[np.asarray(beams, dtype=np.intp)] = True
-    return chosen & informative
+@dataclass(frozen=True)
+class Placing:
+    """Readings that the kernel ``place_inputs`` places, along with poses; see the kernel file ``scan``.
 
-
-def check_beams(beams: Beams, count: int) -> Beams:
-    """Validate ``beams=`` for a scanner of ``count`` beams.
-
-    Raises:
-        ValueError: a number below 0, or an index outside the scan.
-        TypeError: not an integer or a list of them.
+    Attributes:
+        flags: Flags of the kernel.
+        arguments: Its arguments that are not those of ``place_poses``.
     """
-    if beams is None:
-        return None
-    if isinstance(beams, (int, np.integer)):
-        return integer("beams", beams, low=0)
-    try:
-        indices = np.asarray(beams)
-    except ValueError:
-        indices = np.empty((0, 0))
-    if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
-        raise TypeError(f"beams: must be a number of beams or a list of beam indices, got {show(beams)}")
-    outside = (indices < 0) | (indices >= count)
-    if outside.any():
-        raise ValueError(f"beams: indices must be in [0, {count}), got {indices[outside][0]}")
-    return np.unique(indices)
+
+    flags: frozenset[str]
+    arguments: dict[str, Any]
 
 
-def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
-    """Readings of one scan (K,) or of several (S, K), in their own float dtype."""
-    given = as_array("ranges", ranges)
-    shape = ("S", scanner.count) if given.ndim == 2 else (scanner.count,)
-    return array("ranges", given, shape=shape, finite=False, dtype=None)
+@dataclass(frozen=True)
+class Sensing:
+    """How a model takes readings that are on the device.
+
+    Attributes:
+        scanner: The scanner's geometry.
+        beams: The beams that are used.
+        vectors: (K, C, 2) float64 cosines and sines of the rays of each beam.
+        z_max: Probability of a max reading.
+        end_points: Whether readings become end points.
+        max_depends: Whether the probability of a max reading depends on the pose.
+        possible: Whether some range is possible.
+        specialize: False leaves nothing out.
+        top: Largest range below a max reading.
+        guard_scale: Bound of the rounding errors of end points per cell of range.
+        real: Precision of the model.
+    """
+
+    scanner: Scanner
+    beams: Beams
+    vectors: np.ndarray = field(repr=False)
+    z_max: float
+    end_points: bool
+    max_depends: bool
+    possible: bool
+    specialize: bool
+    top: float
+    guard_scale: float
+    real: np.dtype
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Beams whose readings are looked at."""
+        every = np.arange(self.scanner.count)
+        if self.beams is None or isinstance(self.beams, (int, np.integer)):
+            return every
+        return every[np.asarray(self.beams, np.intp)]
+
+    @property
+    def places(self) -> int:
+        """Places of readings; those at the end may be missing (nan)."""
+        count = len(self.columns)
+        chosen = min(int(self.beams), count) if isinstance(self.beams, (int, np.integer)) else count
+        return chosen if self.specialize else count
+
+    @property
+    def max_readings(self) -> int:
+        """How max readings count: left out, in the constant term, or in a place."""
+        if self.z_max <= 0:
+            return MAX_LEFT_OUT
+        return MAX_PLACED if self.max_depends or not self.specialize else MAX_FIXED
+
+    @property
+    def constants_there(self) -> bool:
+        """Whether readings without a place may add a constant term."""
+        return self.max_readings == MAX_FIXED or not self.possible
+
+    def limits(self, dtype: np.dtype) -> tuple[float, float]:
+        """Return the least range, and the least max reading, of readings of a type."""
+        with np.errstate(over="ignore"):
+            nearest, farthest = dtype.type(self.scanner.range_min), dtype.type(self.scanner.range_max)
+        if self.scanner.range_min > 0:
+            # A reading of 0 is missing, even where the limit is rounded to 0.
+            nearest = max(nearest, np.finfo(dtype).smallest_subnormal)
+        return float(nearest), float(farthest)
 
 
-def prepare_scan(
-    ranges: np.ndarray,
-    scanner: Scanner,
-    vectors: np.ndarray,
-    z_max: float,
-    beams: Beams,
-    specialize: bool,
-    *,
-    max_is_range: bool = False,
-    max_depends: bool = False,
-    distinct: bool = False,
-) -> PreparedScan:
-    """Class, choose and group the readings of one scan.
+def device_readings(
+    sensing: Sensing, ranges: Buffer, dtype: np.dtype, limits: np.dtype, space: Workspace
+) -> tuple[Placing, dict[str, Buffer]]:
+    """Allocate places for readings that are on the device, and describe the launch that fills them.
 
     Args:
-        ranges: (K,) metres.
-        scanner: Its geometry.
-        vectors: (K, 2) float64 cosine and sine of the bearings, mount included.
-        z_max: Probability of a max reading; 0 makes it missing.
-        beams: Which beams are used.
-        specialize: False keeps readings without information, and casts equal bearings one by one.
-        max_is_range: Evaluate finite max readings like ranges, at range_max.
-        max_depends: The probability of a max reading depends on the pose, so such readings are evaluated too.
-        distinct: No two bearings are known to be the same.
+        sensing: How the model takes readings.
+        ranges: (K,) readings.
+        dtype: Their type.
+        limits: The type to which the scanner's limits are rounded.
+        space: Holds the places.
+
+    Returns:
+        The launch, and the buffers that it fills by name.
     """
-    if specialize and distinct and beams is None and not (max_is_range or max_depends):
-        return _plain_scan(ranges, scanner, vectors, z_max)
-    kinds = classify(ranges, scanner)
-    if max_is_range:
-        kinds[(kinds == Reading.MAX) & np.isfinite(ranges)] = Reading.HIT
-        ranges = np.minimum(ranges, scanner.range_max)
-    used = choose_beams(kinds, beams, z_max > 0)
-    is_max = used & (kinds == Reading.MAX)
-    hit = used & (kinds == Reading.HIT)
-    informative = int(np.count_nonzero((kinds == Reading.HIT) | ((kinds == Reading.MAX) & (z_max > 0))))
-    values = np.where(hit, ranges, np.nan).astype(np.float64)
-    values[is_max] = np.inf
-    if specialize and not max_depends:
-        columns = np.flatnonzero(hit)
-        constant = float(np.count_nonzero(is_max) * np.log(z_max)) if is_max.any() else 0.0
-    else:
-        columns = np.flatnonzero(hit | is_max) if specialize else np.arange(len(kinds))
-        constant = 0.0
-        is_max = np.zeros_like(is_max)
-    rays, first, order = _group(vectors[columns], specialize and not distinct)
-    return PreparedScan(
-        columns=columns[order],
-        readings=values[columns][order],
-        vectors=vectors[columns][order],
-        rays=rays,
-        first=first,
-        constant=constant,
-        max_columns=np.flatnonzero(is_max),
-        missing=int(np.count_nonzero(kinds == Reading.MISSING)),
-        ignored_max=0 if z_max > 0 else int(np.count_nonzero(kinds == Reading.MAX)),
-        thinned=informative - int(np.count_nonzero(used)),
+    real, places, columns = sensing.real, sensing.places, sensing.columns
+    each, end_points = sensing.vectors.shape[1], sensing.end_points
+    filled = dict(
+        point=space.empty("point", 2 * places * each, real),
+        point_low=space.empty("point_low", 2 * places if end_points else 2, real),
+        reading=space.empty("reading", 1 if end_points else places, real),
+        guard=space.empty("guard", -(-places // BLOCK_TERMS) if end_points else 1, real),
+        fixed=space.empty("fixed", 1, real),
     )
+    flags = {"END_POINTS"} if end_points else set()
+    flags |= {"FLOAT64"} if real == np.float64 else set()
+    flags |= set() if sensing.specialize else {"ALL_READINGS"}
+    flags |= {"RANGES_FLOAT32"} if dtype == np.float32 else set()
+    flags |= set() if np.array_equal(columns, np.arange(sensing.scanner.count)) else {"SOME_BEAMS"}
+    nearest, farthest = sensing.limits(limits)
+    chosen = min(int(sensing.beams), len(columns)) if isinstance(sensing.beams, (int, np.integer)) else len(columns)
+    kind = sensing.max_readings
+    arguments = dict(
+        filled, ranges=ranges, beam=space.upload("beam", columns.astype(_INT)),
+        vector=space.upload("vector", sensing.vectors[columns]), head=-(-max(len(columns), 1) // _GROUP) * _GROUP,
+        beams=len(columns), each=each, places=places, chosen=chosen, max_readings=kind, possible=int(sensing.possible),
+        nearest=nearest, farthest=farthest, log_max=float(np.log(sensing.z_max)) if kind == MAX_FIXED else 0.0,
+        top=sensing.top, guard_scale=sensing.guard_scale,
+    )  # fmt: skip
+    return Placing(frozenset(flags), arguments), filled
 
 
-@functools.lru_cache(maxsize=64)
-def _limits(range_min: float, range_max: float, dtype: np.dtype) -> tuple[np.floating, np.floating]:
-    """The scanner's limits as readings of a type compare with them."""
-    with np.errstate(over="ignore"):
-        return dtype.type(range_min), dtype.type(range_max)
-
-
-def hits_and_max(ranges: np.ndarray, scanner: Scanner) -> tuple[np.ndarray, np.ndarray]:
-    """Which readings of scans are ranges, and which are max readings."""
-    nearest, farthest = _limits(scanner.range_min, scanner.range_max, ranges.dtype)
-    hit: np.ndarray = ranges >= nearest
-    if nearest == 0 < scanner.range_min:
-        hit &= ranges > 0
-    hit &= ranges < farthest
-    return hit, ranges >= farthest
-
-
-def _plain_scan(ranges: np.ndarray, scanner: Scanner, vectors: np.ndarray, z_max: float) -> PreparedScan:
-    """``prepare_scan`` where all beams are used and none repeats another: what filters do at every step."""
-    hit, is_far = hits_and_max(ranges, scanner)
-    columns, count = hit.nonzero()[0], 0
-    far = columns[:0]
-    if len(columns) < len(ranges):
-        far = is_far.nonzero()[0]
-        count = len(far)
-        ranges, vectors = ranges[columns], vectors[columns]
-    return PreparedScan(
-        columns=columns,
-        readings=ranges.astype(np.float64),
-        vectors=vectors,
-        rays=vectors,
-        first=np.arange(len(columns) + 1, dtype=np.int32),
-        constant=float(count * np.log(z_max)) if count and z_max > 0 else 0.0,
-        max_columns=far if z_max > 0 else columns[:0],
-        missing=scanner.count - len(columns) - count,
-        ignored_max=0 if z_max > 0 else count,
-        thinned=0,
-    )
-
-
-def _group(vectors: np.ndarray, share: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays without repetition, the readings of each, and the order of readings that makes them neighbours."""
-    count = len(vectors)
-    plain = (vectors, np.arange(count + 1, dtype=np.int32), np.arange(count))
-    if not share or count < 2:
-        return plain
-    rays, index, inverse = np.unique(vectors, axis=0, return_index=True, return_inverse=True)
-    if len(rays) == count:
-        return plain
-    rank = np.argsort(np.argsort(index))
-    ray_of = rank[inverse.ravel()]
-    order = np.argsort(ray_of, kind="stable")
-    first = np.concatenate([[0], np.cumsum(np.bincount(ray_of, minlength=len(rays)))]).astype(np.int32)
-    return vectors[np.sort(index)], first, order
+def placing_launches(placed: PlacedPoses, placing: Placing | None) -> Program:
+    """Return the launch that places poses, and readings along with them."""
+    if placing is None:
+        return placed.launches()
+    size = (placing.arguments["head"] + placed.count,)
+    return (launch("place_inputs", placed.flags | placing.flags, size, **placed.arguments(), **placing.arguments),)

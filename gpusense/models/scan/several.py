@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.models.cloud import Cloud, finish_all
+from gpusense.models.poses import Poses
+from gpusense.models.run import finish_all
 from gpusense.models.scan.model import ScanModel
 
 
@@ -40,12 +41,12 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
     if out is not None and not isinstance(out, (list, tuple)):
         raise TypeError(f"out: must be a list or tuple of one array for each model, got {checks.show(out)}")
     each_out = _one_each("out", out, len(chosen))
-    known: dict[int, dict[object, list[Cloud]]] = {}
-    calls = []
-    for model, own_poses, own_ranges, own_out in zip(chosen, each_poses, each_ranges, each_out, strict=True):
-        # Poses that several models have are looked at once.
-        seen = known.setdefault(id(own_poses), {})
-        calls.append(model._call(own_poses, own_ranges, own_out, known=seen))
+    known: dict[int, dict[int | None, Poses]] = {}
+    requests = []
+    for model, model_poses, model_ranges, model_out in zip(chosen, each_poses, each_ranges, each_out, strict=True):
+        # Poses that several models share are checked once.
+        shared = known.setdefault(id(model_poses), {})
+        requests.append(model._request(model_poses, model_ranges, model_out, known=shared))
     # Always in one order, so that two such calls cannot wait for each other.
     different = sorted({id(model): model for model in chosen}.items())
     with contextlib.ExitStack() as stack:
@@ -53,14 +54,14 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
             stack.enter_context(model._lock)
         for _, model in different:
             stack.push(lambda kind, *error, space=model._workspace: space.abandon() if kind else None)
-        # Left first: what was gathered is started before an error forgets its memory.
+        # Left first: gathered work is started before an error forgets its memory.
         stack.enter_context(chosen[0]._workspace)
-        for model, call in zip(chosen, calls, strict=True):
-            model._start(call)
+        for model, request in zip(chosen, requests, strict=True):
+            model._pipeline.run(request, model._workspace, model._last)
             model._workspace.start()
-        on_device = {id(model) for model, call in zip(chosen, calls, strict=True) if call.on_device}
+        on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])
-    return [call.log_p(model._backend) for model, call in zip(chosen, calls, strict=True)]
+    return [request.result(model._setting.backend) for model, request in zip(chosen, requests, strict=True)]
 
 
 def _checked(models: object) -> list[ScanModel]:
@@ -75,7 +76,7 @@ def _checked(models: object) -> list[ScanModel]:
         if not isinstance(model, ScanModel):
             rule = "must be BeamModel or LikelihoodFieldModel objects"
             raise TypeError(f"models: {rule}, got {checks.show(model)} at index {i}")
-        if model._backend is not models[0]._backend:
+        if model._setting.backend is not models[0]._setting.backend:
             found = f"{models[0].device.selection} and, at index {i}, {model.device.selection}"
             raise ValueError(f"models: must be of one device, got {found}")
     return list(models)

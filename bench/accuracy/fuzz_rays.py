@@ -1,0 +1,89 @@
+"""Fuzz rays: are float32 ranges the same bits on every device?
+
+    python bench/accuracy/fuzz_rays.py --backend opencl --backend warp:cpu --rays 2000000 --output NAME
+
+Every case is a map, poses and bearings drawn to be awkward: sparse to dense maps of one cell to hundreds on a side,
+diagonal walls, resolutions from 1 mm to 100 m, origins at 5e6 m with yaw, poses on edges and corners, in walls and off
+the map, headings of multiples of 45 degrees to the last bit and of 1e6 rad, both policies for what lies outside. Each
+device is compared with float32 NumPy bit by bit. Exit code 1 where a bit differs.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.backends import get_backend
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import differing_bits, make_parser, parse, publish, table
+
+
+def draw_grid(rng: np.random.Generator) -> gs.OccupancyGrid:
+    """Draw a map to trip over."""
+    rows, cols = (int(n) for n in np.ceil(10 ** rng.uniform(0, 2.7, 2)))
+    density = rng.choice([0.0, 0.002, 0.02, 0.2, 0.7, 1.0], p=[0.05, 0.3, 0.3, 0.2, 0.1, 0.05])
+    cells = np.where(rng.random((rows, cols)) < density, 100, 0)
+    cells[rng.random((rows, cols)) < 0.02] = -1
+    if rng.random() < 0.5:
+        wall = np.arange(min(rows, cols))
+        cells[wall, wall if rng.random() < 0.5 else cols - 1 - wall] = 100
+    resolution = float(rng.choice([1e-3, 0.05, 0.1, 1.0, 100.0]))
+    far = rng.random() < 0.3
+    origin = (*rng.uniform(-5e6, 5e6, 2), rng.uniform(-3, 3)) if far else (0.0, 0.0, float(rng.choice([0.0, 0.7])))
+    return gs.OccupancyGrid(cells, resolution, origin)
+
+
+def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> np.ndarray:
+    """Draw poses in, on the edges of, and around the map."""
+    rows, cols = grid.shape
+    col, row = rng.uniform(-0.3 * cols - 2, 1.3 * cols + 2, count), rng.uniform(-0.3 * rows - 2, 1.3 * rows + 2, count)
+    on_edge = rng.random((2, count)) < 0.25
+    col, row = np.where(on_edge[0], np.rint(col), col), np.where(on_edge[1], np.rint(row), row)
+    cos, sin = np.cos(grid.origin[2]), np.sin(grid.origin[2])
+    x, y = col * grid.resolution, row * grid.resolution
+    theta = rng.uniform(-np.pi, np.pi, count)
+    theta = np.where(rng.random(count) < 0.25, np.rint(theta / (np.pi / 4)) * (np.pi / 4), theta)
+    theta = np.where(rng.random(count) < 0.1, theta + 1e6, theta)
+    return np.stack([grid.origin[0] + cos * x - sin * y, grid.origin[1] + sin * x + cos * y, theta], axis=1)
+
+
+def main() -> int:
+    """Fuzz until enough rays are cast."""
+    parser = make_parser(__doc__, backend="kernels")
+    parser.add_argument("--rays", type=int, default=2_000_000)
+    arguments = parse(parser)
+    backends = arguments.backend
+    rng = np.random.default_rng(arguments.seed)
+    cast = maps = nothing = 0
+    differing = dict.fromkeys(backends, 0)
+    while cast < arguments.rays:
+        grid = draw_grid(rng)
+        poses = draw_poses(rng, grid, 300)
+        bearings = np.concatenate([rng.uniform(-np.pi, np.pi, 36), np.arange(-4, 4) * (np.pi / 4)])
+        range_max = grid.resolution * float(10 ** rng.uniform(0, 3.3))
+        policy = {"outside": str(rng.choice(["free", "occupied"])), "unknown": str(rng.choice(["free", "occupied"]))}
+        truth = gs.RayCaster(grid, range_max, backend="numpy", **policy).cast(poses, bearings)
+        for backend in backends:
+            ranges = gs.RayCaster(grid, range_max, backend=backend, **policy).cast(poses, bearings)
+            differing[backend] += differing_bits(ranges, truth)
+        cast, maps = cast + truth.size, maps + 1
+        nothing += int(np.count_nonzero(truth == np.float32(range_max)))
+    infos = {backend: get_backend(backend).info for backend in backends}
+    rows = [
+        {"backend": info.selection, "device": info.name, "driver": info.driver, "differing_rays": differing[backend]}
+        for backend, info in infos.items()
+    ]
+    report = {"rays": cast, "maps": maps, "rays_without_obstacle": nothing, "rows": rows}
+    text = table(("backend", "device", "driver", "rays with other bits"), (row.values() for row in rows))
+    remark = f"{cast} rays in {maps} maps, {nothing} of them without an obstacle."
+    publish(__file__, arguments, text, report, remark)
+    return int(any(differing.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,377 @@
+"""Share options, scenes, timings and reports among the scripts of ``bench/``.
+
+A script runs from a checkout, with an installed gpusense: ``python bench/speed/limits.py ...``. Its line
+``sys.path.insert(0, str(Path(__file__).resolve().parents[1]))`` makes this file and the folders beside it importable.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.backends.base import Backend, Launcher, Proxy
+from gpusense.evaluation.scoring import logged_scans
+from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
+from gpusense.interface.launches import Launch
+
+ROOT = Path(__file__).resolve().parents[1]
+FIGURES = ROOT / "docs" / "img"
+MODELS = {"beam model": gs.BeamModel, "field": gs.LikelihoodFieldModel}
+# Logs of SICK lasers among the recorded data.
+LOGS = ("intel", "freiburg-079", "csail", "aces")
+# A rate counts if no error is larger [eps (1 + |log p|) for each reading].
+MOST_EPS = 16.0
+
+# ---- options
+
+
+def make_parser(doc: str | None, *, backend: str = "present", data: bool = False) -> argparse.ArgumentParser:
+    """Make a parser with the options that the scripts share.
+
+    Args:
+        doc: The script's docstring, which is its help.
+        backend: The default of ``--backend``: "present" for every device of the machine, "kernels" for every one but
+            NumPy, "auto" for the library's choice of one, "" for no such option.
+        data: Whether the script reads recorded data.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if backend == "auto":
+        parser.add_argument("--backend", default="auto", help="selection string (default: %(default)s)")
+    elif backend:
+        which = "every device present" + (" but NumPy" if backend == "kernels" else "")
+        parser.add_argument("--backend", action="append", help=f"selection string, repeatable; default: {which}")
+        parser.set_defaults(numpy=backend == "present")
+    if data:
+        parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
+    parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
+    return parser
+
+
+def add_repeats(parser: argparse.ArgumentParser, repeats: int, seconds: float) -> None:
+    """Add ``--repeats`` and ``--seconds``, the limits of what :func:`best` does."""
+    parser.add_argument("--repeats", type=int, default=repeats, help="of each figure (default: %(default)s)")
+    parser.add_argument(
+        "--seconds", type=float, default=seconds, help="longest time of the repeats of a figure (default: %(default)s)"
+    )
+
+
+def add_scene(parser: argparse.ArgumentParser, size: float, range_max: float = 30.0) -> None:
+    """Add the options of :class:`Scene`."""
+    parser.add_argument(
+        "--size", type=float, default=size, help="side of the built-in building [m] (default: %(default)s)"
+    )
+    parser.add_argument("--map", type=Path, help="a map_server YAML in place of the built-in building")
+    parser.add_argument("--range-max", type=float, default=range_max, help="of the scanner [m] (default: %(default)s)")
+
+
+def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Parse a script's arguments and fill in the devices; refuse to run without the recorded data that it reads."""
+    arguments = parser.parse_args(argv)
+    if getattr(arguments, "data", True) is None:
+        parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
+    if getattr(arguments, "backend", True) is None:
+        arguments.backend = present(numpy=arguments.numpy)
+    return arguments
+
+
+def present(*, numpy: bool = True) -> list[str]:
+    """List the selection strings of the machine's devices, simulators left out."""
+    found = [device for device in gs.devices() if device.available and device.kind != "simulator"]
+    return [device.selection for device in found if numpy or device.backend != "numpy"]
+
+
+# ---- scenes
+
+
+class Scene:
+    """A map with a pose in it, from the options of :func:`add_scene` and ``--seed``.
+
+    Attributes:
+        grid: The map: the built-in building, or that of ``--map``.
+        pose: A free pose in it.
+        rng: The generator of clouds and readings.
+        label: The map in words.
+    """
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self.rng = np.random.default_rng(arguments.seed)
+        self.grid = gs.read_map(arguments.map) if arguments.map else building(arguments.seed, (arguments.size,) * 2)
+        self.pose = free_pose(self.grid, self.rng, 0.3)
+        self.range_max = arguments.range_max
+        name = arguments.map.name if arguments.map else "built-in building"
+        self.label = f"{name}, {self.grid.shape[0]} x {self.grid.shape[1]} cells, range_max {self.range_max:g}"
+
+    def cloud(self, kind: str, count: int, spread: tuple[float, float] = (0.3, 0.1)) -> np.ndarray:
+        """Draw (count, 3) poses: "global" over the map, or "tracking" around the pose [m, rad]."""
+        if kind == "global":
+            return cloud_uniform(self.grid, count, self.rng)
+        return cloud_around(self.pose, count, *spread, self.rng)
+
+    def scanner(self, beams: int) -> gs.Scanner:
+        """Make a scanner that looks all around."""
+        return gs.Scanner(np.linspace(-np.pi, np.pi, beams, endpoint=False), self.range_max)
+
+    def scan(self, scanner: gs.Scanner) -> np.ndarray:
+        """Cast a scan at the pose, without noise and with a range for each beam."""
+        ranges = gs.RayCaster(self.grid, self.range_max, backend="numpy").cast(self.pose[None], scanner.bearings)[0]
+        return np.minimum(ranges, self.range_max - 0.1)
+
+    def noisy_scan(self, scanner: gs.Scanner, backend: Any = "numpy") -> np.ndarray:
+        """Draw a scan at the pose from the beam model's default parameters, beams without a return included."""
+        return simulate_scan(self.grid, scanner, self.pose, gs.BeamParameters(), self.rng, backend)
+
+
+def odd_scans(data: Path, name: str, limit: int | None = None) -> tuple[gs.OccupancyGrid, list[Any]]:
+    """Read the map of 5 cm that was made of a log's even scans, and its odd scans with their logged poses."""
+    folder = data / "carmen_logs"
+    grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
+    return grid, logged_scans(folder / f"{name}-corrected.log.gz", every=2, offset=1, limit=limit)
+
+
+# ---- launches
+
+
+@dataclass(frozen=True)
+class Started:
+    """A launch of an earlier call, to be started again."""
+
+    launch: Launch
+    launcher: Launcher
+
+    def __call__(self) -> None:
+        """Start it."""
+        self.launcher(self.launch.size, *self.launch.arguments)
+
+
+class Recorder(Proxy):
+    """A backend that passes everything on to another one and keeps launches, so that they can be timed again."""
+
+    def __init__(self, backend: Backend) -> None:
+        super().__init__(backend)
+        self.launches: list[Callable[[], None]] = []
+        self._listening = False
+
+    @property
+    def gathers(self) -> bool:
+        """See Backend.gathers; while launches are recorded each copy and launch is started by itself."""
+        return not self._listening and super().gathers
+
+    def launches_of(self, run: Callable[[], Any]) -> list[Callable[[], None]]:
+        """Run a call and return its launches."""
+        self.launches.clear()
+        self._listening = True
+        try:
+            run()
+        finally:
+            self._listening = False
+        launches, self.launches = self.launches, []
+        return launches
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Any:
+        """Return the backend's launcher, recorded with its arguments."""
+        launcher = super().compile(kernel, flags)
+
+        def launch(size: tuple[int, ...], *arguments: Any) -> None:
+            self.launches.append(Started(Launch(kernel, flags, size, arguments), launcher))
+            launcher(size, *arguments)
+
+        return launch
+
+
+def one_by_one(launches: list[Callable[[], None]]) -> Callable[[], None]:
+    """Make a function that starts launches one after the other."""
+
+    def start() -> None:
+        for launch in launches:
+            launch()
+
+    return start
+
+
+def as_a_call(device: Any, launches: list[Callable[[], None]]) -> Callable[[], None]:
+    """Make a function that starts launches as a call starts them: on CUDA devices as one graph."""
+    if device.info.kind != "gpu":
+        return one_by_one(launches)
+    replay = device.record(tuple(one.launch for one in launches))
+    # The first time each is started on its own, the second time the graph is made.
+    replay()
+    replay()
+    device.synchronize()
+    return replay
+
+
+def waited(device: Any, start: Callable[[], Any], times: int = 1) -> Callable[..., None]:
+    """Make a function that starts something a number of times and waits for the device once."""
+
+    def run(*_: Any) -> None:
+        for _ in range(times):
+            start()
+        device.synchronize()
+
+    return run
+
+
+# ---- arrays
+
+
+def on_device(device: Any, array: np.ndarray) -> Any:
+    """Copy an array to the memory of a GPU, as an array of the library that drives it."""
+    if device.info.backend == "opencl":
+        import pyopencl.array
+
+        return pyopencl.array.to_device(device.queue, array)
+    import warp as wp
+
+    dtype = {"float32": wp.float32, "float64": wp.float64}[array.dtype.name]
+    return wp.array(array, dtype=dtype, device=device.info.selection.removeprefix("warp:"))
+
+
+def on_host(array: Any) -> np.ndarray:
+    """Copy an array of any of the libraries to NumPy."""
+    return np.array(array if isinstance(array, np.ndarray) else array.get() if hasattr(array, "get") else array.numpy())
+
+
+def differing_bits(one: Any, other: Any) -> int:
+    """Count the float32 values with other bits."""
+    return int(np.count_nonzero(on_host(one).view(np.uint32) != on_host(other).view(np.uint32)))
+
+
+# ---- times
+
+
+def best(run: Callable[[], Any], repeats: int, longest: float, least: int = 1) -> tuple[float, float]:
+    """Return the shortest and the median seconds of some calls.
+
+    Args:
+        run: The call.
+        repeats: The number of calls.
+        longest: Seconds of all calls together; there are fewer of them where they would take longer.
+        least: The number of calls that are made however long they take.
+    """
+    times: list[float] = []
+    while len(times) < repeats and (len(times) < least or sum(times) + times[-1] < longest):
+        start = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - start)
+    return min(times), float(np.median(times))
+
+
+@dataclass(frozen=True)
+class Way:
+    """One of several ways to the same result.
+
+    Attributes:
+        run: Takes the number of a call.
+        around: Makes the context of a turn.
+        each: The number of calls that ``run`` makes.
+    """
+
+    run: Callable[[int], Any]
+    around: Callable[[], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext
+    each: int = 1
+
+
+def in_turns(ways: Sequence[Way], calls: int, turn: int = 1, seconds: float = 0.0) -> list[list[float]]:
+    """Time ways in turns, so that their ratios hold on a busy machine.
+
+    Args:
+        ways: They take turns in this order.
+        calls: The least number of calls of each.
+        turn: Calls before the next way has its turn. A turn of several calls begins with one that does not count.
+        seconds: The least time of all together.
+
+    Returns:
+        Seconds of each call, for each way.
+    """
+    times: list[list[float]] = [[] for _ in ways]
+    begin = time.perf_counter()
+    while len(times[0]) < calls or time.perf_counter() - begin < seconds:
+        for way, taken in zip(ways, times, strict=True):
+            with way.around():
+                if turn > 1:
+                    way.run(0)
+                for number in range(min(turn, calls)):
+                    start = time.perf_counter()
+                    way.run(number)
+                    taken.append((time.perf_counter() - start) / way.each)
+    return times
+
+
+# ---- reports
+
+
+def note(text: str) -> None:
+    """Print a line of progress."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def table_line(cells: Iterable[Any]) -> str:
+    """Format a row of a Markdown table."""
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
+    """Format a Markdown table."""
+    return "\n".join([table_line(columns), "| --- " * len(columns) + "|", *map(table_line, rows)])
+
+
+def command_line(script: str) -> str:
+    """Return the command as typed, absolute paths by their last part."""
+    words = [Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:]]
+    return shlex.join(["python", script, *words])
+
+
+def machine(commit: str) -> dict[str, str]:
+    """Describe the machine and the versions, with a commit that git names where it is empty."""
+    commit = (
+        commit
+        or subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False, cwd=ROOT
+        ).stdout.strip()
+    )
+    return {
+        "date": time.strftime("%Y-%m-%d"), "python": platform.python_version(), "numpy": np.__version__,
+        "gpusense": gs.__version__, "commit": commit, "platform": platform.platform(terse=True),
+        "threads": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+    }  # fmt: skip
+
+
+def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[str, Any], remark: str = "") -> None:
+    """Print a script's tables with machine and command below them, and write them with the report to ``--output``.
+
+    Args:
+        script: The script's ``__file__``.
+        arguments: Those of :func:`parse`.
+        text: The tables.
+        report: The contents of the .json file beside machine and command.
+        remark: Sentences before the machine.
+    """
+    command = command_line(Path(script).resolve().relative_to(ROOT).as_posix())
+    if getattr(arguments, "data", None) is not None:
+        # The folder of the data says nothing to others.
+        command = command.replace(str(arguments.data), "DATA")
+    host = machine(arguments.commit)
+    described = ", ".join(f"{name} {value}" for name, value in host.items())
+    text = f"{text}\n\n{remark and remark + ' '}Machine: {described}. Command: `{command}`.\n"
+    print(text)
+    if arguments.output:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        document = json.dumps({"command": command, "machine": host, **report}, indent=1)
+        arguments.output.with_suffix(".json").write_text(document + "\n")
+        arguments.output.with_suffix(".md").write_text(text)

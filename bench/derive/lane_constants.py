@@ -1,0 +1,87 @@
+"""Derive the constants of ``kernels/opencl/lanes/math.cl`` with mpmath, and print them and their errors.
+
+Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
+|r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);
+erf(x) = 1 - exp(-x W(x)) for x up to 4; arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that
+has products with counts without rounding and the rest.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import mpmath as mp
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from derive.remez import Function, remez, weighted_errors
+
+mp.mp.dps = 50
+# log(2)/2 with room for a count that is rounded to its wrong side.
+HALF = mp.log(2) / 2 * (1 + mp.mpf(2) ** -10)
+LOW, HIGH = mp.sqrt(0.5) - 1, mp.sqrt(2) - 1
+ERF_ONE = mp.mpf(4)
+# tan(pi/8) with room for rounding.
+ARC_END = (mp.sqrt(2) - 1) * (1 + mp.mpf(2) ** -10)
+# Bits of the first part of log 2; counts have at most 8.
+PART_BITS = 16
+POINTS = 1001
+
+
+def rounded_polynomial(
+    f: Function, weight: Function, low: mp.mpf, high: mp.mpf, count: int
+) -> tuple[list[float], float]:
+    """Find the polynomial with the least largest weighted error, and round its coefficients to float32.
+
+    Returns:
+        The coefficients, lowest power first, and the base-2 logarithm of the largest weighted error of the rounded
+        ones.
+    """
+    middle, reach = (low + high) / 2, (high - low) / 2
+    grid = [middle - reach * mp.cos(mp.pi * (i + 0.5) / POINTS) for i in range(POINTS)]
+    rounded = [float(np.float32(float(c))) for c in remez(f, weight, grid, count)]
+    error = weighted_errors(rounded, [f(z) for z in grid], [weight(z) for z in grid], grid)
+    return rounded, float(mp.log(max(map(abs, error)), 2))
+
+
+def exponential() -> tuple[list[float], float]:
+    """Return E and its error."""
+    return rounded_polynomial(lambda r: (mp.expm1(r) - r) / r**2, lambda r: r**2 / abs(mp.expm1(r)), -HALF, HALF, 5)
+
+
+def logarithm() -> tuple[list[float], float]:
+    """Return L and its error."""
+    return rounded_polynomial(lambda f: (mp.log1p(f) - f + f**2 / 2) / f**3, lambda f: f**3 / mp.log1p(f), LOW, HIGH, 8)
+
+
+def error_function() -> tuple[list[float], float]:
+    """Return W and its error."""
+    zero = mp.mpf(0)
+    return rounded_polynomial(lambda x: -mp.log(mp.erfc(x)) / x, lambda x: x * mp.erfc(x) / mp.erf(x), zero, ERF_ONE, 9)
+
+
+def arc() -> tuple[list[float], float]:
+    """Return A and its error."""
+    return rounded_polynomial(
+        lambda z: (mp.atan(mp.sqrt(z)) / mp.sqrt(z) - 1) / z, lambda z: z, mp.mpf(0), ARC_END**2, 5
+    )
+
+
+def log_parts() -> list[float]:
+    """Return log 2 in a part of 16 bits and the rest, and its reciprocal."""
+    scale = mp.mpf(2) ** PART_BITS
+    first = mp.floor(mp.log(2) * scale) / scale
+    return [float(first), *(float(np.float32(float(v))) for v in (mp.log(2) - first, 1 / mp.log(2)))]
+
+
+def main() -> None:
+    """Print everything."""
+    for name, (powers, error) in (("E", exponential()), ("L", logarithm()), ("W", error_function()), ("A", arc())):
+        print(name, ", ".join(f"{c:.9g}f" for c in powers), f"relative error 2^{error:.1f}")
+    print("log 2 in parts, and 1 / log 2", *(f"{part:.9g}f" for part in log_parts()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,282 @@
+"""Offer outside rows of ``gpusense bench``: other implementations, measured in the same run on the same scenes.
+
+numba (``pip install numba``): code of our own from public descriptions, parallel over particles on all processors:
+
+- ``numba field``: the likelihood field as Beluga scores it: a grid of z_hit N(d; 0, sigma_hit) + z_rand / range_max
+  made beforehand, one look-up per beam. ``log grid`` stores logarithms, so that a beam costs an addition; ``log of
+  products`` stores densities as Beluga's ``LikelihoodFieldProbModel`` does and takes one logarithm for some beams
+  together; ``sum of cubes`` is the weight 1 + sum p^3 of AMCL and of Beluga's ``LikelihoodFieldModel``, which is no
+  likelihood.
+- ``numba march``: f1tenth_gym's ray marching: steps of the distance between cell centres through the Euclidean distance
+  field, headings rounded to a table of sines.
+
+range_libc and f1tenth_gym themselves appear where they can be imported. Both run one thread. Their maps are the whole
+map in cells, with its yaw taken out.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from gpusense.evaluation.benchmark.candidates import Candidate
+from gpusense.evaluation.benchmark.scenes import Scene
+from gpusense.world.scanner import Reading, classify
+
+THETA_BINS = (500, 2000, 8000)
+CDDT_BINS = (54, 108, 216, 720)
+TABLE_BINS = (54, 108, 216)
+# f1tenth_gym stops where an obstacle is nearer than this [m].
+NEAR = 1e-4
+# Beams whose densities are multiplied before a logarithm is taken: no product over- or underflows float64.
+BLOCK = 16
+
+try:
+    import numba
+except ImportError as error:
+    numba, NUMBA_MISSING = None, f"not installed ({error}): pip install numba"
+else:
+    NUMBA_MISSING = ""
+
+
+class Runner:
+    """A candidate made ready for a scene, as ``gpusense bench`` measures it."""
+
+    def __init__(self, run: Callable[[np.ndarray], np.ndarray], table_bytes: int) -> None:
+        self.run, self.table_bytes = run, table_bytes
+
+
+def in_cells(scene: Scene, poses: np.ndarray) -> np.ndarray:
+    """Return (N, 3) poses in the grid's frame, in cell units."""
+    placed = np.empty_like(poses)
+    placed[:, :2] = scene.grid.world_to_cells(poses[:, :2])
+    placed[:, 2] = poses[:, 2] - scene.grid.origin[2]
+    return placed
+
+
+def hits(scene: Scene) -> np.ndarray:
+    """Return the indices of the readings that are ranges."""
+    return np.flatnonzero(classify(scene.readings, scene.scanner) == Reading.HIT)
+
+
+if numba is not None:
+
+    @numba.njit(parallel=True, cache=True)
+    def score_logs(grid, beyond, poses, points):
+        """Sum a grid of log densities over the end points of each pose."""
+        rows, cols = grid.shape
+        found = np.empty(len(poses))
+        for i in numba.prange(len(poses)):
+            c, s, total = math.cos(poses[i, 2]), math.sin(poses[i, 2]), 0.0
+            for k in range(len(points)):
+                col = math.floor(poses[i, 0] + c * points[k, 0] - s * points[k, 1])
+                row = math.floor(poses[i, 1] + s * points[k, 0] + c * points[k, 1])
+                inside = 0 <= col < cols and 0 <= row < rows
+                total += grid[row, col] if inside else beyond
+            found[i] = total
+        return found
+
+    @numba.njit(parallel=True, cache=True)
+    def score_products(grid, beyond, poses, points):
+        """Add logarithms of products of a grid of densities, some beams at a time."""
+        rows, cols = grid.shape
+        found = np.empty(len(poses))
+        for i in numba.prange(len(poses)):
+            c, s, total, product = math.cos(poses[i, 2]), math.sin(poses[i, 2]), 0.0, 1.0
+            for k in range(len(points)):
+                col = math.floor(poses[i, 0] + c * points[k, 0] - s * points[k, 1])
+                row = math.floor(poses[i, 1] + s * points[k, 0] + c * points[k, 1])
+                inside = 0 <= col < cols and 0 <= row < rows
+                product *= grid[row, col] if inside else beyond
+                if k % BLOCK == BLOCK - 1:
+                    total, product = total + math.log(product), 1.0
+            found[i] = total + math.log(product)
+        return found
+
+    @numba.njit(parallel=True, cache=True)
+    def score_cubes(grid, beyond, poses, points):
+        """Take the logarithm of the weight 1 + sum of cubed densities."""
+        rows, cols = grid.shape
+        found = np.empty(len(poses))
+        for i in numba.prange(len(poses)):
+            c, s, total = math.cos(poses[i, 2]), math.sin(poses[i, 2]), 1.0
+            for k in range(len(points)):
+                col = math.floor(poses[i, 0] + c * points[k, 0] - s * points[k, 1])
+                row = math.floor(poses[i, 1] + s * points[k, 0] + c * points[k, 1])
+                inside = 0 <= col < cols and 0 <= row < rows
+                p = grid[row, col] if inside else beyond
+                total += p * p * p
+            found[i] = math.log(total)
+        return found
+
+    @numba.njit(parallel=True, cache=True)
+    def march(distances, resolution, poses, bearings, cosines, sines, range_max):
+        """March through distances between cell centres [m] to ranges [m]; poses in metres in the grid's frame."""
+        rows, cols = distances.shape
+        bins = len(cosines)
+        found = np.empty((len(poses), len(bearings)))
+        for i in numba.prange(len(poses)):
+            for k in range(len(bearings)):
+                bin_ = math.floor((poses[i, 2] + bearings[k]) / (2 * math.pi) * bins) % bins
+                c, s, x, y = cosines[bin_], sines[bin_], poses[i, 0], poses[i, 1]
+                total = 0.0
+                while total <= range_max:
+                    col, row = math.floor(x / resolution), math.floor(y / resolution)
+                    if not (0 <= col < cols and 0 <= row < rows):
+                        total = range_max
+                        break
+                    d = distances[row, col]
+                    if d <= NEAR:
+                        break
+                    x, y, total = x + d * c, y + d * s, total + d
+                found[i, k] = min(total, range_max)
+        return found
+
+
+def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
+    """Make a runner of one of the three ways to score with a precomputed grid."""
+
+    def make(scene: Scene, backend: None, precision: str) -> Runner:
+        p, chosen = scene.field, hits(scene)
+        distance = np.minimum(distances_of(scene), p.max_distance)
+        scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+
+        def density(d: Any) -> Any:
+            return scale * np.exp(-0.5 * (d / p.sigma_hit) ** 2) + p.z_rand / scene.scanner.range_max
+
+        values, beyond = density(distance), float(density(p.max_distance))
+        if kind == "log grid":
+            values, beyond = np.log(values), math.log(beyond)
+        grid = values.astype(precision)
+        cells, bearings = scene.readings[chosen] / scene.grid.resolution, scene.scanner.bearings[chosen]
+        points = cells[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+        score = {"log grid": score_logs, "log of products": score_products, "sum of cubes": score_cubes}[kind]
+        return Runner(lambda poses: score(grid, beyond, in_cells(scene, poses), points), grid.nbytes)
+
+    return make
+
+
+def distances_of(scene: Scene) -> np.ndarray:
+    """Return the distances of cell centres to the nearest obstacle's [m]; far away where there is none."""
+    obstacles = scene.grid.occupied
+    if not obstacles.any():
+        return np.full(obstacles.shape, scene.scanner.range_max)
+    return distance_transform_edt(~obstacles) * scene.grid.resolution
+
+
+def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
+    """Make a runner of f1tenth-style marching with a number of headings."""
+
+    def make(scene: Scene, backend: None, precision: str) -> Runner:
+        side, scanner = scene.grid.resolution, scene.scanner
+        distances, turns = distances_of(scene), 2 * math.pi * np.arange(bins) / bins
+        cosines, sines = np.cos(turns), np.sin(turns)
+
+        def run(poses: np.ndarray) -> np.ndarray:
+            placed = in_cells(scene, poses)
+            placed[:, :2] *= side
+            return march(distances, side, placed, scanner.bearings, cosines, sines, scanner.range_max)
+
+        return Runner(run, distances.nbytes)
+
+    return make
+
+
+def range_libc_caster(library: Any, make_caster: Callable[[Any, float], Any]) -> Callable[[Scene, None, str], Runner]:
+    """Make a runner of a range_libc method, in cells and in the frame of the grid."""
+
+    def make(scene: Scene, backend: None, precision: str) -> Runner:
+        occupied, limit = scene.grid.occupied, scene.scanner.range_max / scene.grid.resolution
+        # It mixes up the sides of maps that are not square.
+        side = max(occupied.shape)
+        square = np.zeros((side, side), bool)
+        square[: occupied.shape[0], : occupied.shape[1]] = occupied
+        caster = make_caster(library.PyOMap(np.ascontiguousarray(square.T)), limit)
+        angles = scene.scanner.bearings.astype(np.float32)
+
+        def run(poses: np.ndarray) -> np.ndarray:
+            found = np.empty(len(poses) * len(angles), np.float32)
+            caster.calc_range_repeat_angles(in_cells(scene, poses).astype(np.float32), angles, found)
+            return found.reshape(len(poses), -1) * scene.grid.resolution
+
+        return Runner(run, 0)
+
+    return make
+
+
+def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]:
+    """Make a runner of f1tenth_gym's scan simulator, one scan a call as it offers it."""
+
+    def make(scene: Scene, backend: None, precision: str) -> Runner:
+        bearings, limit = scene.scanner.bearings, scene.scanner.range_max
+        known = inspect.signature(module.ScanSimulator2D.__init__).parameters
+        options = {"eps": NEAR, "theta_dis": bins, "max_range": limit, "std_dev": 0.0}
+        options = {name: value for name, value in options.items() if name in known}
+        simulator = module.ScanSimulator2D(len(bearings), float(bearings[-1] - bearings[0]), **options)
+        simulator.dt = distances_of(scene)
+        simulator.map_height, simulator.map_width = simulator.dt.shape
+        simulator.map_resolution = scene.grid.resolution
+        simulator.orig_x, simulator.orig_y, yaw = scene.grid.origin
+        simulator.orig_c, simulator.orig_s = math.cos(yaw), math.sin(yaw)
+        middle = 0.5 * float(bearings[0] + bearings[-1])
+        # Newer versions take the generator of the noise, and None for none.
+        noise = (None,) if "rng" in inspect.signature(simulator.scan).parameters else ()
+
+        def run(poses: np.ndarray) -> np.ndarray:
+            turned = poses + np.array([0.0, 0.0, middle])
+            return np.minimum(np.array([simulator.scan(pose, *noise) for pose in turned]), limit)
+
+        return Runner(run, simulator.dt.nbytes)
+
+    return make
+
+
+def imported(*names: str) -> tuple[Any, str]:
+    """Return the first module that can be imported, or the reasons why none can."""
+    reasons = []
+    for name in names:
+        try:
+            return importlib.import_module(name), ""
+        except Exception as error:
+            reasons.append(f"{name} cannot be imported ({type(error).__name__}: {error})")
+    return None, "; ".join(reasons)
+
+
+def candidates() -> list[Candidate]:
+    """Return the outside rows; those that cannot run say why."""
+    threads = "all threads" if numba is None else f"{numba.get_num_threads()} threads"
+    name = "numba" if numba is None else f"numba {numba.__version__}, {threads}"
+    own = {"outside": name, "missing": NUMBA_MISSING}
+    found = [
+        Candidate("field", "numba field", numba_field(kind), kind, exact=kind != "sum of cubes", **own)
+        for kind in ("log grid", "log of products", "sum of cubes")
+    ]
+    found += [
+        Candidate("ranges", "numba march", numba_march(bins), "", "headings", bins, precision="float64", **own)
+        for bins in THETA_BINS
+    ]
+    library, missing = imported("range_libc")
+    own = {"outside": "range_libc, 1 thread", "missing": missing}
+    casters = [
+        ("BL", None, lambda m, r: library.PyBresenhamsLine(m, r)),
+        ("RM", None, lambda m, r: library.PyRayMarching(m, r)),
+        *(("CDDT", bins, lambda m, r, bins=bins: library.PyCDDTCast(m, r, bins)) for bins in CDDT_BINS),
+        *(("GLT", bins, lambda m, r, bins=bins: library.PyGiantLUTCast(m, r, bins)) for bins in TABLE_BINS),
+    ]
+    found += [
+        Candidate("ranges", "range_libc", range_libc_caster(library, make), kind, "bins" if bins else "", bins, **own)
+        for kind, bins, make in casters
+    ]
+    module, missing = imported("f110_gym.envs.laser_models", "f1tenth_gym.envs.laser_models")
+    own = {"outside": "f1tenth_gym, 1 thread", "missing": missing}
+    found += [
+        Candidate("ranges", "f1tenth_gym", f1tenth_scan(module, bins), "", "headings", bins, precision="float64", **own)
+        for bins in THETA_BINS
+    ]
+    return found

@@ -1,0 +1,117 @@
+"""Launches: a kernel, its flags, its size, and its arguments by name.
+
+A program is a tuple of launches. Making one starts nothing: tests read it, backends run it or record it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from operator import itemgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense.interface.signatures import KERNELS, Kernel
+
+_INTEGERS = (int, np.integer)
+_NUMBERS = (int, float, np.integer, np.floating)
+
+
+class Launch(NamedTuple):
+    """One start of a kernel.
+
+    Attributes:
+        kernel: Its name in the signature table.
+        flags: Flags of its code.
+        size: Work-items along each axis of the row's launch shape.
+        arguments: Buffers and scalars in the order of the row.
+    """
+
+    kernel: str
+    flags: frozenset[str]
+    size: tuple[int, ...]
+    arguments: tuple[Any, ...]
+
+    def named(self) -> dict[str, Any]:
+        """Return the arguments by name."""
+        return dict(zip(_names(self.kernel), self.arguments, strict=True))
+
+
+Program = tuple[Launch, ...]
+
+
+def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **arguments: Any) -> Launch:
+    """Bind the arguments of a kernel by name.
+
+    Args:
+        kernel: Its name in the signature table.
+        flags: Flags of its code.
+        size: Work-items along each axis.
+        **arguments: Every argument of the row: an array's buffer, an integer, or a real number.
+
+    Raises:
+        TypeError: an argument is missing, unknown, or of the wrong type; the message names it.
+    """
+    row = _ROWS.get(kernel) or _row(kernel)
+    if len(arguments) != len(row.names):
+        raise TypeError(_difference(kernel, row.names, arguments))
+    try:
+        values = row.take(arguments)
+    except KeyError:
+        raise TypeError(_difference(kernel, row.names, arguments)) from None
+    types = tuple(map(type, values))
+    if types not in row.accepted:
+        row.check(types)
+    return Launch(kernel, frozenset(flags), size, values)
+
+
+def flags_of(program: Program) -> frozenset[str]:
+    """Return the flags of all launches of a program."""
+    return frozenset[str]().union(*(one.flags for one in program))
+
+
+class _Row:
+    """A row of the signature table, ready to bind arguments."""
+
+    def __init__(self, kernel: str, row: Kernel) -> None:
+        self._kernel, self._row = kernel, row
+        self.names = tuple(argument.name for argument in row.arguments)
+        self.take = itemgetter(*self.names)
+        # Types that were checked once: calls repeat them.
+        self.accepted: set[tuple[type, ...]] = set()
+
+    def check(self, types: tuple[type, ...]) -> None:
+        """Hold the types of arguments to the row.
+
+        Raises:
+            TypeError: a number in place of an array, or the other way round, or a real number in place of an integer.
+        """
+        for argument, kind in zip(self._row.arguments, types, strict=True):
+            is_number = issubclass(kind, _NUMBERS)
+            if argument.shape is not None:
+                rule, right = "a buffer", not is_number
+            elif argument.type == "int":
+                rule, right = "an integer", issubclass(kind, _INTEGERS)
+            else:
+                rule, right = "a number", is_number
+            if not right:
+                raise TypeError(f"{self._kernel}: {argument.name} must be {rule}, got a {kind.__name__}")
+        self.accepted.add(types)
+
+
+_ROWS: dict[str, _Row] = {}
+
+
+def _row(kernel: str) -> _Row:
+    return _ROWS.setdefault(kernel, _Row(kernel, KERNELS[kernel]))
+
+
+def _names(kernel: str) -> tuple[str, ...]:
+    return _row(kernel).names
+
+
+def _difference(kernel: str, names: tuple[str, ...], arguments: dict[str, Any]) -> str:
+    missing = [name for name in names if name not in arguments]
+    unknown = [name for name in arguments if name not in names]
+    parts = [f"missing {', '.join(missing)}" if missing else "", f"unknown {', '.join(unknown)}" if unknown else ""]
+    return f"{kernel}: arguments must be those of its signature, got {' and '.join(part for part in parts if part)}"

@@ -1,0 +1,244 @@
+"""Poses of a request: checked, bounded, and placed in a window of the map.
+
+NumPy arrays are checked and bounded on the host; the values of device poses are not inspected before the launch that
+places them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import arrays
+from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.workspace import POSE_STATUS, Workspace
+from gpusense.interface.launches import Program, launch
+from gpusense.reference.heading import LIMIT
+from gpusense.tables.reachable import ReachableMap
+from gpusense.world.frames import Cells, Mount, frame_scalars, place_poses
+from gpusense.world.windows import Corners, Window
+
+_INT = np.dtype(np.int32)
+_SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
+_PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
+_HUGE_SINGLE = _HUGE | {"POSES_FLOAT32"}
+_FRAME = ("origin_x", "origin_y", "resolution", "mount_x", "mount_y", "yaw_cos", "yaw_sin")
+# Poses whose bounds are found at once.
+_BLOCK = 8192
+
+Part = tuple[int, int]
+"""Poses from a first one to before a last one."""
+
+
+class Poses:
+    """(N, 3) poses of a request.
+
+    Args:
+        poses: Numbers, or an array on the device.
+        backend: The device.
+        name: Their name in messages.
+        several: An array on the device is (S, N, 3), the poses of S scans one after the other.
+        in_place: An array on the device must be used where it is, now and later.
+
+    Raises:
+        TypeError: not numbers, or an array that this device cannot read.
+        ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
+    """
+
+    def __init__(
+        self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False, in_place: bool = False
+    ) -> None:
+        self.host: np.ndarray | None = None
+        self._last_corners: tuple[Part, Corners] | None = None
+        self.on_device = arrays.on_device(poses)
+        if self.on_device:
+            self._buffer, self.count, single, self._owner = arrays.adopt_poses(
+                poses, backend, name, several, in_place=in_place
+            )
+            self._dtype = _SINGLE if single else _DOUBLE
+            return
+        read = arrays.to_host(poses, name)
+        if isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.ndim == 2 and read.shape[1] == 3:
+            self.host = np.ascontiguousarray(read, np.float64)
+            self._corners = self._bounds(0, len(read))
+            if not all(map(math.isfinite, (*self._corners[0], *self._corners[3]))):
+                self.host = checks.array(name, read, ("N", 3))
+        else:
+            self.host = np.ascontiguousarray(checks.array(name, read, ("N", 3)))
+            self._corners = self._bounds(0, len(self.host))
+        self.count = len(self.host)
+
+    def corners(self, part: Part) -> Corners | None:
+        """Return four corners of the box of some poses, at 0 for no poses; None on the device."""
+        if self.host is None:
+            return None
+        if part[1] - part[0] == self.count:
+            return self._corners
+        if self._last_corners is None or self._last_corners[0] != part:
+            self._last_corners = part, self._bounds(*part)
+        return self._last_corners[1]
+
+    def window(self, table: ReachableMap, part: Part) -> tuple[Buffer, Window]:
+        """Return the map's table for some poses, and its window."""
+        return table.ensure(self.corners(part))
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """The flags of kernels that place these poses."""
+        if self.host is None:
+            return _HUGE_SINGLE if self._dtype == _SINGLE else _HUGE
+        return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LIMIT else _PLAIN
+
+    def buffer(self, backend: Backend, space: Workspace, part: Part) -> Buffer:
+        """Return some poses on the device, uploaded where they are not there; None where the host must place them."""
+        begin, end = part
+        if self.host is None:
+            return self._device_part(backend, space, 3 * begin, 3 * (end - begin))
+        return space.upload("poses", self.host[begin:end]) if backend.info.float64 else None
+
+    def _device_part(self, backend: Backend, space: Workspace, first: int, count: int) -> Buffer:
+        """Return some numbers of device poses; a copy where a part cannot begin with them."""
+        size = self._dtype.itemsize
+        if first * size % backend.alignment == 0:
+            return backend.part(self._buffer, first, count, self._dtype)
+        copied = space.empty("poses_part", count, self._dtype)
+        backend.copy(self._buffer, copied, count * size, begin=first * size)
+        return copied
+
+    def _bounds(self, begin: int, end: int) -> Corners:
+        assert self.host is not None
+        if begin == end:
+            return ((0.0, 0.0, 0.0),) * 4
+        low, high = _bounds(self.host[begin:end])
+        return low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame in which poses are placed.
+
+    Attributes:
+        window: The part of the map that a table is made of.
+        cells: The map's shape, resolution and origin.
+        mount: The sensor's pose on the robot; its yaw belongs to the bearings.
+    """
+
+    window: Window
+    cells: Cells
+    mount: Mount
+
+
+@dataclass(frozen=True)
+class PlacedPoses:
+    """Sensor poses in the frame of a window, on the device.
+
+    Attributes:
+        count: Their number.
+        corners: Corners of the box of the robot's poses; None where they are not known.
+        frame: The frame.
+        cell: Cells, int2.
+        pose: Fractions in x and y, cosines and sines of the headings, real4.
+        low: Rounding errors (low parts) of ``pose``, real4.
+        flags: Flags of the kernels that place them.
+        source: The poses as they are in the request; None where the host has placed them.
+        status: The non-finite flag.
+    """
+
+    count: int
+    corners: Corners | None
+    frame: Frame
+    cell: Buffer
+    pose: Buffer
+    low: Buffer
+    flags: frozenset[str] = _PLAIN
+    source: Buffer = None
+    status: Buffer = None
+
+    @property
+    def headings(self) -> frozenset[str]:
+        """The flag of headings that may be huge: those of device poses are not inspected."""
+        return self.flags & _HUGE
+
+    @property
+    def key(self) -> Hashable:
+        """Everything but buffers on which the launches depend."""
+        return self.flags, self.count, self.frame.window
+
+    def arguments(self) -> dict[str, object]:
+        """Return the arguments of ``place_poses`` by name."""
+        window = self.frame.window
+        return dict(
+            poses=self.source, pose_cell=self.cell, pose=self.pose, pose_low=self.low, verdict=self.status,
+            **dict(zip(_FRAME, frame_scalars(self.frame.cells, self.frame.mount), strict=True)),
+            first_col=window.col, first_row=window.row, rows=window.rows, cols=window.cols, particles=self.count,
+        )  # fmt: skip
+
+    def launches(self) -> Program:
+        """Return the launch that places them; none where the host has."""
+        if self.source is None:
+            return ()
+        return (launch("place_poses", self.flags, (self.count,), **self.arguments()),)
+
+
+def place(
+    poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *, careful: bool = False
+) -> PlacedPoses:
+    """Upload some poses, and describe how they are placed in the frame of a window.
+
+    Args:
+        poses: The request's poses.
+        part: The first of them and the one after the last.
+        frame: The frame.
+        backend: The device.
+        space: Holds the buffers.
+        real: Precision of the placed poses.
+        careful: Whether low parts are needed.
+    """
+    source, count, corners = poses.buffer(backend, space, part), part[1] - part[0], poses.corners(part)
+    if source is None:
+        return _place_on_host(poses, part, frame, space, real, careful=careful)
+    return PlacedPoses(
+        count, corners, frame, space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real),
+        space.empty("pose_low", 4 * count if careful else 4, real),
+        poses.flags | ({"FLOAT64"} if real == np.float64 else _PLAIN) | ({"CAREFUL"} if careful else _PLAIN),
+        source, pose_status(space),
+    )  # fmt: skip
+
+
+def pose_status(space: Workspace) -> Buffer:
+    """Return the buffer of the non-finite flag."""
+    return space.empty(POSE_STATUS[0], 2, POSE_STATUS[1], zero=True)
+
+
+def _place_on_host(
+    poses: Poses, part: Part, frame: Frame, space: Workspace, real: np.dtype, *, careful: bool
+) -> PlacedPoses:
+    assert poses.host is not None
+    placed = place_poses(poses.host[slice(*part)], frame.cells, frame.mount, real)
+    placed.cell[:] -= (frame.window.col, frame.window.row)
+    low = placed.low if careful else placed.low[:1]
+    return PlacedPoses(
+        part[1] - part[0], poses.corners(part), frame, space.upload("cell", placed.cell),
+        space.upload("pose", placed.pose), space.upload("pose_low", low), poses.flags,
+    )  # fmt: skip
+
+
+def _bounds(poses: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return the least and the largest of each column of (N, 3) numbers, N > 0; NaN where there is one.
+
+    Columns of three are slow to reduce. Turned into rows, a block that fits the nearest cache at a time, they are not.
+    """
+    lows, highs = [], []
+    for begin in range(0, len(poses), _BLOCK):
+        rows = np.ascontiguousarray(poses[begin : begin + _BLOCK].T)
+        lows.append(np.minimum.reduce(rows, axis=1))
+        highs.append(np.maximum.reduce(rows, axis=1))
+    # Several blocks: NaN stays.
+    low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
+    high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
+    (x, y, turn), (far_x, far_y, far_turn) = low.tolist(), high.tolist()
+    return (x, y, turn), (far_x, far_y, far_turn)

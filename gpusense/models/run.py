@@ -1,0 +1,155 @@
+"""Pieces of a request that fit a device's memory, and that a processor ends within seconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.backends.workspace import POSE_STATUS, Workspace
+from gpusense.tables.reachable import TableMemoryError
+
+# Particles of one launch: enough to fill a device, few enough for its memory (44 bytes each).
+CHUNK = 1 << 20
+# Most bytes of a result with a number per particle and beam.
+CHUNK_BYTES = 320 << 20
+# Most particle-beams of one launch on a processor: it can be interrupted between launches, a few seconds apart.
+CHUNK_WORK = 1 << 24
+# A piece that does not fit is tried with half the particles down to this.
+SMALLEST_CHUNK = 256
+# Pieces are multiples of this number of particles, unless they are smaller: every device can begin at their numbers.
+_ROUND = 256
+
+
+def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
+    """Return the particles of one launch.
+
+    Args:
+        backend: The device.
+        beams: Beams of each particle.
+        itemsize: Bytes of a result per particle and beam.
+    """
+    chunk = CHUNK
+    if itemsize:
+        chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
+    if backend.info.kind == "cpu":
+        chunk = min(chunk, CHUNK_WORK // beams)
+    return _rounded(max(chunk, 1))
+
+
+def _rounded(chunk: int) -> int:
+    return chunk - chunk % _ROUND if chunk > _ROUND else chunk
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Particles that are scored by one program, of the S N particles of S scans one after the other.
+
+    Attributes:
+        begin: The first of them.
+        end: The one after the last.
+        per_scan: N, the particles of each scan.
+    """
+
+    begin: int
+    end: int
+    per_scan: int
+
+    @property
+    def part(self) -> tuple[int, int]:
+        """``begin`` and ``end``."""
+        return self.begin, self.end
+
+    @property
+    def count(self) -> int:
+        """Its particles."""
+        return self.end - self.begin
+
+    @property
+    def scans(self) -> tuple[int, int]:
+        """The first scan and the one after the last."""
+        return self.begin // self.per_scan, -(-self.end // self.per_scan)
+
+
+def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece], None]) -> None:
+    """Score particles in pieces; a piece that does not fit into memory is tried again with half the particles.
+
+    Args:
+        space: Its memory is freed before a second try.
+        whole: All particles, of whole scans that one program may score.
+        most: Particles of a piece; a piece with several scans has whole ones.
+        score: Runs the program of a piece.
+
+    Raises:
+        MemoryError: not even the smallest piece fits, or not the map's table, which is tried only once. The owner of
+            the workspace still works for smaller calls.
+    """
+    begin = whole.begin
+    while begin < whole.end:
+        piece = Piece(begin, _end(begin, whole.end, whole.per_scan, most), whole.per_scan)
+        try:
+            score(piece)
+            begin = piece.end
+        except TableMemoryError:
+            space.release()
+            raise
+        except MemoryError:
+            most = _halved(piece)
+            # The non-finite flag of earlier pieces stays.
+            space.release(keep=POSE_STATUS[0] if most else "")
+            if not most:
+                raise
+
+
+def _end(begin: int, end: int, per_scan: int, most: int) -> int:
+    """Return the end of the piece that begins at a particle: whole scans, or a part of one."""
+    if begin % per_scan == 0 and most >= per_scan:
+        return min(begin + most // per_scan * per_scan, end)
+    return min(begin + most, (begin // per_scan + 1) * per_scan)
+
+
+def _halved(piece: Piece) -> int:
+    """Return the particles of the next try, 0 where there is none."""
+    if piece.count > piece.per_scan:
+        return max(piece.count // 2, piece.per_scan)
+    return 0 if piece.count <= SMALLEST_CHUNK else max(_rounded(piece.count // 2), SMALLEST_CHUNK)
+
+
+def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
+    """Wait for a call to end.
+
+    Raises:
+        ValueError: a device pose that was placed in it was not finite.
+    """
+    if on_device:
+        finish_all([(space, True)], name)
+    else:
+        space.wait()
+
+
+def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") -> None:
+    """Wait for a call that used one workspace or several of a device to end.
+
+    Args:
+        spaces: Each workspace, and whether it had device poses.
+        name: Name of the poses in messages.
+
+    Raises:
+        ValueError: a device pose that was placed in it was not finite.
+    """
+    flag, dtype = POSE_STATUS
+    states = np.zeros((len(spaces), 2), dtype)
+    for (space, on_device), state in zip(spaces, states, strict=True):
+        if on_device:
+            space.download(space.empty(flag, 2, dtype, zero=True), state)
+    for space, _ in spaces:
+        # The device has ended everything after the first.
+        space.wait()
+    for (space, _), state in zip(spaces, states, strict=True):
+        if state[0]:
+            space.upload(flag, np.zeros(2, dtype))
+            space.wait()
+    if states[:, 0].any():
+        raise ValueError(f"{name}: must be finite, got a pose on the device that is not")

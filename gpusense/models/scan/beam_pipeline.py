@@ -1,0 +1,173 @@
+"""The beam model on a device: its mixture, rays and ranges of readings, flags and launches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.lanes import widened
+from gpusense.interface.launches import Program, launch
+from gpusense.models.poses import PlacedPoses
+from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.cones import Cones
+from gpusense.models.scan.map_caster import MapCaster
+from gpusense.models.scan.mixture import Mixture
+from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
+from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
+from gpusense.reference.error_free import BLOCK_TERMS, strands_in
+from gpusense.tables.reachable import ReachableMap
+from gpusense.world.frames import ray_vectors
+
+_NO_FLAGS = frozenset[str]()
+
+
+class BeamPipeline(ScanPipeline):
+    """The stages of a beam model.
+
+    Args:
+        setting: The device and the rules.
+        caster: Finds expected ranges.
+        cones: How the sensor hears.
+        mixture: The mixture.
+        max_evaluated: Whether max readings are evaluated by the mixture.
+    """
+
+    orders = True
+
+    def __init__(
+        self, setting: Setting, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
+    ) -> None:
+        super().__init__(setting, caster.grid)
+        self.caster, self.cones, self.mixture = caster, cones, mixture
+        self.rays_each = cones.rays
+        # The rays of each beam: one, or those of a cone.
+        self.cone_vectors = ray_vectors(self.scanner.ray_bearings, self.scanner.mount)
+        self._fixed_flags = mixture.flags | ({"FLOAT64"} if self.real == np.float64 else _NO_FLAGS)
+        # Where no range is possible there are no components, but the code must evaluate some.
+        self._fixed_flags |= _NO_FLAGS if mixture.flags else {"RAND", "SINGLE"}
+        self._fixed_flags |= {"ALL_READINGS"} if max_evaluated or not self.specialize else _NO_FLAGS
+        upload, cells = self.backend.upload, mixture.cells
+        self._terms = upload(mixture.terms)
+        self._constants = dict(
+            terms=self._terms, edges=upload(mixture.cosines.astype(self.real)),
+            sensor=upload(np.zeros(1, self.real) if mixture.table is None else mixture.table), kinds=mixture.bins,
+            cone_rays=cones.rays, critical=cones.critical, cells=cells, per_metre=cells / self.scanner.range_max,
+            limit=caster.limit, range_max=self.scanner.range_max,
+        )  # fmt: skip
+        # The first reading of each ray where no rays are shared.
+        self._one_each: Buffer = upload(np.arange(self.scanner.count + 1, dtype=np.int32))
+
+    @property
+    def map(self) -> ReachableMap:
+        """See ScanPipeline.map."""
+        return self.caster.map
+
+    @property
+    def _top(self) -> float:
+        """Largest range below a max reading to a table: one that is rounded to range_max is still a range."""
+        if not self.mixture.cells:
+            return math.inf
+        return float(np.nextafter(self.real.type(self.scanner.range_max), self.real.type(0)))
+
+    # ---- readings
+
+    def upload(self, scans: ClassedScans, space: Workspace) -> Readings:
+        """See ScanPipeline.upload; readings that share a ray are neighbours."""
+        vectors = scans.rays if self.cones.rays == 1 else self.cone_vectors[scans.columns[scans.first[:-1]]]
+        values = scans.readings.astype(self.real)
+        if self.mixture.cells:
+            values = np.where(np.isfinite(scans.readings), np.minimum(values, self.real.type(self._top)), values)
+        shared, several = scans.shared or not self.specialize, scans.scans > 1
+        arrays = dict(ray=vectors.astype(self.real), reading=values)
+        if several:
+            arrays["fixed_of"] = (scans.constants + self.setting.constant_term).astype(self.real)
+        given = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
+        start = counts = self.nothing
+        if several:
+            begins = np.append(0, np.cumsum(scans.ray_counts)).astype(np.int32)
+            start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
+        # Kernels without shared rays read no first reading, but NumPy's does, of a single scan.
+        first = space.upload("first", scans.first) if shared and (several or scans.shared) else self._one_each
+        fixed = float(scans.constants[0]) + self.setting.constant_term
+        flags = ({"SHARED_RAYS"} if shared else _NO_FLAGS) | ({"SCANS"} if several else _NO_FLAGS)
+        return Readings(
+            scans.scans, scans.most_rays, scans.most_readings, frozenset(flags),
+            dict(ray=given["ray"], reading=given["reading"], first=first, start=start),
+            dict(counts=counts, fixed_of=given.get("fixed_of", self._terms), fixed=fixed),
+            (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings), fixed),
+        )  # fmt: skip
+
+    def sensing(self) -> Sensing:
+        """See ScanPipeline.sensing."""
+        rules = self.rules
+        vectors = rules.vectors[:, None] if self.cones.rays == 1 else self.cone_vectors
+        return Sensing(
+            self.scanner, rules.beams, vectors, rules.z_max, end_points=False, max_depends=rules.max_depends,
+            possible=self.setting.possible, specialize=self.specialize, top=self._top, guard_scale=0.0, real=self.real,
+        )  # fmt: skip
+
+    def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
+        """See ScanPipeline.place_arguments."""
+        return dict(ray=filled["point"], reading=filled["reading"], first=self._one_each, start=self.nothing)
+
+    # ---- program
+
+    def spread(self, particles: int, readings: Readings) -> int:
+        """See ScanPipeline.spread."""
+        return tiles_of(particles, readings.rays)[1]
+
+    def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        """See ScanPipeline.conditions."""
+        inside = self.specialize and all_within(placed, 0)
+        flags = self.caster.flags if inside else self.caster.flags | {"ORIGINS_OUTSIDE"}
+        if tiles is None:
+            return flags
+        flags |= {"ORDERED"} if tiles.order is not None else _NO_FLAGS
+        strands = "SHARED_RAYS" not in readings.flags and stranded(readings.rays, tiles.spread)
+        return flags | {"STRANDED"} if strands else flags
+
+    def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
+        """See ScanPipeline.flags."""
+        flags = self._fixed_flags | self.cones.flags | conditions
+        if tiled:
+            return flags
+        return widened(self.backend.info.lanes, "score_beams", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
+
+    def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
+        """See ScanPipeline.layout."""
+        if "STRANDED" in flags:
+            return int(strands_in(readings.readings)), 1
+        return readings.readings, BLOCK_TERMS
+
+    def score_launches(self, scoring: Scoring) -> Program:
+        """See ScanPipeline.score_launches."""
+        placed, readings, parts, caster = scoring.placed, scoring.readings, scoring.parts, self.caster
+        window, count, per_scan = placed.frame.window, placed.count, scoring.per_scan
+        common = dict(
+            map_table=scoring.table, normals=caster.normals(window, self.cones.flags), pose_cell=placed.cell,
+            pose=placed.pose, rows=window.rows, cols=window.cols, particles=count, rays=readings.rays,
+            readings=readings.readings, resolution=self.grid.resolution, parts=parts.buffer, per_scan=per_scan,
+            **caster.knobs, **self._constants, **readings.arguments,
+        )  # fmt: skip
+        if scoring.tiles is None:
+            sums = dict(fixed_of=readings.sums["fixed_of"], fixed=readings.sums["fixed"])
+            return (
+                launch(
+                    "score_beams", scoring.flags, (count,), **common, **sums, log_p=scoring.log_p,
+                    temperature=self.setting.temperature, ahead=0,
+                ),
+            )  # fmt: skip
+        order = self.nothing if scoring.tiles.order is None else scoring.tiles.order.order
+        items, spread = tiles_of(count, readings.rays)
+        tiles = launch(
+            "beam_tiles", scoring.flags, (items,), **common, order=order, across=1, along=count, spread=spread
+        )
+        summing = sum_launch(
+            scoring.flags | readings.sum_flags, count, parts, order, readings.sums, scoring.log_p,
+            self.setting.temperature, per_scan,
+        )  # fmt: skip
+        return (tiles, summing) if readings.readings else (summing,)

@@ -1,0 +1,215 @@
+"""The likelihood field on a device: its numbers, end points of readings, flags and launches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.lanes import widened
+from gpusense.interface.launches import Program, launch
+from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.models.poses import PlacedPoses
+from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
+from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
+from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.tables.field import RING, FieldTable
+from gpusense.tables.reachable import ReachableMap
+from gpusense.world.frames import split
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import LikelihoodFieldParameters
+
+# Particles of a work-group of ``field_blocks`` or of vectors, as in the kernel file ``field``.
+_GROUP = 64
+# In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.
+_GUARD = 3.25
+_NO_FLAGS, _INSIDE = frozenset[str](), frozenset({"INSIDE"})
+
+
+class FieldPipeline(ScanPipeline):
+    """The stages of a likelihood field.
+
+    Attributes:
+        table: Makes the map's table.
+        components: Flags of the mixture.
+        log_table: Whether cells hold log densities or cubes of densities, not distances.
+        quick: Whether GPUs round to find cells, and look again with more digits where that is in doubt.
+    """
+
+    kept_parts = 1 / BLOCK_TERMS
+    end_points = True
+
+    def __init__(
+        self,
+        setting: Setting,
+        grid: OccupancyGrid,
+        parameters: LikelihoodFieldParameters,
+        *,
+        unknown: str,
+        outside: str,
+    ) -> None:
+        super().__init__(setting, grid)
+        bilinear, compat = parameters.interpolation == "bilinear", setting.peer is not None
+        self.log_table = (self.specialize or compat) and not bilinear
+        self.careful = self.real == np.float32
+        self.quick = self.careful and self.log_table and self.specialize
+        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=compat)
+        self._terms = self.backend.upload(terms)
+        self._guard = _GUARD * float(np.finfo(self.real).eps)
+        range_max = self.scanner.range_max
+        self.table = FieldTable(
+            self.real, parameters, grid.resolution, range_max, outside=outside,
+            compat=None if setting.peer is None else setting.peer.name, log_table=self.log_table, flags=self.components,
+        )  # fmt: skip
+        reach = (range_max + parameters.max_distance) / grid.resolution
+        self._map = ReachableMap(
+            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.mend
+        )
+
+    @property
+    def map(self) -> ReachableMap:
+        """See ScanPipeline.map."""
+        return self._map
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of the map's table on the device; 0 before there is one."""
+        region = self._map.region
+        return 0 if region is None else self.real.itemsize * (region.rows + 2 * RING) * (region.cols + 2 * RING)
+
+    def _mixture(
+        self, p: LikelihoodFieldParameters, *, bilinear: bool, cubes: bool
+    ) -> tuple[frozenset[str], np.ndarray]:
+        """Return flags of the mixture, and the numbers of the kernel file ``field``."""
+        range_max, everything = self.scanner.range_max, not self.specialize
+        flags = {"FLOAT64"} if self.real == np.float64 else {"CAREFUL"}
+        flags |= {"ALL_READINGS"} if everything else set()
+        flags |= {"BILINEAR"} if bilinear else set()
+        flags |= {"LOG_TABLE"} if self.log_table else set()
+        flags |= {"CUBES"} if cubes else set()
+        flags |= {"HIT"} if p.z_hit > 0 or everything else set()
+        rand = p.z_rand / range_max
+        peak = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+        if not self.log_table and ((p.z_hit > 0 and peak > HIGH_PEAK) or everything):
+            flags.add("SHARP")
+        if sums_linearly(rand, peak, self.real):
+            flags.add("LINEAR")
+            head = (peak, rand)
+        else:
+            log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+            head = (log_scale, log_weight(p.z_rand) - math.log(range_max))
+        terms = [head[0], 0.5 / p.sigma_hit / p.sigma_hit, head[1], log_weight(p.z_max)]
+        return frozenset(flags), rounded_terms(terms, self.real)
+
+    # ---- readings
+
+    def upload(self, scans: ClassedScans, space: Workspace) -> Readings:
+        """See ScanPipeline.upload; a point is an end point in cells relative to the sensor."""
+        cells = scans.readings / self.grid.resolution
+        lengths = cells
+        if not self.specialize:
+            # Missing and max readings are no lengths, and stay what they are as points.
+            finite = np.isfinite(cells)
+            lengths = np.where(finite, cells, 0.0)
+        high, low = split(scans.vectors * lengths[:, None], self.real)
+        if not self.specialize:
+            high[~finite] = cells[~finite, None]
+        longest = float(np.maximum.reduce(lengths))
+        # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, and 1.5 eps.
+        guard, arrays = self._guard * (longest + 2), dict(point=high, point_low=low)
+        if self.backend.info.kind == "gpu":
+            arrays["guard"] = (self._guard * (self._longest_of_blocks(lengths, scans) + 2)).astype(self.real)
+        several = scans.scans > 1
+        if several:
+            arrays["fixed_of"] = (scans.constants + self.setting.constant_term).astype(self.real)
+        given = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
+        start = counts = self.nothing
+        if several:
+            blocks = -(-scans.counts // BLOCK_TERMS)
+            begins = np.append(0, np.cumsum(scans.counts))
+            start, counts = space.upload_all("scans", [begins.astype(np.int32), blocks.astype(np.int32)])
+        fixed = float(scans.constants[0]) + self.setting.constant_term
+        return Readings(
+            scans.scans, scans.most_rays, scans.most_readings, frozenset({"SCANS"} if several else ()),
+            dict(point=given["point"], point_low=given["point_low"], guard=given.get("guard", guard), start=start),
+            dict(counts=counts, fixed_of=given.get("fixed_of", self._terms), fixed=fixed),
+            (scans.scans, scans.most_readings, len(scans.readings), fixed), longest + 2,
+        )  # fmt: skip
+
+    def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:
+        """Return the longest reading of each block, in cells; every scan has as many blocks as the longest scan."""
+        blocks = -(-scans.most_readings // BLOCK_TERMS)
+        if scans.scans == 1:
+            return np.maximum.reduceat(lengths, np.arange(0, len(lengths), BLOCK_TERMS))
+        padded = np.zeros((scans.scans, blocks * BLOCK_TERMS))
+        padded[np.arange(padded.shape[1]) < scans.counts[:, None]] = lengths
+        return padded.reshape(scans.scans, blocks, BLOCK_TERMS).max(axis=2)
+
+    def sensing(self) -> Sensing:
+        """See ScanPipeline.sensing."""
+        rules = self.rules
+        return Sensing(
+            self.scanner, rules.beams, rules.vectors[:, None], rules.z_max, end_points=True, max_depends=False,
+            possible=self.setting.possible, specialize=self.specialize, top=math.inf, guard_scale=self._guard,
+            real=self.real,
+        )  # fmt: skip
+
+    def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
+        """See ScanPipeline.place_arguments."""
+        return dict(point=filled["point"], point_low=filled["point_low"], guard=filled["guard"], start=self.nothing)
+
+    # ---- program
+
+    def spread(self, particles: int, readings: Readings) -> int:
+        """See ScanPipeline.spread."""
+        return spread_of(particles, -(-readings.readings // BLOCK_TERMS), ENOUGH_SHORT)
+
+    def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        """See ScanPipeline.conditions."""
+        inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
+        return _INSIDE if inside else _NO_FLAGS
+
+    def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
+        """See ScanPipeline.flags."""
+        flags = self.components | conditions
+        if tiled:
+            return flags | ({"QUICK"} if self.quick else _NO_FLAGS)
+        flags = widened(self.backend.info.lanes, "score_field", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
+        return flags | {"QUICK"} if self.quick and self.backend.info.vector_loops else flags
+
+    def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
+        """See ScanPipeline.layout."""
+        return readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1
+
+    def score_launches(self, scoring: Scoring) -> Program:
+        """See ScanPipeline.score_launches."""
+        placed, readings, parts = scoring.placed, scoring.readings, scoring.parts
+        window, count, per_scan = placed.frame.window, placed.count, scoring.per_scan
+        common = dict(
+            table=scoring.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=self._terms,
+            rows=window.rows, cols=window.cols, particles=count, readings=readings.readings, per_scan=per_scan,
+            parts=parts.buffer, **readings.arguments,
+        )  # fmt: skip
+        if scoring.tiles is None:
+            # Vectors of particles hold those of one scan.
+            size = readings.scans * -(-per_scan // _GROUP) * _GROUP if "WIDE" in scoring.flags else count
+            sums = dict(fixed_of=readings.sums["fixed_of"], fixed=readings.sums["fixed"])
+            return (
+                launch(
+                    "score_field", scoring.flags, (size,), **common, **sums, log_p=scoring.log_p,
+                    temperature=self.setting.temperature, ahead=0,
+                ),
+            )  # fmt: skip
+        items = (-(-count // _GROUP) << scoring.tiles.spread) * _GROUP
+        blocks = launch(
+            "field_blocks", scoring.flags, (items,), **common, across=1, along=count, spread=scoring.tiles.spread
+        )
+        summing = sum_launch(
+            scoring.flags | readings.sum_flags, count, parts, self.nothing, readings.sums, scoring.log_p,
+            self.setting.temperature, per_scan,
+        )  # fmt: skip
+        return (blocks, summing) if readings.readings else (summing,)

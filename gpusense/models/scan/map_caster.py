@@ -1,0 +1,214 @@
+"""The caster of one map, sensor mount and range on one device; models share its table of the map."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import Backend, arrays
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.lanes import widened
+from gpusense.interface.launches import Program, launch
+from gpusense.interface.plan import Omission
+from gpusense.models.poses import Frame, PlacedPoses, Poses, place
+from gpusense.models.run import Piece, chunk_of, finish, run_pieces
+from gpusense.models.scan.cones import LASER, Cones
+from gpusense.models.scan.tiles import all_within, order_of, tiles_of
+from gpusense.tables import casters
+from gpusense.tables.casters import Caster, Window
+from gpusense.tables.lookup_files import describe, write_lookup
+from gpusense.tables.normals import normal_table
+from gpusense.tables.reachable import ReachableMap, TableMemoryError
+from gpusense.world.frames import Mount
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.windows import Region
+
+
+class MapCaster:
+    """The caster of one map, sensor mount and range on one device; models share its table of the map.
+
+    Args:
+        backend: The device.
+        real: Precision.
+        grid: The map.
+        mount: The sensor's pose on the robot; its yaw belongs to the ray vectors.
+        range_max: Longest range [m].
+        method: How ranges are found.
+        unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
+        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
+        crop: False prepares the whole map at once.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        real: np.dtype,
+        grid: OccupancyGrid,
+        mount: Mount,
+        range_max: float,
+        method: Caster,
+        *,
+        unknown: str,
+        outside: str,
+        crop: bool,
+    ) -> None:
+        self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
+        self.limit = range_max / grid.resolution
+        self.method, self.outside, self._table_bytes = method, outside, 0
+        # Normals of the map's walls, and the window they belong to.
+        self._normals: tuple[Region, Buffer, int] | None = None
+        self._no_normals = backend.upload(np.zeros(2, real))
+        self.map = ReachableMap(
+            backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._mend
+        )
+        self._own_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
+        self._own_flags |= {method.flag} if method.flag else set()
+        # Those of the table once there is one.
+        self.flags = self._own_flags
+        self._wide = {"FLOAT64"} if real == np.float64 else set()
+        self._workspace = Workspace(backend)
+        # Threads may share a caster: its buffers serve one call at a time.
+        self._lock = threading.Lock()
+
+    @property
+    def table_bytes(self) -> int:
+        """Bytes of the map's tables on the device."""
+        return self._table_bytes + (0 if self._normals is None else self._normals[2])
+
+    def normals(self, region: Region, flags: frozenset[str]) -> Buffer:
+        """Normals of the walls in a window, where flags ask for them; made once for a window.
+
+        Raises:
+            TableMemoryError: the device cannot hold them.
+        """
+        if "INCIDENCE" not in flags:
+            return self._no_normals
+        if self._normals is None or self._normals[0] != region:
+            self._normals = None
+            try:
+                table = normal_table(self.map.obstacles, region, self.outside, self.real)
+                self._normals = (region, self.backend.upload(table), table.nbytes)
+            except MemoryError as error:
+                raise TableMemoryError(*error.args) from error
+        return self._normals[1]
+
+    @property
+    def knobs(self) -> dict[str, Any]:
+        """The kernels' arguments bins, slack and tolerance."""
+        return dict(zip(("bins", "slack", "tolerance"), self.method.scalars(), strict=True))
+
+    def omission(self) -> Omission | None:
+        """What cropping the map left out, once a cloud has been seen."""
+        region = self.map.region
+        return self.map.omission(self.table_bytes / region.cells) if region is not None else None
+
+    def _prepare(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
+        table = self.method.prepare(backend, Window(obstacles, self.limit, self.outside))
+        self._table_bytes = table.size
+        self.flags = self._own_flags | table.flags
+        return table.buffer
+
+    def _mend(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Region) -> bool:
+        return self.method.mend(backend, Window(obstacles, self.limit, self.outside), table, changed)
+
+    def update(self, cells: object, region: object) -> OccupancyGrid:
+        """Replace cells of the map, and return it."""
+        if isinstance(self.method, casters.Lookup) and self.method.file is not None:
+            raise ValueError(f"file: must be None where the map changes, got {checks.show(self.method.file)}")
+        with self._lock:
+            self.grid, self._normals = self.map.update(cells, region), None
+            return self.grid
+
+    def prepare(self, poses: Poses) -> None:
+        """Make the table for some poses."""
+        if poses.count:
+            with self._lock:
+                poses.window(self.map, (0, poses.count))
+
+    def save(self, path: Path, bins: int) -> None:
+        """Write the look-up table."""
+        with self._lock:
+            buffer, region = self.map.ensure([self.grid.origin])
+            entries = self.backend.download(buffer, np.empty(region.cells * bins, np.uint16))
+            obstacles = region.cut(self.map.obstacles)
+        write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
+
+    def cast(self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER) -> Any:
+        """Cast rays, in pieces that fit.
+
+        Args:
+            poses: (N, 3) poses.
+            vectors: (K, 2) ray vectors, or (K, C, 2) of cones.
+            out: Where to write the result, or None.
+            cones: How the sensor hears.
+
+        Returns:
+            (N, K) expected ranges, or angles of incidence.
+        """
+        given, rays = Poses(poses, self.backend), len(vectors)
+        shape = given.count, rays
+        target: Any = arrays.check_out(out, shape, self.real, poses, self.backend)
+        if given.on_device:
+            target = arrays.blank(self.backend, given.count * rays, self.real) if target is None else target
+            flat = target
+        else:
+            target = np.empty(shape, self.real) if target is None else target
+            flat = target.reshape(-1)
+        if given.count * rays:
+            with self._lock, self._workspace:
+                ray = self._workspace.upload("ray", vectors.astype(self.real))
+                chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
+                run_pieces(
+                    self._workspace, Piece(0, given.count, given.count), chunk,
+                    lambda piece: self._cast(given, piece, ray, rays, flat, cones),
+                )  # fmt: skip
+                finish(self._workspace, given.on_device)
+        if out is not None:
+            return out
+        if given.on_device:
+            return arrays.lent(poses, self.backend, target, shape, self.real)
+        return arrays.like(poses, target)
+
+    def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
+        """Start to cast the rays of a piece."""
+        space, count = self._workspace, piece.count
+        table, window = poses.window(self.map, piece.part)
+        placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)
+        with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
+            program = self._program(placed, table, ray, rays, result, cones)
+            self.backend.run((*placed.launches(), *program))
+
+    def _program(
+        self, placed: PlacedPoses, table: Buffer, ray: Buffer, rays: int, result: Buffer, cones: Cones
+    ) -> Program:
+        """Return the launches that cast the rays of placed poses."""
+        space, window, count = self._workspace, placed.frame.window, placed.count
+        flags = self.flags | self._wide | cones.flags
+        flags |= set() if all_within(placed, 0) else {"ORIGINS_OUTSIDE"}
+        common = dict(
+            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, rows=window.rows, cols=window.cols,
+            particles=count, rays=rays, **self.knobs, limit=self.limit, resolution=self.grid.resolution,
+            range_max=self.range_max,
+        )  # fmt: skip
+        if "ECHO" in flags:
+            other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
+            ranges, incidence = (other, result) if cones.incidence else (result, other)
+            heard = dict(
+                normals=self.normals(window, cones.flags), ranges=ranges, incidence=incidence, cone_rays=cones.rays,
+                critical=cones.critical,
+            )  # fmt: skip
+            return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
+        if self.backend.info.kind == "gpu":
+            order = order_of(space, placed, rays, self.real)
+            flags |= {"ORDERED"} if order is not None else set()
+            items, spread = tiles_of(count, rays)
+            places = placed.cell if order is None else order.order
+            tiles = launch("cast_tiles", flags, (items,), **common, ranges=result, order=places, spread=spread)
+            return (tiles,) if order is None else (*order.launches(), tiles)
+        flags = widened(self.backend.info.lanes, "cast_ranges", flags)
+        return (launch("cast_ranges", flags, (rays, count), **common, ranges=result),)

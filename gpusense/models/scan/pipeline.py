@@ -1,0 +1,343 @@
+"""The pipeline of scan models: request, readings, poses, program, run.
+
+Every scan model and every kind of call goes through these five stages. A request is checked arguments. Readings and
+poses are brought to the device. A program follows from them: it starts nothing. Running it, in pieces that fit the
+memory of the device, is the only loop.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.launches import Program
+from gpusense.interface.terms import log_weight
+from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
+from gpusense.models.run import Piece, chunk_of, run_pieces
+from gpusense.models.scan.classed import ClassedScans, Rules, class_scans
+from gpusense.models.scan.readings import Readings, Sensing, placing_launches
+from gpusense.models.scan.request import Request
+from gpusense.models.scan.tiles import Order, Parts, order_of
+from gpusense.tables.reachable import ReachableMap
+from gpusense.world.compat import Peer
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.windows import whole
+
+# Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
+# launches fill the device for longer than it takes to start them.
+TOGETHER = {"gpu": 1 << 22, "cpu": 1 << 20}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all models of scans have: the map, the device and the rules for readings.
+
+    Attributes:
+        backend: The device.
+        real: Precision.
+        rules: How readings are classed; they hold the scanner.
+        peer: The program whose weights are computed; None for likelihoods.
+        temperature: Multiplies the sum over readings.
+        constant_term: The first term of that sum.
+        possible: Whether some range is possible at some pose.
+    """
+
+    backend: Backend
+    real: np.dtype
+    rules: Rules
+    peer: Peer | None
+    temperature: float
+    constant_term: float
+    possible: bool
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """A launch in tiles of particles and rays.
+
+    Attributes:
+        spread: log2 of the number of groups of each tile.
+        order: The order of the particles, where that pays.
+    """
+
+    spread: int
+    order: Order | None
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """A piece of a request on the device, from which its program follows.
+
+    Attributes:
+        readings: The readings.
+        placed: The poses.
+        table: The map's table for the window of the poses.
+        parts: Numbers that each particle's sum adds, or the log-likelihoods of the readings.
+        log_p: The buffer for the log-likelihoods.
+        flags: Flags of the scoring kernel.
+        tiles: How GPUs tile particles and rays, and sum in a second launch; None where one launch does it all.
+    """
+
+    readings: Readings
+    placed: PlacedPoses
+    table: Buffer
+    parts: Parts
+    log_p: Buffer
+    flags: frozenset[str]
+    tiles: Tiles | None
+
+    @property
+    def per_scan(self) -> int:
+        """Particles of each scan."""
+        return self.placed.count // self.readings.scans
+
+
+@dataclass
+class LastCall:
+    """The last call, as ``explain`` reports it.
+
+    Attributes:
+        flags: Flags of its launches.
+        scans: The readings of its last scans; None before there is a call.
+        together: Scans that shared launches.
+    """
+
+    flags: frozenset[str] = frozenset()
+    scans: ClassedScans | None = None
+    together: int = 0
+
+    @property
+    def scan(self) -> ClassedScans | None:
+        """The readings of its last scan."""
+        return None if self.scans is None else self.scans.part(self.scans.scans - 1, self.scans.scans)
+
+
+class ScanPipeline(ABC):
+    """The stages of one scan model.
+
+    Attributes:
+        setting: The device and the rules.
+        grid: The map as it is.
+        nothing: A buffer for arguments that are not read.
+    """
+
+    # Rays of each beam, and numbers that GPUs keep for each reading until they are summed.
+    rays_each: int = 1
+    kept_parts: float = 1.0
+    # Whether readings are end points, whether poses are needed in two parts, and whether an order of particles may pay.
+    end_points: bool = False
+    careful: bool = False
+    orders: bool = False
+
+    def __init__(self, setting: Setting, grid: OccupancyGrid) -> None:
+        self.setting, self.grid = setting, grid
+        self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
+        self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
+        self.nothing = self.backend.upload(np.zeros(1, np.int32))
+        # Flags by everything on which they depend.
+        self._flags: dict[Hashable, frozenset[str]] = {}
+
+    # ---- what a model adds
+
+    @property
+    @abstractmethod
+    def map(self) -> ReachableMap:
+        """The map's table."""
+
+    @abstractmethod
+    def upload(self, scans: ClassedScans, space: Workspace) -> Readings:
+        """Copy the readings of scans to the device."""
+
+    @abstractmethod
+    def sensing(self) -> Sensing:
+        """Return how readings that are on the device are taken."""
+
+    @abstractmethod
+    def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
+        """Return the arguments of the scoring kernel from the buffers that ``place_inputs`` fills."""
+
+    @abstractmethod
+    def spread(self, particles: int, readings: Readings) -> int:
+        """Return log2 of the number of parts into which the work of a tile is split."""
+
+    @abstractmethod
+    def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
+        """Return the flags of the scoring kernel that depend on the poses and on their number."""
+
+    @abstractmethod
+    def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
+        """Return the flags of the scoring kernel."""
+
+    @abstractmethod
+    def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
+        """Return how many numbers each particle's sum adds, and in blocks of how many; see ``Parts``."""
+
+    @abstractmethod
+    def score_launches(self, scoring: Scoring) -> Program:
+        """Return the launches of a piece whose poses are placed."""
+
+    # ---- request: groups of scans that one program may score
+
+    def groups(self, request: Request) -> Iterator[tuple[Piece, ClassedScans]]:
+        """Yield the particles and readings of neighbouring scans that one program may score."""
+        count = request.per_scan
+        if self._shares_launches(request):
+            scans = self.classed(request.ranges)
+            for first, last in scans.groups():
+                yield Piece(first * count, last * count, count), scans.part(first, last)
+        else:
+            for i in range(request.scans):
+                yield Piece(i * count, (i + 1) * count, count), self.classed(request.ranges[i : i + 1])
+
+    def _shares_launches(self, request: Request) -> bool:
+        """Return whether several scans may be scored by one program."""
+        if request.scans < 2 or request.per_beam or not self.setting.possible:
+            return False
+        rays = max(self.scanner.count * self.rays_each, 1)
+        most = min(TOGETHER[self.backend.info.kind] // rays, self.chunk(rays))
+        return request.per_scan <= most
+
+    def chunk(self, rays: int, *, per_beam: bool = False) -> int:
+        """Return the particles of one launch with a number of rays each."""
+        kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
+        return chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
+
+    # ---- readings
+
+    def classed(self, ranges: np.ndarray) -> ClassedScans:
+        """Class, choose and group the readings of (S, K) scans."""
+        if self.setting.peer is not None:
+            ranges = self.setting.peer.readings(ranges, self.scanner, self.end_points)
+        return class_scans(ranges, self.rules)
+
+    def value(self, scans: ClassedScans) -> float | None:
+        """Return the log-likelihood of scans that have the same at every pose; None where it depends on the pose."""
+        if not len(scans.readings):
+            with np.errstate(divide="ignore"):
+                constant = scans.constants[0] if self.setting.peer is None else np.log(self.setting.constant_term)
+                return float(self.setting.temperature * constant)
+        if not self.setting.possible and np.isfinite(scans.readings).any():
+            return -np.inf
+        return None
+
+    # ---- poses
+
+    def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, Buffer]:
+        """Place some poses in a window of the map; also return the map's table for it."""
+        table, window = poses.window(self.map, part)
+        frame = Frame(window, self.grid, self.scanner.mount)
+        return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), table
+
+    # ---- program
+
+    def scoring(
+        self, readings: Readings, placed: PlacedPoses, table: Buffer, log_p: Buffer, space: Workspace, *,
+        per_beam: bool = False, ordered: bool = True,
+    ) -> Scoring:  # fmt: skip
+        """Describe a piece on the device, and allocate its parts."""
+        tiles = None
+        if self.backend.info.kind == "gpu" and not per_beam:
+            order = order_of(space, placed, readings.rays, self.real) if ordered and self.orders else None
+            tiles = Tiles(self.spread(placed.count, readings), order)
+        conditions = self.conditions(readings, placed, tiles)
+        key = conditions, readings.flags, placed.flags, tiles is None, per_beam
+        flags = self._flags.get(key)
+        if flags is None:
+            everything = conditions | readings.flags | placed.headings
+            flags = self._flags[key] = self.flags(everything, tiled=tiles is not None, per_beam=per_beam)
+        count, block = self.layout(readings, flags)
+        numbers = placed.count * count if tiles or per_beam else 1
+        parts = Parts(count, block, space.empty("parts", numbers, self.real))
+        return Scoring(readings, placed, table, parts, log_p, flags, tiles)
+
+    def program(self, scoring: Scoring) -> Program:
+        """Return all launches of a piece."""
+        tiles = scoring.tiles
+        order = () if tiles is None or tiles.order is None else tiles.order.launches()
+        placing = placing_launches(scoring.placed, scoring.readings.placing)
+        return (*placing, *order, *self.score_launches(scoring))
+
+    # ---- run
+
+    def run(self, request: Request, space: Workspace, last: LastCall) -> None:
+        """Start everything that a request needs; parts are complete on return."""
+        last.together = 0
+        for particles, scans in self.groups(request):
+            last.scans = scans
+            if not particles.count:
+                continue
+            most = self.chunk(scans.most_readings * self.rays_each, per_beam=request.per_beam)
+            run_pieces(space, particles, most, _Scorer(self, request, particles, scans, space, last))
+            if request.scans > 1:
+                space.start()
+
+
+class _Scorer:
+    """Runs the programs of one group of scans; their readings are uploaded once."""
+
+    def __init__(
+        self, pipeline: ScanPipeline, request: Request, particles: Piece, scans: ClassedScans, space: Workspace,
+        last: LastCall,
+    ) -> None:  # fmt: skip
+        self._pipeline, self._request, self._space, self._last = pipeline, request, space, last
+        self._first, self._scans = particles.scans[0], scans
+        self._uploaded: tuple[Part, Readings] | None = None
+
+    def __call__(self, piece: Piece) -> None:
+        first, last = piece.scans
+        scans = self._scans.part(first - self._first, last - self._first)
+        if (value := self._pipeline.value(scans)) is not None:
+            self._fill(piece, scans, value)
+            return
+        if self._uploaded is None or self._uploaded[0] != piece.scans:
+            self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
+        self._score(piece, scans, self._uploaded[1])
+
+    def _score(self, piece: Piece, scans: ClassedScans, readings: Readings) -> None:
+        """Score a piece; parts are complete on return."""
+        pipeline, request, space = self._pipeline, self._request, self._space
+        placed, table = pipeline.place(request.poses, piece.part, space)
+        with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
+            scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
+            key = (scoring.flags, placed.key, readings.key)
+            flags = space.run(
+                key, (placed.source, log_p, table), lambda: pipeline.program(scoring), version=pipeline.map.version,
+                lasting=not request.poses.on_device,
+            )  # fmt: skip
+        self._last.flags = flags
+        if readings.scans > 1:
+            self._last.together = max(self._last.together, readings.scans)
+        if request.per_beam:
+            each = np.empty((piece.count, len(scans.readings)), pipeline.real)
+            rows = self._rows(piece)
+            rows[:, scans.columns] = pipeline.backend.download(scoring.parts.buffer, each)
+            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
+
+    def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
+        """Set log-likelihoods that do not depend on the poses; device poses are inspected all the same."""
+        pipeline, request, space = self._pipeline, self._request, self._space
+        if request.poses.on_device:
+            frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
+            placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
+            pipeline.backend.run(placed.launches())
+            with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
+                pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
+        else:
+            request.log_p[piece.begin : piece.end] = value
+        if request.per_beam:
+            rows, finite = self._rows(piece), np.isfinite(scans.readings)
+            rows[:, scans.columns[finite]] = -np.inf
+            rows[:, scans.columns[~finite]] = log_weight(pipeline.rules.z_max)
+            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
+
+    def _rows(self, piece: Piece) -> np.ndarray:
+        """Return the rows of a piece of one scan in the parts of the request."""
+        scan = piece.scans[0]
+        before = scan * piece.per_scan
+        return self._request.parts[scan, piece.begin - before : piece.end - before]

@@ -1,0 +1,141 @@
+"""Launches for GPUs: tiles of particles and rays, the order of particles, and sums of parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.backends.base import Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.launches import Launch, Program, launch
+from gpusense.models.poses import PlacedPoses
+from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.reference.order import ALL_BINS, STRETCH
+from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
+from gpusense.world.windows import extent
+
+_INT = np.dtype(np.int32)
+_UNBOUNDED = np.full(7, -(1 << 31), _INT)
+# Particle-beams from which an order saves more time than it takes, and particles.
+LEAST_ORDERED = (1 << 22, 1 << 12)
+# Work-items that fill any device.
+ENOUGH = 1 << 21
+# The same for the likelihood field, whose work-items are short, so that their beginnings count.
+ENOUGH_SHORT = 1 << 19
+
+
+def all_within(placed: PlacedPoses, reach: float, ring: int = 0) -> bool:
+    """Return whether all cells within ``reach`` of the sensors surely lie in the window and a ring around it."""
+    if placed.corners is None:
+        return False
+    window, frame = placed.frame.window, placed.frame
+    left, right, low, high = extent(frame.cells, placed.corners, frame.mount)
+    reach += 1
+    return bool(
+        left - reach >= window.col - ring
+        and right + reach <= window.col + window.cols + ring
+        and low - reach >= window.row - ring
+        and high + reach <= window.row + window.rows + ring
+    )
+
+
+@dataclass(frozen=True)
+class Order:
+    """An order of the particles that makes neighbouring rays coherent; see the kernel file ``order``."""
+
+    placed: PlacedPoses
+    bounds: Buffer
+    bins: Buffer
+    bin_of: Buffer
+    order: Buffer
+    flags: frozenset[str]
+
+    def launches(self) -> Program:
+        """Return the launches that find it."""
+        count, poses = self.placed.count, dict(pose_cell=self.placed.cell, pose=self.placed.pose)
+        bins = dict(bounds=self.bounds, bins=self.bins)
+        return (
+            launch("order_bounds", self.flags, (ALL_BINS,), **poses, **bins, particles=count),
+            launch("order_count", self.flags, (count,), **poses, **bins, bin_of=self.bin_of, particles=count),
+            launch("order_starts", self.flags, (ALL_BINS // STRETCH,), **bins),
+            launch(
+                "order_fill", self.flags, (count,), bin_of=self.bin_of, bins=self.bins, order=self.order,
+                particles=count,
+            ),
+        )  # fmt: skip
+
+
+def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -> Order | None:
+    """Return an order of the particles where that pays, and upload its bounds."""
+    count = placed.count
+    if count * rays < LEAST_ORDERED[0] or count < LEAST_ORDERED[1]:
+        return None
+    return Order(
+        placed, space.upload("bounds", _UNBOUNDED), space.empty("bins", ALL_BINS, _INT),
+        space.empty("bin_of", count, _INT), space.empty("order", count, _INT),
+        frozenset({"FLOAT64"} if real == np.float64 else ()),
+    )  # fmt: skip
+
+
+def spread_of(items: int, groups: int, enough: int) -> int:
+    """Return log2 of the number of parts into which the work of each of ``items`` work-items is split.
+
+    Args:
+        items: Work-items before the split.
+        groups: Groups of readings or rays of each, the most parts there can be.
+        enough: Work-items that fill the device.
+    """
+    spread = 0
+    while items << spread < enough and 1 << spread < groups:
+        spread += 1
+    return spread
+
+
+def stranded(rays: int, spread: int) -> bool:
+    """Return whether a launch in tiles has a block of rays for each group of a tile: work-items then sum strands."""
+    return -(-rays // BLOCK_TERMS) >= 1 << spread
+
+
+def tiles_of(particles: int, rays: int) -> tuple[int, int]:
+    """Return the work-items of a launch in tiles of particles and rays, and its spread."""
+    tiles = -(-particles // TILE_PARTICLES)
+    spread = spread_of(tiles * TILE, -(-rays // TILE_RAYS), ENOUGH)
+    return (tiles << spread) * TILE, spread
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Numbers that a particle's sum adds.
+
+    Attributes:
+        count: Numbers of each particle.
+        block: 1 for sums of blocks or strands, BLOCK_TERMS for terms of single readings.
+        buffer: All of them, the numbers of a place ``particles`` apart.
+    """
+
+    count: int
+    block: int
+    buffer: Buffer = None
+
+
+def sum_launch(
+    flags: frozenset[str], particles: int, parts: Parts, order: Buffer, sums: dict[str, object], log_p: Buffer,
+    temperature: float, per_scan: int,
+) -> Launch:  # fmt: skip
+    """Return the launch that sums the parts of each particle.
+
+    Args:
+        flags: Flags of its code.
+        particles: Particles of the launch.
+        parts: Their numbers.
+        order: Order of the particles.
+        sums: Constant terms and counts of the scans; see ``Readings.sums``.
+        log_p: Where the sums go.
+        temperature: Multiplies them.
+        per_scan: Particles of each scan.
+    """
+    return launch(
+        "sum_parts", flags, (particles,), parts=parts.buffer, order=order, **sums, log_p=log_p, particles=particles,
+        count=parts.count, block=parts.block, across=1, along=particles, temperature=temperature, per_scan=per_scan,
+    )  # fmt: skip

@@ -1,0 +1,27 @@
+// Error-free transformations in lanes: error_free.cl for LANES numbers at once, with the same bits.
+// requires: lanes/types
+
+// A sum of two numbers in each lane.
+typedef struct {
+    lanes hi, lo;
+} LanePair;
+
+// Return a + b = hi + lo exactly.
+LanePair two_sum_lanes(const lanes a, const lanes b) {
+    const lanes sum = a + b, shift = sum - a;
+    return (LanePair){sum, (a - (sum - shift)) + (b - shift)};
+}
+
+// Return a * b = hi + lo exactly, short of overflow and underflow.
+LanePair two_product_lanes(const lanes a, const lanes b) {
+    const lanes product = a * b, scaled_a = SPLITTER * a, scaled_b = SPLITTER * b;
+    const lanes a_high = scaled_a - (scaled_a - a), b_high = scaled_b - (scaled_b - b);
+    const lanes a_low = a - a_high, b_low = b - b_high;
+    return (LanePair){product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low};
+}
+
+// Return a * b = hi + lo by a fused multiply-add.
+LanePair fused_product_lanes(const lanes a, const lanes b) {
+    const lanes product = a * b;
+    return (LanePair){product, fma(a, b, -product)};
+}

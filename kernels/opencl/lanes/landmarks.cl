@@ -1,0 +1,147 @@
+// Density of one feature at one landmark for LANES particles at once: landmarks.cl, offsets.cl and log_terms.cl in
+// lanes, for features that have ranges and bearings and are seen all around. Every lane has the arithmetic of the
+// scalar kernel, except that exp, log and erf are those of lanes/math, that the arc tangent has two arcs only, 0 and
+// pi/4, and that a fused multiply-add gives the rounding error of a product.
+// requires: landmarks lanes/error_free lanes/math
+
+// A place, an offset or a direction in each lane.
+typedef struct {
+    LanePair x, y;
+} LanePlace;
+
+// tan(pi/8); pi/4, pi/2 and pi as sums of two numbers.
+#define EIGHTH_SLOPE 0.414213562f
+#define EIGHTH_TURN 0.785398185f
+#define EIGHTH_TURN_LOW -2.18556941e-08f
+#define QUARTER_TURN 1.57079637f
+#define QUARTER_TURN_LOW -4.37113883e-08f
+#define HALF_TURN 3.14159274f
+#define HALF_TURN_LOW -8.74227766e-08f
+
+// Return c - a for a positive c.
+LanePair difference_lanes(const float c, const float c_low, const LanePair a) {
+    const LanePair sum = two_sum_lanes((lanes)c, -a.hi);
+    return two_sum_lanes(sum.hi, sum.lo + (c_low - a.lo));
+}
+
+// Return the direction of a feature in the world: the heading, turned by the bearing.
+LanePlace direction_lanes(const LanePlace heading, global const real *feature) {
+    const float c = feature[COSINE], s = feature[SINE], c_low = feature[COSINE_LOW], s_low = feature[SINE_LOW];
+    const LanePair cc = fused_product_lanes(heading.x.hi, (lanes)c), ss = fused_product_lanes(heading.y.hi, (lanes)s);
+    const LanePair cs = fused_product_lanes(heading.x.hi, (lanes)s), sc = fused_product_lanes(heading.y.hi, (lanes)c);
+    LanePlace turned = {two_sum_lanes(cc.hi, -ss.hi), two_sum_lanes(sc.hi, cs.hi)};
+    turned.x.lo += (cc.lo - ss.lo) +
+                   ((heading.x.hi * c_low + heading.x.lo * c) - (heading.y.hi * s_low + heading.y.lo * s));
+    turned.y.lo += (sc.lo + cs.lo) +
+                   ((heading.y.hi * c_low + heading.y.lo * c) + (heading.x.hi * s_low + heading.x.lo * s));
+    return turned;
+}
+
+// Return the offset from the sensors to a landmark.
+LanePlace offset_lanes(const real4 landmark, const LanePlace place) {
+    const LanePair x = two_sum_lanes((lanes)landmark.x, -place.x.hi), y = two_sum_lanes((lanes)landmark.y, -place.y.hi);
+    return (LanePlace){two_sum_lanes(x.hi, x.lo + (landmark.z - place.x.lo)),
+                       two_sum_lanes(y.hi, y.lo + (landmark.w - place.y.lo))};
+}
+
+// Return the length of an offset.
+LanePair distance_pair_lanes(const LanePlace off) {
+    const LanePair xx = fused_product_lanes(off.x.hi, off.x.hi), yy = fused_product_lanes(off.y.hi, off.y.hi);
+    const LanePair sum = two_sum_lanes(xx.hi, yy.hi);
+    const lanes d = sqrt(sum.hi);
+    const LanePair dd = fused_product_lanes(d, d);
+    const lanes rest = (sum.hi - dd.hi) + ((sum.lo + ((xx.lo + yy.lo) - dd.lo)) +
+                                           2.0f * (off.x.hi * off.x.lo + off.y.hi * off.y.lo));
+    return (LanePair){d, d > 0 ? rest / (2.0f * d) : (lanes)0};
+}
+
+// Return the absolute value of the angle between an offset and a direction, in [0, pi].
+LanePair angle_pair_lanes(const LanePlace off, const LanePlace turned) {
+    const LanePair right = fused_product_lanes(turned.x.hi, off.y.hi);
+    const LanePair left = fused_product_lanes(turned.y.hi, off.x.hi);
+    const LanePair forth = fused_product_lanes(turned.x.hi, off.x.hi);
+    const LanePair more = fused_product_lanes(turned.y.hi, off.y.hi);
+    LanePair side = two_sum_lanes(right.hi, -left.hi), ahead = two_sum_lanes(forth.hi, more.hi);
+    side.lo += (right.lo - left.lo) + ((turned.x.hi * off.y.lo + turned.x.lo * off.y.hi) -
+                                       (turned.y.hi * off.x.lo + turned.y.lo * off.x.hi));
+    ahead.lo += (forth.lo + more.lo) + ((turned.x.hi * off.x.lo + turned.x.lo * off.x.hi) +
+                                        (turned.y.hi * off.y.lo + turned.y.lo * off.y.hi));
+    const ilanes behind = ahead.hi < 0, under = side.hi < 0;
+    const LanePair a = {behind ? -ahead.hi : ahead.hi, behind ? -ahead.lo : ahead.lo};
+    const LanePair b = {under ? -side.hi : side.hi, under ? -side.lo : side.lo};
+    const ilanes steep = b.hi > a.hi;
+    LanePair num = {steep ? a.hi : b.hi, steep ? a.lo : b.lo}, den = {steep ? b.hi : a.hi, steep ? b.lo : a.lo};
+    const ilanes large = num.hi > EIGHTH_SLOPE * den.hi;
+    if (any_lane(large)) {
+        // (num - den) / (num + den) is the slope from 1 on.
+        const LanePair less = two_sum_lanes(num.hi, -den.hi), sum = two_sum_lanes(den.hi, num.hi);
+        num = (LanePair){large ? less.hi : num.hi, large ? less.lo + (num.lo - den.lo) : num.lo};
+        den = (LanePair){large ? sum.hi : den.hi, large ? sum.lo + (den.lo + num.lo) : den.lo};
+    }
+    const lanes one_over = 1.0f / den.hi, t = num.hi * one_over;
+    const lanes t_low = (fma(-t, den.hi, num.hi) + (num.lo - t * den.lo)) * one_over;
+    const LanePair sum = two_sum_lanes(large ? (lanes)EIGHTH_TURN : (lanes)0, t);
+    LanePair arc = two_sum_lanes(sum.hi,
+                                 sum.lo + ((large ? (lanes)EIGHTH_TURN_LOW : (lanes)0) + (t_low + arc_rest_lanes(t))));
+    if (any_lane(steep)) {
+        const LanePair rest = difference_lanes(QUARTER_TURN, QUARTER_TURN_LOW, arc);
+        arc = (LanePair){steep ? rest.hi : arc.hi, steep ? rest.lo : arc.lo};
+    }
+    if (any_lane(behind)) {
+        const LanePair rest = difference_lanes(HALF_TURN, HALF_TURN_LOW, arc);
+        arc = (LanePair){behind ? rest.hi : arc.hi, behind ? rest.lo : arc.lo};
+    }
+    return arc;
+}
+
+// Add (residual * scale)^2 to an exponent.
+LanePair add_square_lanes(const LanePair total, const LanePair residual, const float scale, const float scale_low) {
+    const LanePair u = fused_product_lanes(residual.hi, (lanes)scale);
+    const lanes u_low = u.lo + (residual.hi * scale_low + residual.lo * scale);
+    const LanePair square = fused_product_lanes(u.hi, u.hi), sum = two_sum_lanes(total.hi, square.hi);
+    const lanes low = sum.lo + (total.lo + (square.lo + 2.0f * u.hi * u_low));
+    // After an overflow there is no low part.
+    return (LanePair){sum.hi, low - low == 0 ? low : (lanes)0};
+}
+
+// Return log(z_detect p(f | j)) of a feature at an offset.
+lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global const real *feature,
+                          global const real *terms) {
+    LanePair exponent = {0, 0};
+    lanes mass = 1;
+    const LanePair d = distance_pair_lanes(off);
+#if RANGE
+    if (feature[RANGE_SCALE] > 0) {
+        const float scale = feature[RANGE_SCALE];
+        const LanePair r = two_sum_lanes(d.hi, (lanes)-feature[RANGE_AT]);
+        exponent = add_square_lanes(exponent, two_sum_lanes(r.hi, r.lo + (d.lo - feature[RANGE_LOW])), scale,
+                                    feature[RANGE_SCALE_LOW]);
+        const lanes inside = d.hi < terms[0] ? d.hi : (lanes)terms[0];
+        const lanes left = (terms[0] - d.hi) + (terms[1] - d.lo);
+        const lanes below = inside * scale, above = (left > 0 ? left : (lanes)0) * scale;
+        if (any_lane((below < above ? below : above) < (float)ERF_ONE))
+            mass = 0.5f * (erf_lanes(below) + erf_lanes(above));
+    }
+#endif
+#if BEARING
+    if (feature[BEARING_SCALE] > 0) {
+        const ilanes has_bearing = d.hi > (float)ZERO_RANGE;
+        const LanePair more =
+            add_square_lanes(exponent, angle_pair_lanes(off, turned), feature[BEARING_SCALE],
+                             feature[BEARING_SCALE_LOW]);
+        exponent = (LanePair){has_bearing ? more.hi : exponent.hi, has_bearing ? more.lo : exponent.lo};
+        mass = has_bearing ? mass : mass * (terms[3] * feature[BEARING_SCALE]);
+    }
+#endif
+    const lanes log_p = (feature[PEAK] - exponent.hi) + (feature[PEAK_LOW] - exponent.lo);
+    return any_lane(mass != 1) ? (mass == 1 ? log_p : log_p - log_lanes(mass)) : log_p;
+}
+
+// Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
+lanes either_lanes(const lanes detected, const float false_positive) {
+    const ilanes larger = detected > false_positive;
+    const lanes high = larger ? detected : (lanes)false_positive, low = larger ? (lanes)false_positive : detected;
+    const lanes small = exp_lanes(low - high), sum = 1.0f + small;
+    const lanes sum_log = high + (log_lanes(sum) + (small - (sum - 1.0f)) / sum);
+    return high > -INFINITY ? sum_log : high;
+}

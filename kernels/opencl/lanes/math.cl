@@ -1,0 +1,95 @@
+// Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors
+// through memory. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
+//     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
+//     erf(x) = 1 - exp(-x W(x));   arctan t = t + t^3 A(t^2).
+// bench/derive/lane_constants.py derives the constants; tests/test_lane_math.py measures the worst errors that stand below, in
+// ulps of float32.
+// requires: lanes/types
+
+// log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
+#define LOG2_HIGH 0.693145752f
+#define LOG2_LOW 1.42860677e-06f
+#define ONE_OVER_LOG2 1.44269502f
+// 1.5 * 2^23: a sum with it is rounded to a whole number, which stands in its last bits.
+#define LANE_ROUNDER 12582912.0f
+// e^EXP_ZERO is close to the smallest normal number; e^EXP_LOST is below half of the last bit of 1.
+#define EXP_ZERO -87.0f
+#define EXP_LOST -20.0f
+// Bits of sqrt(1/2).
+#define ROOT_HALF 0x3f3504f3
+// From here on the error function is 1 to the last bit.
+#define LANE_ERF_ONE 4.0f
+// E, L, A and W, lowest power first. Their relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t) and 2^-24.2.
+#define E0 0.49999997f
+#define E1 0.166665465f
+#define E2 0.041667223f
+#define E3 0.00836638454f
+#define E4 0.00138791779f
+#define L0 0.333333313f
+#define L1 -0.250008196f
+#define L2 0.200012267f
+#define L3 -0.166233569f
+#define L4 0.142017633f
+#define L5 -0.131601855f
+#define L6 0.127615467f
+#define L7 -0.0763445124f
+#define A0 -0.333333164f
+#define A1 0.199984789f
+#define A2 -0.14243634f
+#define A3 0.105943188f
+#define A4 -0.0607896857f
+#define W0 1.12837923f
+#define W1 0.636619389f
+#define W2 0.102777831f
+#define W3 -0.0191530641f
+#define W4 -0.000160394105f
+#define W5 0.00166702515f
+#define W6 -0.000632835436f
+#define W7 0.000117640826f
+#define W8 -9.25621225e-06f
+
+// Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
+lanes reduced_exp_lanes(const lanes a, ilanes *count) {
+    const lanes shifted = a * ONE_OVER_LOG2 + LANE_ROUNDER, k = shifted - LANE_ROUNDER;
+    const lanes r = (a - k * LOG2_HIGH) - k * LOG2_LOW, square = r * r;
+    *count = as_ilanes(shifted) - as_int(LANE_ROUNDER);
+    return r + square * ((E0 + E1 * r) + square * ((E2 + E3 * r) + square * E4));
+}
+
+// Return e^a for a <= 0, within 1.1 ulp. Denormal results become 0: processors compute slowly with them.
+lanes exp_lanes(const lanes a) {
+    ilanes k;
+    const lanes rest = reduced_exp_lanes(a, &k), power = (1.0f + rest) * as_lanes((k + 127) << 23);
+    return a < EXP_ZERO ? (lanes)0 : power;
+}
+
+// Return 1 - e^a for a <= 0, within 1.1 ulp. Nothing cancels: where the count is 0, so is the first term.
+lanes one_minus_exp_lanes(const lanes a) {
+    ilanes k;
+    const lanes rest = reduced_exp_lanes(a < EXP_LOST ? (lanes)EXP_LOST : a, &k), scale = as_lanes((k + 127) << 23);
+    return (1.0f - scale) - scale * rest;
+}
+
+// Return log(p) of a finite normal number p > 0, within 0.9 ulp.
+lanes log_lanes(const lanes p) {
+    const ilanes above = as_ilanes(p) - ROOT_HALF;
+    const lanes k = to_lanes(above >> 23), f = as_lanes((above & 0x7fffff) + ROOT_HALF) - 1.0f, square = f * f;
+    const lanes low = (L0 + L1 * f) + square * (L2 + L3 * f), high = (L4 + L5 * f) + square * (L6 + L7 * f);
+    const lanes cubic = (square * f) * (low + (square * square) * high);
+    return (f + ((cubic + k * LOG2_LOW) - 0.5f * square)) + k * LOG2_HIGH;
+}
+
+// Return arctan t - t for |t| <= tan(pi/8).
+lanes arc_rest_lanes(const lanes t) {
+    const lanes z = t * t;
+    return t * z * ((A0 + A1 * z) + z * z * ((A2 + A3 * z) + z * z * A4));
+}
+
+// Return erf(x) for x >= 0, within 3.8 ulp; exactly 1 from 4 on.
+lanes erf_lanes(const lanes x) {
+    if (!any_lane(x < LANE_ERF_ONE)) return (lanes)1.0f;
+    const lanes b = x < LANE_ERF_ONE ? x : (lanes)LANE_ERF_ONE;
+    const lanes square = b * b, low = (W0 + W1 * b) + square * (W2 + W3 * b);
+    const lanes high = (W4 + W5 * b) + square * ((W6 + W7 * b) + square * W8);
+    return one_minus_exp_lanes(-b * (low + (square * square) * high));
+}

@@ -1,0 +1,62 @@
+// Vector types of the kernels in this folder: one work-item computes LANES particles, beams or pairs at once. They are
+// for processors whose compilers make no vector code of scalar kernels. Where a processor's vectors are shorter than
+// LANES, the loads of several vectors wait for memory side by side. A function in lanes has the name of its scalar one
+// and the ending _lanes. There are 16 lanes of float32; the sums for learning alone have lanes of float64, 8 of them.
+// PoCL compiles any, fabs, fmax, min and max as calls, which are too slow for an inner loop: comparisons and masks
+// stand in their place.
+
+#if FLOAT64
+typedef double8 lanes;
+typedef long8 ilanes;
+#define LANES 8
+#define load_lanes vload8
+
+// Return whether a comparison holds in any lane.
+int any_lane(const ilanes holds) {
+    const long4 four = holds.lo | holds.hi;
+    const long2 two = four.lo | four.hi;
+    return (two.x | two.y) != 0;
+}
+
+// Return the sum of all lanes.
+real sum_lanes(const lanes a) {
+    const double4 four = a.lo + a.hi;
+    const double2 two = four.lo + four.hi;
+    return two.x + two.y;
+}
+#else
+typedef float16 lanes;
+typedef int16 ilanes;
+#define LANES 16
+#define to_lanes convert_float16
+#define to_ilanes convert_int16_rtz
+#define as_ilanes as_int16
+#define as_lanes as_float16
+#define load_lanes vload16
+#define store_lanes vstore16
+#define GATHER(type, table, i)                                                                                           \
+    ((type)(table[i.s0], table[i.s1], table[i.s2], table[i.s3], table[i.s4], table[i.s5], table[i.s6], table[i.s7],      \
+            table[i.s8], table[i.s9], table[i.sa], table[i.sb], table[i.sc], table[i.sd], table[i.se], table[i.sf]))
+// GATHER with indices in memory: faster where they were computed well before.
+#define GATHER_AT(type, table, i)                                                                                        \
+    ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]],      \
+            table[i[8]], table[i[9]], table[i[10]], table[i[11]], table[i[12]], table[i[13]], table[i[14]], table[i[15]]))
+
+// Return whether a comparison holds in any lane.
+int any_lane(const ilanes holds) {
+    const int8 eight = holds.lo | holds.hi;
+    const long2 two = as_long2(eight.lo | eight.hi);
+    return (two.x | two.y) != 0;
+}
+
+// Return the sum of all lanes.
+real sum_lanes(const lanes a) {
+    const float8 eight = a.lo + a.hi;
+    const float4 four = eight.lo + eight.hi;
+    const float2 two = four.lo + four.hi;
+    return two.x + two.y;
+}
+
+// Return the bits of the absolute values; as integers they have the order of the values.
+ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
+#endif

@@ -1,0 +1,253 @@
+"""Faults of real machines, provoked: each gives a clear message and leaves a working model."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.interface import sources
+from gpusense.models import run
+
+
+def room() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
+    cells = np.zeros((40, 60), np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    cells[10:14, 30:33] = 100
+    grid = gs.OccupancyGrid(cells, 0.1)
+    scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.1, count=41, range_max=5.0)
+    rng = np.random.default_rng(1)
+    poses = rng.uniform((0.2, 0.2, -3), (5.8, 3.8, 3), (2000, 3))
+    return grid, scanner, poses, gs.RayCaster(grid, 5.0, backend="numpy").cast(poses[:1], scanner.bearings)[0]
+
+
+@pytest.mark.parametrize("model_type", [gs.BeamModel, gs.LikelihoodFieldModel])
+def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type, monkeypatch):
+    grid, scanner, poses, ranges = room()
+    model = model_type(grid, scanner, backend=backend)
+    whole = model.log_likelihood(poses, ranges)
+    device = get_backend(backend)
+    empty, asked = type(device).empty, []
+    # Of 2000 particles; GPUs keep the 41 numbers of each of a beam model's 256 until they are summed.
+    room_for = 11_000 if device.info.kind == "gpu" and model_type is gs.BeamModel else 2500
+
+    def short_of_memory(self, count, dtype, *, zero=False):
+        asked.append(count)
+        if count > room_for:
+            raise MemoryError("the device is full")
+        return empty(self, count, dtype, zero=zero)
+
+    model._workspace.release()
+    with monkeypatch.context() as patch:
+        patch.setattr(type(device), "empty", short_of_memory)
+        pieces = model.log_likelihood(poses, ranges)
+        assert max(asked) > room_for
+    np.testing.assert_array_equal(pieces, whole)
+    np.testing.assert_array_equal(model.log_likelihood(poses, ranges), whole)
+
+
+def test_a_device_without_memory_is_an_error_and_the_model_recovers(backend, monkeypatch):
+    grid, scanner, poses, ranges = room()
+    model = gs.BeamModel(grid, scanner, backend=backend)
+    before = model.log_likelihood(poses, ranges)
+    model._workspace.release()
+
+    def full(self, count, dtype, *, zero=False):
+        raise MemoryError("the device is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(get_backend(backend)), "empty", full)
+        with pytest.raises(MemoryError, match="the device is full"):
+            model.log_likelihood(poses, ranges)
+    np.testing.assert_array_equal(model.log_likelihood(poses, ranges), before)
+
+
+def test_a_kernel_that_does_not_compile_names_file_line_and_log(needs, monkeypatch):
+    device = get_backend(needs("opencl"))
+    source = sources.opencl_source
+
+    def broken(name):
+        text = source(name)
+        return text.replace("real k_x = COUNT + (real)start.k_x", "real k_x = nonsense") if name == "raycast" else text
+
+    line = 1 + source("raycast").split("real k_x = COUNT + (real)start")[0].count("\n")
+    monkeypatch.setattr(sources, "opencl_source", broken)
+    with pytest.raises(RuntimeError) as caught:
+        device._build("ranges", frozenset({"ORIGINS_OUTSIDE"}))
+    message = str(caught.value)
+    assert message.startswith("ranges.cl did not compile on ")
+    assert f"raycast.cl:{line}:" in message
+    assert "nonsense" in message
+
+
+def test_places_in_the_whole_source_become_places_in_files():
+    source = sources.assemble("ranges", frozenset())
+    number = 1 + source.split("real k_x = COUNT + (real)start")[0].count("\n")
+    line = 1 + sources.opencl_source("raycast").split("real k_x = COUNT + (real)start")[0].count("\n")
+    assert sources.with_places(f"<kernel>:{number}:15: error", source) == f"raycast.cl:{line}:15: error"
+    assert sources.with_places("<kernel>:1:1: error", source) == "<kernel>:1:1: error"
+
+
+def test_a_device_that_is_gone_says_so(needs, monkeypatch):
+    import pyopencl as cl
+
+    from gpusense.backends.opencl import backend as _opencl
+
+    grid, scanner, poses, ranges = room()
+    model = gs.BeamModel(grid, scanner, backend=needs("opencl"))
+    before = model.log_likelihood(poses, ranges)
+
+    def gone(*arguments, **options):
+        raise cl.RuntimeError("clEnqueueNDRangeKernel failed: DEVICE_NOT_AVAILABLE")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_opencl.cl, "enqueue_nd_range_kernel", gone)
+        with pytest.raises(RuntimeError, match="no longer available, make the model anew"):
+            model.log_likelihood(poses, ranges)
+    np.testing.assert_array_equal(model.log_likelihood(poses, ranges), before)
+
+
+def test_threads_may_share_a_model(backend):
+    grid, scanner, poses, ranges = room()
+    model = gs.BeamModel(grid, scanner, backend=backend)
+    clouds = [poses[: 100 + 50 * i] for i in range(8)]
+    expected = [model.log_likelihood(cloud, ranges) for cloud in clouds]
+    casts = [model.expected_ranges(cloud[:50]) for cloud in clouds]
+    results: dict[int, list[bool]] = {}
+
+    def work(i: int) -> None:
+        same = []
+        for _ in range(5):
+            same.append(np.array_equal(model.log_likelihood(clouds[i], ranges), expected[i]))
+            same.append(np.array_equal(model.expected_ranges(clouds[i][:50]), casts[i]))
+        results[i] = same
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 8
+    assert all(all(same) for same in results.values())
+
+
+def test_threads_may_use_models_of_their_own_on_one_device(backend):
+    grid, scanner, poses, ranges = room()
+    expected = gs.LikelihoodFieldModel(grid, scanner, backend=backend).log_likelihood(poses, ranges)
+    results = []
+
+    def work() -> None:
+        model = gs.LikelihoodFieldModel(grid, scanner, backend=backend)
+        results.extend(np.array_equal(model.log_likelihood(poses, ranges), expected) for _ in range(5))
+
+    threads = [threading.Thread(target=work) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 30
+    assert all(results)
+
+
+_FORK = """
+import multiprocessing, os, sys
+import numpy as np, gpusense as gs
+cells = np.zeros((20, 20), int); cells[5] = 100
+grid = gs.OccupancyGrid(cells, 1.0)
+BACKEND = {backend!r}
+def work(send):
+    try:
+        send.send(float(gs.RayCaster(grid, 10.0, backend=BACKEND).cast([[2.5, 1.5, 1.5707963267948966]], [0.0])[0, 0]))
+    except RuntimeError as error:
+        send.send(str(error))
+if __name__ == "__main__":
+    gs.RayCaster(grid, 10.0, backend=BACKEND).cast([[2.5, 1.5, 0.0]], [0.0])
+    for method in ("fork", "spawn"):
+        context = multiprocessing.get_context(method)
+        receive, send = context.Pipe(False)
+        process = context.Process(target=work, args=(send,))
+        process.start(); print(receive.recv()); process.join()
+"""
+
+
+@pytest.mark.parametrize("family", ["opencl", "warp"])
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_a_forked_child_is_refused_and_a_spawned_one_works(needs, family, tmp_path):
+    script = tmp_path / "workers.py"
+    script.write_text(_FORK.format(backend=needs(family)))
+    run = subprocess.run([sys.executable, "-W", "ignore", str(script)], capture_output=True, text=True, timeout=300)
+    forked, spawned = run.stdout.splitlines()
+    assert "does not survive a fork: start workers with multiprocessing.get_context('spawn')" in forked
+    assert spawned == "3.5", run.stderr
+
+
+_COLD = """
+import numpy as np, gpusense as gs
+cells = np.zeros((20, 20), int); cells[5] = 100
+grid = gs.OccupancyGrid(cells, 1.0)
+print(gs.RayCaster(grid, 10.0, backend={backend!r}).cast([[2.5, 1.5, 1.5707963267948966]], [0.0])[0, 0])
+"""
+
+
+@pytest.mark.parametrize("family", ["opencl", "warp"])
+def test_two_processes_may_start_with_a_cold_cache_at_once(needs, family, tmp_path):
+    places = ("GPUSENSE_CACHE_DIR", "POCL_CACHE_DIR", "XDG_CACHE_HOME", "WARP_CACHE_PATH")
+    # With proofs: see test_cache.
+    environment = os.environ | {place: str(tmp_path / place) for place in places} | {"GPUSENSE_PROOF": "off"}
+    for place in places:
+        (tmp_path / place).mkdir()
+    command = [sys.executable, "-W", "ignore", "-c", _COLD.format(backend=needs(family))]
+    started = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    for process in started:
+        output, errors = process.communicate(timeout=300)
+        assert output.strip() == "3.5", errors
+
+
+_LONG = """
+import sys, numpy as np, gpusense as gs
+cells = np.zeros((200, 200), np.int8); cells[[0, -1]] = 100; cells[::7, ::5] = 100
+grid = gs.OccupancyGrid(cells, 0.1)
+scanner = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.02, count=300, range_max=30.0)
+model = gs.BeamModel(grid, scanner, backend={backend!r})
+poses = np.random.default_rng(0).uniform((0, 0, -3), (20, 20, 3), (300, 3))
+ranges = model.expected_ranges(poses[:1])[0]
+before = model.log_likelihood(poses, ranges)
+many = np.tile(poses, (20_000, 1))
+print("ready", flush=True)
+try:
+    model.log_likelihood(many, ranges)
+except KeyboardInterrupt:
+    print("interrupted", np.array_equal(model.log_likelihood(poses, ranges), before), flush=True)
+"""
+
+
+def test_a_long_batch_can_be_interrupted_and_the_model_still_works(backend, tmp_path):
+    if backend.startswith("warp:cuda") or get_backend(backend).info.kind == "gpu":
+        pytest.skip("a GPU is done before it can be interrupted")
+    command = [sys.executable, "-W", "ignore", "-c", _LONG.format(backend=backend)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=120)
+    assert output == "interrupted True\n", errors
+
+
+def test_work_on_a_processor_is_cut_into_pieces_that_can_be_interrupted():
+    device = get_backend("numpy")
+    assert run.chunk_of(device, 360) == run.CHUNK_WORK // 360 // 256 * 256
+    assert run.chunk_of(device, 1 << 17) == run.CHUNK_WORK >> 17 == 128
+    assert run.chunk_of(device, 1 << 30) == 1
+    assert run.chunk_of(device, 4, 8) <= run.CHUNK_BYTES // 32

@@ -1,0 +1,426 @@
+"""Drivers that fail end no process of a user's: verdicts, the order in which settings give way, and real fakes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from support import fake_driver
+
+import gpusense as gs
+from gpusense.backends import BackendInfo, child, proof
+from gpusense.backends.child import Outcome
+from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, Verdict, verdict_on
+
+INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "cpu", "Driver 1", 1 << 30, 1 << 28, True, 16)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Use a cache of this test alone, and forget the verdicts of this process."""
+    monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
+    for name in ("GPUSENSE_CACHE", "GPUSENSE_PROOF", "GPUSENSE_PROOF_SECONDS", "GPUSENSE_BACKEND"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(proof, "_known", {})
+    return tmp_path
+
+
+@pytest.fixture
+def driver(monkeypatch):
+    """Return a function that makes a driver whose families fail as asked, and that records the settings tried."""
+    tried: list[tuple[int, bool]] = []
+
+    def make(fails: dict[tuple[str, int], str], conclusive: bool = True) -> list[tuple[int, bool]]:
+        def run(job):
+            info = BackendInfo(**job["info"])
+            tried.append((info.lanes, info.float64))
+            said = []
+            families = [SCALAR, *([FLOAT64] if info.float64 else []), VECTORS if info.lanes > 1 else SCALAR]
+            for turn, family in enumerate(families):
+                said.append({"begin": family})
+                lanes = info.lanes if turn == len(families) - 1 else 0
+                if how := fails.get((family, lanes)):
+                    if how.startswith("wrong"):
+                        return Outcome([*said, {"wrong": how}])
+                    return Outcome(said, how, conclusive)
+            return Outcome([*said, {"rate": 100.0}, {"end": True}])
+
+        monkeypatch.setattr(child, "run", run)
+        return tried
+
+    return make
+
+
+def test_a_good_driver_is_proved_once(driver):
+    tried = driver({})
+    assert verdict_on(INFO) == Verdict(True, 16, True, rate=100.0)
+    proof._known.clear()
+    assert verdict_on(INFO) == Verdict(True, 16, True, rate=100.0)
+    assert tried == [(16, True)]
+
+
+ABORT = "ends the process with SIGABRT (LLVM ERROR: no)"
+
+
+@pytest.mark.parametrize(
+    ("fails", "tried", "left"),
+    [
+        ({(VECTORS, 16): ABORT}, [(16, True), (8, True)], (True, 8, True)),
+        ({(VECTORS, 16): ABORT, (VECTORS, 8): "hangs: no answer in 60 s"}, [(16, True), (8, True), (1, True)],
+         (True, 1, True)),
+        ({(FLOAT64, 0): "wrong: ranges"}, [(16, True), (16, False)], (True, 16, False)),
+        ({(FLOAT64, 0): ABORT, (VECTORS, 16): "wrong"}, [(16, True), (16, False), (8, False)], (True, 8, False)),
+        ({(SCALAR, 0): ABORT}, [(16, True)], (False, 1, False)),
+        ({(VECTORS, 16): ABORT, (VECTORS, 8): ABORT, (SCALAR, 1): ABORT}, [(16, True), (8, True), (1, True)],
+         (False, 1, False)),
+    ],
+)  # fmt: skip
+def test_a_setting_that_fails_gives_way_to_the_next_more_modest_one(driver, caplog, fails, tried, left):
+    asked = driver(fails)
+    verdict = verdict_on(INFO)
+    assert asked == tried
+    assert (verdict.usable, verdict.lanes, verdict.float64) == left
+    for family, lanes in fails:
+        assert (f"{family} of {lanes}" if family == VECTORS else family) in verdict.reason
+    assert verdict.remedy
+    (line,) = caplog.messages
+    assert "opencl:0:0 (Some device, Driver 1)" in line and verdict.reason in line and "\n" not in line
+    left_info = proof.apply(INFO, verdict)
+    assert (left_info.lanes, left_info.float64) == left[1:]
+    # It is reported once, and kept.
+    proof._known.clear()
+    assert verdict_on(INFO) == verdict
+    assert asked == tried and len(caplog.messages) == 1
+
+
+@pytest.mark.parametrize("changed", ["driver", "name", "lanes", "target", "version", "processor"])
+def test_a_verdict_is_made_anew_when_its_key_changes(driver, monkeypatch, changed):
+    tried = driver({})
+    verdict_on(INFO)
+    if changed == "version":
+        monkeypatch.setattr(proof, "__version__", "99")
+    elif changed == "processor":
+        monkeypatch.setattr(proof, "fingerprint", lambda: "another")
+    else:
+        verdict_on(dataclasses.replace(INFO, **{changed: 8 if changed == "lanes" else "another"}))
+    verdict_on(INFO)
+    assert len(tried) == 2
+    verdict_on(dataclasses.replace(INFO, selection="opencl:3:0"))
+    assert len(tried) == 2
+    verdict_on(INFO, anew=True)
+    assert len(tried) == 3
+
+
+def test_a_child_that_something_else_ended_is_no_lasting_verdict(driver):
+    tried = driver({(SCALAR, 0): "ends the process with SIGKILL"}, conclusive=False)
+    assert not verdict_on(INFO).usable
+    assert not verdict_on(INFO).usable
+    assert len(tried) == 1
+    proof._known.clear()
+    verdict_on(INFO)
+    assert len(tried) == 2
+
+
+@pytest.mark.parametrize("state", ["OSError: No space left on device", "MemoryError", "database or disk is full"])
+def test_a_state_of_the_machine_is_no_lasting_verdict(driver, state):
+    tried = driver({(SCALAR, 0): state})
+    for _ in range(2):
+        assert not verdict_on(INFO).usable
+        proof._known.clear()
+    assert len(tried) == 2
+
+
+def test_a_crash_after_the_end_of_a_proof_condemns_no_device(monkeypatch):
+    said = [{"begin": SCALAR}, {"rate": 5.0}, {"end": True}]
+    monkeypatch.setattr(child, "run", lambda job: Outcome(said, "ends the process with SIGSEGV"))
+    assert verdict_on(INFO) == Verdict(True, 16, True, rate=5.0)
+
+
+def test_a_damaged_verdict_is_made_anew(driver, folder):
+    tried = driver({})
+    verdict_on(INFO)
+    (entry,) = (folder / "cache").glob("*.bin")
+    for damage in (b"", entry.read_bytes()[:-3], bytes(100)):
+        entry.write_bytes(damage)
+        proof._known.clear()
+        assert verdict_on(INFO).usable
+    assert len(tried) == 4
+
+
+def test_proofs_can_be_switched_off(driver, monkeypatch):
+    tried = driver({(SCALAR, 0): ABORT})
+    monkeypatch.setenv("GPUSENSE_PROOF", "off")
+    assert verdict_on(INFO) == proof.trust(INFO) == Verdict(True, 16, True)
+    assert tried == []
+
+
+@pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
+def test_a_program_that_is_no_interpreter_is_not_started(monkeypatch, executable):
+    monkeypatch.setattr(sys, "executable", executable)
+    assert not child.can_start()
+
+
+def test_a_frozen_program_is_not_started(monkeypatch):
+    assert child.can_start()
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    assert not child.can_start()
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon"])
+def test_the_time_limit_is_a_number_of_seconds(monkeypatch, text):
+    monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", text)
+    with pytest.raises(ValueError, match=rf"GPUSENSE_PROOF_SECONDS: must be a number of seconds > 0, got '{text}'"):
+        child.time_limit()
+
+
+# ---- children
+
+
+def run_text(text: str, **job):
+    return child.run_text(["-c", textwrap.dedent(text)], job)
+
+
+@pytest.mark.parametrize(
+    ("text", "failure"),
+    [
+        ("print('gpusense-child {\"a\": 1}')", ""),
+        ("import sys; sys.exit(3)", "exit code 3"),
+        ("raise ValueError('so it is')", "ValueError: so it is"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "ends the process with SIGSEGV"),
+        (
+            "import os, sys; sys.stderr.write('2 warnings generated.\\nLLVM ERROR: no\\n#0 0x1\\n'); os.abort()",
+            "ends the process with SIGABRT (LLVM ERROR: no)",
+        ),
+        ("import os; os.write(1, bytes(range(256)) * 100); os.abort()", "ends the process with SIGABRT"),
+    ],
+)
+def test_the_end_of_a_child_is_one_line(text, failure):
+    outcome = run_text(text)
+    assert (outcome.failure, outcome.conclusive) == (failure, True)
+
+
+def test_a_child_reports_until_it_dies():
+    text = """
+    import os, sys
+    print("noise")
+    print('gpusense-child {"begin": 1}')
+    print('a driver\\'s own words gpusense-child {"begin": 2}')
+    print('gpusense-child {"cut": ', end="", flush=True)
+    os.abort()
+    """
+    assert run_text(text).said == [{"begin": 1}, {"begin": 2}]
+
+
+def test_a_hanging_child_and_its_children_are_ended(monkeypatch, tmp_path):
+    monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", "1.5")
+    text = f"""
+    import subprocess, sys, time
+    started = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    open({str(tmp_path / "pid")!r}, "w").write(str(started.pid))
+    time.sleep(60)
+    """
+    outcome = run_text(text)
+    assert (outcome.failure, outcome.conclusive) == ("hangs: no answer in 1.5 s", True)
+    status = f"/proc/{(tmp_path / 'pid').read_text()}/stat"
+    end = time.monotonic() + 20
+    while os.path.exists(status) and Path(status).read_text().split()[2] not in "ZX":
+        assert time.monotonic() < end, "what the child started still runs"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
+def test_signals_from_outside_say_nothing_of_the_driver(name):
+    outcome = run_text(f"import os, signal; signal.signal(2, signal.SIG_DFL); os.kill(os.getpid(), signal.{name})")
+    assert outcome.failure == f"ends the process with {name}" and not outcome.conclusive
+
+
+def test_an_interpreter_that_cannot_be_started_says_nothing_of_the_driver(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/nowhere/python3")
+    outcome = child.run({"do": "gpusense.evaluation.proof:prove"})
+    assert outcome.failure.startswith("no child process can be started") and not outcome.conclusive
+
+
+@pytest.mark.parametrize("family", ["opencl", "warp"])
+@pytest.mark.parametrize("float64", [True, False])
+@pytest.mark.parametrize("lanes", [1, 8, 16])
+def test_the_scene_passes_on_real_devices_with_every_setting(needs, family, lanes, float64):
+    """Within this process, with less time for the rate."""
+    from gpusense.evaluation import proof as scene
+
+    needs(family)
+    device = next(d for d in gs.devices() if d.backend == family and d.kind != "simulator" and d.available)
+    if family == "warp" and lanes > 1:
+        pytest.skip("Warp has no lanes")
+    info = dataclasses.replace(gs.backends.get_backend(device.selection).info, lanes=lanes, float64=float64)
+    said = []
+    scene.prove({"info": dataclasses.asdict(info)}, said.append)
+    assert said[-1] == {"end": True}
+    assert said[-2]["rate"] > 0
+    begun = [report["begin"] for report in said if "begin" in report]
+    assert (FLOAT64 in begun) == float64
+    assert (VECTORS in begun) == (lanes > 1)
+
+
+# ---- drivers that really fail
+
+
+_DEFAULT = """
+import json, sys
+import numpy as np, gpusense as gs
+from gpusense.backends import get_backend
+cells = np.zeros((20, 20), int); cells[5] = 100
+info = get_backend("auto").info
+distance = gs.RayCaster(gs.OccupancyGrid(cells, 1.0), 10.0).cast([[2.5, 1.5, 1.5707963267948966]], [0.0])[0, 0]
+try:
+    get_backend("opencl"); named = ""
+except ValueError as error:
+    named = str(error)
+print(json.dumps({"selection": info.selection, "lanes": info.lanes, "float64": info.float64,
+                  "distance": float(distance), "named": named}))
+"""
+
+
+def default_of(tmp_path, **variables):
+    """Return the default backend of a process, and OpenCL by name, in a cold cache and again; and its messages."""
+    seconds = {"GPUSENSE_PROOF_SECONDS": os.environ.get("GPUSENSE_PROOF_SECONDS", "60")}
+    environment = fake_driver.environment(tmp_path, **seconds | variables)
+    runs = [
+        subprocess.run([sys.executable, "-P", "-c", _DEFAULT], capture_output=True, text=True, env=environment)
+        for _ in range(2)
+    ]
+    assert [run.returncode for run in runs] == [0, 0], runs[0].stderr
+    first, again = (json.loads(run.stdout.splitlines()[-1]) for run in runs)
+    assert first == again and first["distance"] == 3.5
+    # It is said once, when the verdict is made.
+    assert runs[1].stderr == ""
+    return first, runs[0].stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "words", "message"),
+    [
+        ("abort", ["distance"], "is unusable: scalar kernels end the process with SIGABRT"),
+        ("hang", ["distance"], "is unusable: scalar kernels hang: no answer in 8 s"),
+        (
+            "wrong",
+            ["OBSTACLE : i - nearest", "OBSTACLE : i + nearest"],
+            "is unusable: scalar kernels compute wrong",
+        ),
+    ],
+)
+def test_a_driver_that_fails_altogether_is_named_and_another_backend_is_the_default(
+    needs, tmp_path, mode, words, message
+):
+    needs("opencl")
+    needs("warp")
+    icd = fake_driver.build(tmp_path, mode, *words)
+    limit = {}
+    if mode == "hang":
+        # Warp is proved before, as it may need longer.
+        proved = [sys.executable, "-P", "-c", "from gpusense.backends import get_backend; get_backend('warp:cpu')"]
+        subprocess.run(proved, env=fake_driver.environment(tmp_path), check=True)
+        limit = {"GPUSENSE_PROOF_SECONDS": "8"}
+    found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd), **limit)
+    assert found["selection"] == "warp:cpu"
+    assert errors.count("\n") == 1 and message in errors and "GPUSENSE_BACKEND" in errors
+    assert message in found["named"] and found["named"].startswith("backend: ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "words", "message", "left"),
+    [
+        ("refuse", ["cl_khr_fp64"], "float64 kernels fail", (None, False)),
+        ("wrong", ["return log_lanes(p)", "return exp_lanes(p)"], "kernels in vectors of 8 compute wrong", (1, True)),
+    ],
+)
+def test_a_driver_that_fails_in_part_keeps_the_rest(needs, tmp_path, mode, words, message, left):
+    """One claims float64 without having it; the vectors of the other are wrong."""
+    needs("opencl")
+    icd = fake_driver.build(tmp_path, mode, *words)
+    found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd))
+    assert found["selection"] == "opencl:0:0" and found["named"] == ""
+    assert found["float64"] == left[1] and left[0] in (None, found["lanes"])
+    assert errors.count("\n") == 1 and message in errors
+
+
+@pytest.mark.slow
+def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
+    """Otherwise the tests above would show nothing."""
+    needs("opencl")
+    found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(fake_driver.build(tmp_path, "")))
+    assert (found["selection"], found["named"], errors) == ("opencl:0:0", "", "")
+    assert found["lanes"] > 1 and found["float64"]
+
+
+@pytest.mark.slow
+def test_a_driver_that_dies_when_it_is_loaded_is_left_out_and_the_others_work(needs, tmp_path):
+    """PoCL, from beside pyopencl, is still there."""
+    needs("opencl")
+    icd = fake_driver.build(tmp_path, "load")
+    found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd.parent))
+    assert found["selection"].startswith("opencl:") and found["named"] == ""
+    assert errors.count("\n") == 1 and f"{icd} is left out: it ends the process with SIGABRT" in errors
+    environment = fake_driver.environment(tmp_path, OCL_ICD_VENDORS=str(icd.parent))
+    command = [sys.executable, "-P", "-m", "gpusense", "devices"]
+    listed = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert listed.returncode == 0
+    assert any(line.startswith(f"{icd}: it ends the process with SIGABRT") for line in listed.stdout.splitlines())
+
+
+@pytest.mark.slow
+def test_without_a_linker_pocl_says_what_to_install(needs, tmp_path):
+    """PoCL needs the system's linker, and aborts without."""
+    needs("opencl")
+    fake_driver.pocl_library()
+    found, errors = default_of(tmp_path, PATH=str(tmp_path))
+    assert found["selection"] == "warp:cpu"
+    assert "install the linker ld (on Debian: apt-get install binutils), then run 'gpusense devices --prove'" in errors
+
+
+_MISFIT = """
+import sys
+from gpusense.backends.opencl import pocl
+fit = pocl.fit_target
+def misfit(device):
+    fit(device)
+    place, name = pocl._find_name(device)
+    pocl._replace(place, "znver3")
+pocl.fit_target = misfit
+"""
+
+
+@pytest.mark.slow
+def test_a_target_that_does_not_fit_the_library_ends_in_narrower_kernels(needs, tmp_path):
+    """The fault of a Zen 4: PoCL is given a processor without the AVX-512 of its library."""
+    needs("opencl")
+    info = gs.backends.get_backend("opencl").info
+    if "Portable" not in info.driver or info.target != "skylake-avx512":
+        pytest.skip(f"{info.name} has no AVX-512, or the driver is not PoCL")
+    (tmp_path / "sitecustomize.py").write_text(_MISFIT)
+    found, errors = default_of(tmp_path, PYTHONPATH=str(tmp_path), GPUSENSE_PROOF_SECONDS="12")
+    # Which one it is depends on what is slow in this time.
+    assert found["lanes"] < 16
+    assert "kernels in vectors of 16 " in errors
+
+
+@pytest.mark.parametrize("name", ["numpy", "warp:cpu"])
+def test_a_variable_chooses_the_default_backend(needs, tmp_path, name):
+    needs(name)
+    found, _ = default_of(tmp_path, GPUSENSE_BACKEND=name)
+    assert found["selection"] == name
+
+
+def test_a_variable_that_names_nothing_is_an_error_that_names_it(monkeypatch):
+    monkeypatch.setenv("GPUSENSE_BACKEND", "cuda")
+    with pytest.raises(ValueError, match=r"GPUSENSE_BACKEND: backend: must be 'auto'.* got 'cuda'"):
+        gs.backends.get_backend("auto")
+    assert gs.backends.get_backend("numpy").info.backend == "numpy"

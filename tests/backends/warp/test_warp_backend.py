@@ -1,0 +1,227 @@
+"""The Warp backend's buffers, launches, words and cache."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpusense.backends import Backend, get_backend
+
+
+@pytest.fixture
+def warp_backend(needs: Callable[[str], str]) -> Backend:
+    """Return the Warp backend."""
+    return get_backend(needs("warp"))
+
+
+def test_buffers_are_copied_by_their_heads(warp_backend: Backend) -> None:
+    real = np.dtype(np.float32)
+    buffer = warp_backend.empty(10, real, zero=True)
+    host = np.arange(4, dtype=real)
+    assert warp_backend.upload(host, buffer) is buffer
+    host[:] = -1
+    np.testing.assert_array_equal(warp_backend.download(buffer, np.empty(6, real)), [0, 1, 2, 3, 0, 0])
+    assert warp_backend.download(warp_backend.upload(np.empty((0, 2), real)), np.empty(0, real)).size == 0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float32, np.float64])
+def test_every_type_goes_to_the_device_and_back(dtype: type, warp_backend: Backend) -> None:
+    array = np.arange(24, dtype=dtype).reshape(2, 3, 4)
+    array.flags.writeable = False
+    back = warp_backend.download(warp_backend.upload(array), np.empty_like(array))
+    np.testing.assert_array_equal(back, array)
+    turned = array.T
+    np.testing.assert_array_equal(
+        warp_backend.download(warp_backend.upload(turned), np.empty((4, 3, 2), dtype)), turned
+    )
+
+
+def test_a_buffer_that_does_not_fit_is_a_memory_error(warp_backend: Backend) -> None:
+    with pytest.raises(MemoryError, match="cannot hold a buffer of"):
+        warp_backend.empty(warp_backend.info.max_buffer // 4 + 1, np.dtype(np.float32))
+    with pytest.raises(MemoryError, match="and 2147483647 numbers"):
+        warp_backend.empty(1 << 31, np.dtype(np.uint8))
+
+
+def test_launches_keep_no_buffer_alive(warp_backend: Backend) -> None:
+    squared = warp_backend.upload(np.zeros(6, np.int32))
+    density = warp_backend.upload(np.ones(1, np.float32))
+    table = warp_backend.empty(7 * 6, np.dtype(np.float32), zero=True)
+    fill = warp_backend.compile("fill_field", frozenset())
+    fill((2, 3), squared, density, table, 3, 2, 0, 0.0, 0, 0, 2, 3, 14, 6)
+    alive = [weakref.ref(buffer) for buffer in (squared, density, table)]
+    assert warp_backend.download(table, np.empty((7, 6), np.float32)).sum() == 6
+    del squared, density, table
+    gc.collect()
+    assert [one() for one in alive] == [None] * 3
+
+
+def test_repeated_launches_see_what_changed(warp_backend: Backend) -> None:
+    fill = warp_backend.compile("fill_field", frozenset())
+    squared, density = np.array([0, 1, 2, 3, 4, 5], np.int32), np.arange(10, dtype=np.float32)
+    first = warp_backend.upload(squared), warp_backend.upload(density)
+    for rows, cols, cap in ((3, 2, 9), (2, 3, 9), (2, 3, 1), (1, 1, 0), (3, 2, 9)):
+        table = warp_backend.empty((rows + 4) * (cols + 4), np.dtype(np.float32), zero=True)
+        stride = cols + 4
+        fill((cols, rows), *first, table, rows, cols, cap, 0.0, 0, 0, cols, rows, 2 * stride + 2, stride)
+        found = warp_backend.download(table, np.empty((rows + 4, cols + 4), np.float32))[2:-2, 2:-2]
+        np.testing.assert_array_equal(found, np.minimum(squared[: rows * cols].reshape(rows, cols), cap))
+    fill((0, 3), *first, table, 3, 0, 0, 0.0, 0, 0, 0, 3, 0, 4)
+    with pytest.raises(ValueError, match="zip"):
+        fill((2, 3), *first)
+
+
+def test_a_buffer_of_another_type_is_refused(warp_backend: Backend) -> None:
+    doubles = warp_backend.upload(np.zeros(60))
+    squared = warp_backend.upload(np.zeros(6, np.int32))
+    with pytest.raises(RuntimeError, match="density"):
+        fill = warp_backend.compile("fill_field", frozenset())
+        fill((2, 3), squared, doubles, doubles, 3, 2, 0, 0.0, 0, 0, 2, 3, 0, 6)
+
+
+_QUIET = """
+import numpy as np, sys
+from gpusense.backends import get_backend
+import warp as wp
+names = [name for name in ("log_level", "quiet", "cache_kernels") if hasattr(wp.config, name)]
+before = {name: getattr(wp.config, name) for name in names}
+backend = get_backend("warp:cpu")
+launch = backend.compile("free_columns", frozenset())
+cells = backend.upload(np.array([0, 0, 1, 0], np.uint8))
+runs = backend.empty(8, np.dtype(np.uint8))
+launch((1, 2), cells, runs, 4, 1, 0, 1)
+backend.synchronize()
+assert backend.download(runs, np.empty(8, np.uint8)).tolist() == [2, 1, 0, 1, 1, 2, 0, 1]
+assert before == {name: getattr(wp.config, name) for name in before}
+"""
+
+
+def run_quietly(folder: Path, **variables: str) -> None:
+    """Run a kernel in a new process with its caches in a folder; it must print nothing at all."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(folder / "warp"), "GPUSENSE_CACHE_DIR": str(folder)} | variables
+    done = subprocess.run([sys.executable, "-c", _QUIET], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str], str], tmp_path: Path) -> None:
+    needs("warp")
+    run_quietly(tmp_path, GPUSENSE_CACHE="")
+    # Warp's own folder is left alone.
+    assert list(tmp_path.glob("*.bin")) and not list(tmp_path.rglob("*.o"))
+
+
+def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Path) -> None:
+    needs("warp")
+    run_quietly(tmp_path, GPUSENSE_CACHE="off", GPUSENSE_PROOF="off")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.fixture
+def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
+    """Return a launcher of the field's scores that three threads share, and a function that runs one on particles."""
+    from gpusense.backends.warp import backend as _warp
+    from gpusense.backends.warp import pieces as _warp_pieces
+
+    monkeypatch.setattr(_warp_pieces, "_threads", lambda: 3)
+    _warp_pieces._pool.cache_clear()
+    monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
+    rng = np.random.default_rng(0)
+    particles, readings, rows, cols = 61, 20, 30, 40
+    angles = rng.uniform(-4, 4, particles)
+    pose = np.concatenate([rng.uniform(0, 1, (particles, 2)), np.cos(angles)[:, None], np.sin(angles)[:, None]], axis=1)
+    arrays = (
+        rng.normal(size=(rows + 4) * (cols + 4)).astype(np.float32),
+        rng.integers(0, 30, (particles, 2)).astype(np.int32),
+        pose.astype(np.float32),
+        np.zeros((particles, 4), np.float32),
+        rng.uniform(-15, 15, (readings, 2)).astype(np.float32),
+        np.zeros((readings, 2), np.float32),
+        np.zeros(6, np.float32),
+    )
+    backend = _warp.WarpBackend(warp_backend.info, "cpu")
+    flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
+    launch = backend.compile("score_field", flags)
+    assert isinstance(launch, _warp_pieces.SharedLaunch)
+    nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)
+    inputs = [backend.upload(array) for array in (*arrays, *nowhere)]
+    scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5, 1, 0)
+    real = np.dtype(np.float32)
+
+    def run(target: Callable[..., None], count: int = particles) -> tuple[np.ndarray, np.ndarray]:
+        log_p, parts = backend.empty(particles, real, zero=True), backend.empty(particles * readings, real, zero=True)
+        target((count,), *inputs, log_p, parts, rows, cols, count, *scalars[3:])
+        found = np.empty(particles, real), np.empty((particles, readings), real)
+        return backend.download(log_p, found[0]), backend.download(parts, found[1])
+
+    yield launch, run
+    _warp_pieces._pool.cache_clear()
+
+
+@pytest.mark.parametrize("count", [1, 4, 5, 6, 60, 61])
+def test_pieces_of_a_launch_are_the_whole(field_launch, count: int) -> None:
+    launch, run = field_launch
+    sizes = []
+    one = launch._launch
+
+    def record(size: tuple[int, ...], *arguments: object) -> None:
+        sizes.append(size[0])
+        one(size, *arguments)
+
+    launch._launch = record
+    found = run(launch, count)
+    assert sum(sizes) == count
+    assert len(sizes) == (6 if count >= 60 else 2 if count > 4 else 1)
+    for cut, whole in zip(found, run(one, count), strict=True):
+        np.testing.assert_array_equal(cut, whole)
+        assert not cut[count:].any()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+def test_nothing_runs_on_after_an_interrupted_launch(field_launch, error: type[BaseException]) -> None:
+    launch, run = field_launch
+    one, busy, owner = launch._launch, [], threading.current_thread()
+    begun = threading.Event()
+
+    def fail(size: tuple[int, ...], *arguments: object) -> None:
+        if threading.current_thread() is owner:
+            begun.wait(10)
+            raise error
+        busy.append(size)
+        begun.set()
+        time.sleep(0.05)
+        one(size, *arguments)
+        busy.pop()
+
+    launch._launch = fail
+    with pytest.raises(error):
+        run(launch)
+    assert not busy
+    launch._launch = one
+    np.testing.assert_array_equal(run(launch)[0], run(one)[0])
+
+
+def test_an_error_in_another_thread_is_raised(field_launch) -> None:
+    launch, run = field_launch
+    one, owner = launch._launch, threading.current_thread()
+    failed = threading.Event()
+
+    def fail(size: tuple[int, ...], *arguments: object) -> None:
+        if threading.current_thread() is not owner:
+            failed.set()
+            raise MemoryError("no more")
+        failed.wait(10)
+        one(size, *arguments)
+
+    launch._launch = fail
+    with pytest.raises(MemoryError, match="no more"):
+        run(launch)

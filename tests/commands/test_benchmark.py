@@ -1,0 +1,117 @@
+"""``gpusense bench`` as a command: whole files, the same errors again, options refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.bench_world import ERRORS, TIMES, made_report
+
+from gpusense.commands import cli
+from gpusense.evaluation.benchmark import candidates, report, scenes
+from gpusense.plots import benchmark as diagrams
+
+pytestmark = pytest.mark.usefixtures("no_data")
+
+SMALL = ["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1", "--no-peers"]
+FIELD = ["bench", "--problem", "field", "--method", "field", "--scene", "clutter"]
+POINT_KEYS = {
+    "scene", "cloud", "problem", "backend", "device", "kind", "method", "variant", "knob", "value", "precision",
+    "exact", "outside", "particles", "beams", "work", "checked", "status", "reason", "time", "memory", "errors",
+}  # fmt: skip
+
+
+def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
+    chosen = [word for name in ("numpy", needs("opencl")) for word in ("--backend", name)]
+    folder = tmp_path / "results"
+    methods = ["--method", "exact", "--method", "march", "--method", "field"]
+    argv = ["bench", *SMALL, *chosen, *methods, "--scene", "clutter", "--output", str(folder), "--json"]
+    assert cli.main(argv) == 0
+    printed = json.loads(capsys.readouterr().out)
+    images = {f"{p}-{m[0]}-{c}.png" for p, own in diagrams.MEASURES.items() for m in own for c in scenes.CLOUDS}
+    assert {path.name for path in folder.iterdir()} == {"report.json", "report.md", "profiles.png", *images}
+    written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert written == printed
+    assert set(written) == {
+        "schema", "date", "commit", "arguments", "machine", "devices", "absent", "truth", "scenes", "points",
+        "profiles",
+    }  # fmt: skip
+    assert written["schema"] == 1
+    for point in written["points"]:
+        assert set(point) == POINT_KEYS
+        assert point["status"] == "ok", point["reason"]
+        assert set(point["time"]) == TIMES
+        assert set(point["memory"]) == {"table_bytes", "device_bytes", "peak_bytes"}
+        kinds = set(ERRORS) - ({"ranges"} if point["problem"] == "field" else set())
+        assert {kind: set(values) for kind, values in point["errors"].items()} == {k: ERRORS[k] for k in kinds}
+        if point["exact"] and "ranges" in kinds:
+            assert point["errors"]["ranges"]["median"] < 1e-3
+    assert {(p["problem"], p["backend"].split(":")[0]) for p in written["points"]} == {
+        (problem, backend) for problem in candidates.PROBLEMS for backend in ("numpy", "opencl")
+    }
+    assert {p["checked"] for p in written["points"]} == {6} and {p["particles"] for p in written["points"]} == {1, 8}
+    for name in images:
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+        assert f"]({name})" in (folder / "report.md").read_text(encoding="utf-8")
+    # The same again is as exact, with the old report's sizes.
+    argv = [
+        "bench", "--no-peers", *chosen, *methods, "--slower", "1e9", "--compare", str(folder / "report.json"),
+        "--repeats", "1",
+    ]  # fmt: skip
+    assert cli.main(argv) == 0
+    out = capsys.readouterr().out
+    assert f"{len(written['points'])} points compared, 0 of the old report not measured now" in out
+    assert "less exact: none" in out
+
+
+def test_same_seed_same_errors(capsys):
+    runs = []
+    for seed in ("1", "1", "2"):
+        assert cli.main([*FIELD, *SMALL, "--backend", "numpy", "--seed", seed, "--json"]) == 0
+        made = json.loads(capsys.readouterr().out)
+        runs.append(([p["errors"] for p in made["points"]], made["scenes"]))
+    assert runs[0] == runs[1] != runs[2]
+
+
+def test_table_on_the_terminal(capsys):
+    assert cli.main([*FIELD, *SMALL, "--backend", "numpy", "--method", "field"]) == 0
+    out = capsys.readouterr().out
+    assert "clutter  tracking  field    numpy    field, fewer beams" in out
+    assert "4 points, 0 left out; truth: " in out
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--scene", "moon"], "scene: must be one of building, clutter, got 'moon'"),
+        (["--method", "magic"], "--method: must be one of exact, dda, march, bresenham, cddt, lookup, field"),
+        (["--backend", "cuda"], "backend: must be 'auto', 'numpy'"),
+        (["--problem", "sonar"], "argument --problem: invalid choice: 'sonar'"),
+        (["--particles", "0"], "argument --particles: must be an integer >= 1, got 0"),
+        (["--slower", "0.5", "--compare", "OLD"], "--slower: must be > 1, got 0.5"),
+        (["--compare", "missing.json"], "missing.json: must exist, got no such file"),
+        (["--compare", "OLD", "OLD", "OLD"], "--compare: must be one or two reports, got 3"),
+        (["--compare", "TEXT"], "TEXT: must be a report of gpusense bench, got no JSON"),
+        (["--compare", "OTHER"], "OTHER: must be a report of gpusense bench, got another document"),
+        (["--compare", "LATER"], "LATER: schema must be 1, got 99"),
+        (["--map", "missing.yaml"], "missing.yaml: must exist"),
+        (["--peers", "missing.py"], "missing.py: must exist, got no such file"),
+        (["--peers", "TEXT", "--no-peers"], "--no-peers: must not be given together with --peers"),
+        (["--output", "TEXT"], "--output: must be a folder, got a file: TEXT"),
+        (["--output", "absent/folder"], "absent: No such file or directory"),
+    ],
+)
+def test_bad_options_are_one_line(argv, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("OLD").write_text(report.to_json(made_report()))
+    Path("TEXT").write_text("no report")
+    Path("OTHER").write_text("[1]")
+    Path("LATER").write_text(report.to_json(made_report() | {"schema": 99}))
+    before = sorted(path.name for path in tmp_path.iterdir())
+    peers_off = [] if "--peers" in argv else ["--no-peers"]
+    assert cli.main(["bench", "--quick", *peers_off, *argv]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"gpusense: error: {message}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == before

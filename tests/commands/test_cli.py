@@ -1,0 +1,187 @@
+"""The command line: help, exit codes, one-line errors, and the devices."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from support.command_line import SMALL, error_of, script
+
+import gpusense
+from gpusense.commands import cli, devices
+
+
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
+    """Make ``gpusense devices`` raise."""
+
+    def install(error: BaseException) -> None:
+        def run(args: object) -> int:
+            raise error
+
+        monkeypatch.setattr(devices, "run", run)
+
+    return install
+
+
+@pytest.mark.parametrize("argv", [[], ["--help"]])
+def test_top_level_help_lists_every_command(argv, capsys):
+    assert cli.main(argv) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    for name in cli.COMMANDS:
+        assert f"\n    {name} " in out
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_command_help_has_an_example(name, capsys):
+    assert cli.main([name, "--help"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert out.startswith(f"usage: gpusense {name} ")
+    assert "example" in out and f"  gpusense {name}" in out
+    assert "--json" in out
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_command_modules_keep_the_contract(name):
+    module = importlib.import_module(f"gpusense.commands.{name}")
+    assert name == module.NAME
+    assert module.HELP.endswith(".") and "\n" not in module.HELP
+
+
+def test_help_loads_no_backend_and_no_drawing(tmp_path):
+    done = script(
+        "from gpusense.commands.cli import main; code = main(['--help'])\n"
+        "heavy = {'matplotlib', 'rich', 'pyopencl', 'warp', 'scipy', 'PIL', 'yaml'} & set(sys.modules)\n"
+        "print(code, sorted(heavy))",
+        cwd=tmp_path,
+    )
+    assert done.stdout.splitlines()[-1] == "0 []", done.stderr
+
+
+def test_version(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"gpusense {gpusense.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["devices", "--jsn"], "unrecognized arguments: --jsn"),
+        ([*SMALL, "--js"], "unrecognized arguments: --js"),
+        (["demo", "--particles", "-5"], "argument --particles: must be an integer from 1 to 100000000, got -5"),
+        (["demo", "--particles", "1e3"], "argument --particles: must be an integer from 1 to 100000000, got '1e3'"),
+        (["demo", "--beams", "181"], "argument --beams: must be an integer from 1 to 180, got 181"),
+        (["demo", "--seed", "-1"], "argument --seed: must be an integer >= 0, got -1"),
+        (["demo", "--output", "demo.gif"], "argument --output: must end in .png or .pdf or .svg, got 'demo.gif'"),
+        (["demo", "--particles"], "argument --particles: expected one argument"),
+        (
+            [*SMALL, "--no-plot", "--backend", "cuda"],
+            "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', "
+            "got 'cuda'",
+        ),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(argv, message, capsys):
+    assert error_of(argv, capsys) == message
+
+
+def test_unknown_command_names_the_choices(capsys):
+    message = error_of(["bogus"], capsys)
+    assert message.startswith("argument COMMAND: invalid choice: 'bogus'")
+    assert all(name in message for name in cli.COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (ValueError("grid: must be\n  a map,\tgot 3"), "grid: must be a map, got 3"),
+        (TypeError("poses: must hold real numbers"), "poses: must hold real numbers"),
+        (MemoryError(), "out of memory"),
+        (FileNotFoundError(2, "No such file or directory", "map.yaml"), "map.yaml: No such file or directory"),
+        (OSError("device lost"), "device lost"),
+    ],
+)
+def test_exceptions_of_the_library_are_one_line(error, message, broken, capsys):
+    broken(error)
+    assert error_of(["devices"], capsys) == message
+
+
+def test_exceptions_pass_where_the_environment_asks_for_it(broken, monkeypatch):
+    broken(ValueError("why"))
+    monkeypatch.setenv(cli.TRACEBACK, "1")
+    with pytest.raises(ValueError, match="why"):
+        cli.main(["devices"])
+
+
+def test_keyboard_interrupt_is_130(broken, capsys):
+    broken(KeyboardInterrupt())
+    assert cli.main(["devices"]) == 130
+    assert capsys.readouterr() == ("", "gpusense: interrupted\n")
+
+
+def test_broken_pipe_is_silent(broken, capsys):
+    broken(BrokenPipeError())
+    assert cli.main(["devices"]) == 141
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes break with a signal's error on POSIX only")
+def test_reader_that_went_away_leaves_no_traceback(tmp_path):
+    code = (
+        "import os; from gpusense.commands.cli import main\n"
+        "read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
+        "sys.exit(main(['devices', '--json']))"
+    )
+    done = script(code, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_full_disk_is_one_line(tmp_path):
+    code = "from gpusense.commands.cli import main; import os; os.dup2(os.open('/dev/full', os.O_WRONLY), 1); "
+    code += "sys.exit(main(['devices']))"
+    done = script(code, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (2, "gpusense: error: No space left on device\n")
+
+
+def test_module_is_the_command(tmp_path):
+    code = "import runpy; sys.argv = ['gpusense', 'demo', '--seed', 'x']; "
+    code += "runpy.run_module('gpusense', run_name='__main__')"
+    done = script(code, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "gpusense: error: argument --seed: must be an integer >= 0, got 'x'\n"
+
+
+def test_devices_as_json(capsys):
+    assert cli.main(["devices", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    report = json.loads(out)
+    marked = [device["selection"] for device in report["devices"] if device["auto"]]
+    assert marked == [report["auto"]]
+    for device in report["devices"]:
+        assert device["available"] == bool(device["selection"]) == (device["reason"] == "")
+    assert {"gpusense", "platform", "processor", "processors", "python", "numpy"} == set(report["machine"])
+
+
+def test_devices_as_a_table(capsys):
+    assert cli.main(["devices"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["selection", "kind", "name", "driver", "status"]
+    assert any(line.split()[:2] == ["numpy", "cpu"] or line.split()[:3] == ["*", "numpy", "cpu"] for line in lines)
+    assert sum(line.startswith("*  ") for line in lines) == 1
+
+
+def test_devices_survive_a_broken_auto(monkeypatch, capsys):
+    def fail(selection: str) -> object:
+        raise RuntimeError("driver lost")
+
+    monkeypatch.setattr("gpusense.backends.get_backend", fail)
+    assert cli.main(["devices"]) == 0
+    assert "'auto' does not work: RuntimeError: driver lost" in capsys.readouterr().out

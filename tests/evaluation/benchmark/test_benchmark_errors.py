@@ -1,0 +1,126 @@
+"""Scenes and errors of ``gpusense bench``, by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support.bench_world import quick_scene
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.evaluation.benchmark import accuracy, scenes
+from gpusense.evaluation.tolerances import TOLERANCES
+
+pytestmark = pytest.mark.usefixtures("no_data")
+
+
+@pytest.mark.parametrize("name", scenes.GENERATED)
+def test_scenes_follow_from_their_seed(name):
+    one, same = quick_scene(name), quick_scene(name)
+    assert one.fingerprint == same.fingerprint
+    np.testing.assert_array_equal(one.readings, same.readings)
+    np.testing.assert_array_equal(one.clouds["tracking"], same.clouds["tracking"])
+    assert quick_scene(name, seed=4).fingerprint != one.fingerprint
+    assert quick_scene(name, particles=21).fingerprint != one.fingerprint
+
+
+def test_clouds_stand_on_free_cells():
+    scene = quick_scene("building", particles=300)
+    for cloud in scenes.CLOUDS:
+        assert scene.clouds[cloud].shape == (300, 3)
+        assert scenes.is_free(scene.grid, scene.clouds[cloud]).all()
+    offsets = scene.clouds["tracking"] - scene.pose
+    assert np.abs(offsets[:, :2]).max() < 6 * scenes.SIGMA_POSITION
+    assert 0.15 < offsets[:, 2].std() < 0.35
+    assert scene.hits > 0
+
+
+def test_is_free_outside_and_in_walls():
+    grid = gs.OccupancyGrid([[0, 100], [-1, 0]], 1.0)
+    poses = np.array([[0.5, 0.5, 0], [1.5, 0.5, 0], [0.5, 1.5, 0], [1.5, 1.5, 0], [-0.5, 0.5, 0], [0.5, 2.0, 0]])
+    assert scenes.is_free(grid, poses).tolist() == [True, False, False, True, False, False]
+
+
+def test_recorded_maps_need_the_data(tmp_path, monkeypatch):
+    assert [source.name for source in scenes.sources()] == list(scenes.GENERATED)
+    with pytest.raises(ValueError, match="GPUSENSE_DATA"):
+        scenes.sources(["intel"])
+    grid = scenes.clutter(0, (4.0, 3.0), 0.1)
+    (tmp_path / "ros_maps").mkdir()
+    gs.write_map(grid, tmp_path / scenes.RECORDED["willow"])
+    monkeypatch.setenv(scenes.DATA, str(tmp_path))
+    assert [source.name for source in scenes.sources()] == [*scenes.GENERATED, "willow"]
+    (own,) = scenes.sources(maps=[tmp_path / scenes.RECORDED["willow"]])
+    assert (own.name, own.origin) == ("willow-full", "willow-full.yaml")
+    np.testing.assert_array_equal(own.grid(0).occupied, grid.occupied)
+
+
+def test_recorded_scenes_are_found(monkeypatch, data_dir):
+    monkeypatch.setenv(scenes.DATA, str(data_dir))
+    assert {source.name for source in scenes.sources()} == {*scenes.GENERATED, *scenes.RECORDED}
+
+
+# Errors
+
+
+def test_range_errors_by_hand():
+    right = np.array([[1.0, 2.0], [3.0, 4.0]])
+    found = np.array([[1.0, 2.05], [3.15, 3.0]])  # 0, 0.5, 1.5 and 10 cells of 0.1 m
+    errors = accuracy.range_errors(found, right, 0.1)
+    assert errors == pytest.approx(
+        {"median": 1.0, "p99": 1.5 + 0.97 * 8.5, "max": 10.0, "mean": 3.0, "wrong_1": 0.5, "wrong_2": 0.25}
+    )
+
+
+def test_log_p_errors_by_hand():
+    assert accuracy.log_p_errors(np.array([3.0, 1.0]), np.array([0.0, 5.0])) == {"max": 4.0, "rms": math.sqrt(12.5)}
+
+
+def test_posterior_errors_by_hand():
+    """Weights 1/2 and 1/2 that should be 3/4 and 1/4, of particles 4 m and a quarter turn apart."""
+    poses = np.array([[10.0, 2.0, 0.0], [14.0, 2.0, math.pi / 2]])
+    errors = accuracy.posterior_errors(np.log([7.0, 7.0]), np.log([3.0, 1.0]), poses)
+    turn = math.pi / 4 - math.atan2(0.25, 0.75)
+    assert errors == pytest.approx({
+        "kl": 0.75 * math.log(1.5) + 0.25 * math.log(0.5), "tv": 0.25, "shift_m": 1.0, "shift_rad": turn,
+    })  # fmt: skip
+    assert accuracy.posterior_errors(np.log([3.0, 1.0]) + 5, np.log([3.0, 1.0]), poses)["kl"] == pytest.approx(0)
+
+
+def test_mean_pose_wraps_headings_and_keeps_digits_far_away():
+    x, y, theta = accuracy.mean_pose(np.array([[5e6, 0.25, 3.0], [5e6 + 0.5, 0.25, -3.0]]), np.array([0.5, 0.5]))
+    assert (x, y) == (5e6 + 0.25, 0.25)
+    assert abs(theta) == pytest.approx(math.pi)
+
+
+def test_temperature_makes_a_tenth_of_the_particles_share():
+    log_p = np.linspace(-500, 0, 200)
+    factor = accuracy.temperature_of(log_p)
+    assert gs.normalize_weights(factor * log_p).effective_sample_size == pytest.approx(20)
+    assert accuracy.temperature_of(np.zeros(50)) == 1.0
+
+
+def test_scored_ranges_are_the_beam_models():
+    scene = quick_scene("building")
+    readings = scene.readings.copy()
+    readings[2], readings[5] = np.inf, np.nan
+    model = gs.BeamModel(scene.grid, scene.scanner, scene.beam, backend="numpy", precision="float64")
+    poses = scene.clouds["global"]
+    found = accuracy.score_ranges(model.expected_ranges(poses), readings, scene.scanner, scene.beam)
+    np.testing.assert_allclose(found, model.log_likelihood(poses, readings), rtol=1e-11)
+
+
+@pytest.mark.parametrize("selection", ["opencl", "warp"])
+def test_truth_is_the_numpy_reference(selection, needs):
+    """The device that gives the truth computes what float64 NumPy does."""
+    scene, backend = quick_scene("building"), get_backend(needs(selection))
+    truth, reference = (
+        accuracy.Truth(scene, scene.clouds["global"], device) for device in (backend, get_backend("numpy"))
+    )
+    ranges, scan = TOLERANCES["float64 ranges"], TOLERANCES["float64 scan"]
+    assert ranges.difference(truth.ranges, reference.ranges) <= ranges.value
+    for problem in ("beam", "field"):
+        assert scan.difference(truth.log_p(problem), reference.log_p(problem)) <= 2 * scan.value
+    assert accuracy.truth_device().info.float64

@@ -1,0 +1,208 @@
+"""Measurements of ``gpusense bench``: costs, failures that show, outside candidates."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.bench_world import candidate, free_ranges, plan_of, quick_scene
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.evaluation.benchmark import accuracy, candidates, measure, peers, report, runner
+from gpusense.plots import benchmark as diagrams
+
+pytestmark = pytest.mark.usefixtures("no_data")
+
+
+def test_methods_are_those_of_the_package():
+    own = candidates.candidates(candidates.PROBLEMS)
+    cast = [one for one in own if one.problem == "ranges"]
+    assert {one.method for one in cast} == {method.name for method in gs.RayCaster.methods()}
+    assert {one.method for one in cast if one.exact} == {"exact", "dda"}
+    assert len({(one.problem, one.label) for one in own}) == len(own)
+    assert {one.method for one in candidates.candidates(["ranges"], quick=True)} == {one.method for one in cast}
+    assert {one.problem for one in candidates.candidates(["field"])} == {"field"}
+
+
+def test_costs_of_a_caster():
+    scene = quick_scene()
+    chosen = next(one for one in candidates.candidates(["ranges"]) if one.method == "exact")
+    poses = scene.clouds["global"]
+    cost, made = measure.measure(lambda b: chosen.make(scene, b, "float32"), get_backend("numpy"), poses, 3)
+    assert made.run(poses).shape == (20, 9)
+    assert (cost.calls, cost.launches) == (3, 3)
+    assert 0 < cost.call_min_s <= cost.call_median_s
+    assert cost.build_s > 0 and cost.first_s > 0 and cost.compile_s is not None
+    assert 0 < cost.launch_min_s <= cost.launch_median_s
+    rows, cols = scene.grid.shape
+    # The table of the map, and poses, bearings and ranges beside it.
+    assert cost.table_bytes == 8 * (rows + 2) * (cols + 2)
+    assert cost.table_bytes + 4 * 20 * 9 < cost.device_bytes <= cost.peak_bytes
+    assert cost.device_bytes < cost.table_bytes + 20_000
+
+
+def test_a_table_that_is_slow_to_make_is_made_once(monkeypatch):
+    scene, made = quick_scene(), []
+    poses = scene.clouds["global"]
+    slow = candidate(free_ranges)
+
+    def make(backend):
+        made.append(backend)
+        return slow.make(scene, backend, "float32")
+
+    assert measure.measure(make, None, poses, 1)[0].compile_s is not None
+    monkeypatch.setattr(measure, "SLOW_TO_MAKE", -1.0)
+    assert measure.measure(make, None, poses, 1)[0].compile_s is None
+    assert len(made) == 3
+
+
+def test_meter_counts_what_is_alive(backend):
+    meter = measure.Meter(get_backend(backend))
+    first, second = meter.empty(100, np.dtype(np.float32)), meter.upload(np.zeros(50))
+    assert meter.live == 800
+    del first
+    assert meter.live == 400
+    third = meter.empty(10, np.dtype(np.int32))
+    assert (meter.live, meter.peak) == (440, 800)
+    del second, third
+    assert meter.live == 0
+
+
+def test_long_calls_are_not_repeated(monkeypatch):
+    monkeypatch.setattr(measure, "LONG", 0.0)
+    calls = []
+    assert len(measure.series(lambda: calls.append(1), 20)) == len(calls) == 1
+
+
+def test_numpy_gets_fewer_particles():
+    plan = plan_of(particles=80, checked=4)
+    assert (plan.particles_on(get_backend("numpy")), plan.particles_on(None), plan.cloud) == (10, 80, 80)
+    assert plan_of(particles=None).particles_on(None) == runner.PARTICLES["cpu"]
+
+
+def fail(scene, poses):
+    raise MemoryError("no room\nfor the table")
+
+
+@pytest.mark.parametrize(
+    ("made", "status", "reason"),
+    [
+        (candidate(fail), "failed", "MemoryError: no room for the table"),
+        (candidate(lambda s, p: np.full((len(p), 7), np.nan)), "unstable", "42 of 42 ranges are not finite"),
+        (candidate(lambda s, p: np.full(len(p), -np.inf), "beam"), "unstable", "6 of 6 log-likelihoods are not finite"),
+        (
+            candidate(lambda s, p: np.zeros(3), "field"),
+            "unstable",
+            "log-likelihoods have the shape (3,), must have (6,)",
+        ),
+        (candidate(free_ranges, missing="not installed"), "left out", "not installed"),
+    ],
+)
+def test_failures_are_shown(made, status, reason):
+    plan = plan_of(replace(made, outside="somewhere"))
+    outcome = runner.run(plan)
+    assert [(p["status"], p["reason"], p["errors"]) for p in outcome.points] == [(status, reason, None)] * 2
+    assert [p["time"] is None for p in outcome.points] == [status != "unstable"] * 2
+    shown = report.document(plan, outcome, {}, {"processor": "p"}, [])
+    text = report.markdown(shown)
+    assert f"## {status.capitalize()}" in text and reason in text
+    style = diagrams.Style.of(shown["points"])
+    own = [p for p in shown["points"] if p["cloud"] == "global"]
+    figure = diagrams.work_precision(own, style, diagrams.MEASURES[made.problem][0])
+    crosses = [line for line in figure.axes[0].lines if line.get_marker() == "x"]
+    assert len(crosses) == (status != "left out")
+
+
+def test_a_point_that_works_is_measured():
+    outcome = runner.run(plan_of(candidate(free_ranges, outside="somewhere")))
+    (point, _) = outcome.points
+    assert (point["status"], point["backend"], point["work"]) == ("ok", "outside", 56)
+    assert point["errors"]["ranges"]["max"] > 10
+    assert point["time"]["launches"] == 0
+
+
+def test_tables_that_take_too_long_and_late_points_are_left_out():
+    own = [one for one in candidates.candidates(["ranges"], quick=True) if one.method in ("exact", "lookup")]
+    outcome = runner.run(plan_of(*own, build_limit=1e-6))
+    assert [p["status"] for p in outcome.points][:2] == ["ok", "left out"]
+    assert "building its table would take" in outcome.points[1]["reason"]
+    own = [candidate(free_ranges, outside="somewhere")]
+    slow = runner.run(plan_of(*own, build_limit=-1.0))
+    assert [p["status"] for p in slow.points] == ["ok", "left out"]
+    assert "building its table has taken" in slow.points[1]["reason"]
+    late = runner.run(plan_of(*own, deadline=-1.0))
+    assert {p["reason"] for p in late.points} == {"the -1 s of this run were over"}
+
+
+def test_compiling_does_not_use_up_the_time_of_a_run():
+    compiled = []
+
+    def compile_once(scene, backend, precision):
+        if not compiled:
+            compiled.append(time.sleep(1.2))
+        return candidate(free_ranges).make(scene, backend, precision)
+
+    outcome = runner.run(plan_of(replace(candidate(free_ranges, outside="somewhere"), make=compile_once), deadline=1.0))
+    assert [p["status"] for p in outcome.points] == ["ok", "ok"]
+    assert outcome.points[0]["time"]["compile_s"] > 1.0
+
+
+# Outside candidates
+
+
+def test_peers_are_read_from_a_file(tmp_path):
+    file = tmp_path / "peers.py"
+    file.write_text(
+        "from gpusense.evaluation.benchmark.candidates import Candidate\n"
+        "def make(scene, backend, precision): ...\n"
+        "def candidates():\n"
+        "    return [Candidate(p, 'theirs', make, outside='their 1.0') for p in ('ranges', 'field')]\n"
+    )
+    assert [one.problem for one in peers.load(file, ["field"])] == ["field"]
+    for text, message in (
+        ("raise RuntimeError('broken')", "RuntimeError: broken"), ("", "no attribute 'candidates'"),
+        ("candidates = lambda: [1]", "must return Candidate objects"),
+    ):  # fmt: skip
+        file.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            peers.load(file, ["field"])
+    with pytest.raises(FileNotFoundError):
+        peers.load(tmp_path / "absent.py", ["field"])
+
+
+@pytest.fixture
+def baselines():
+    """Return the checkout's outside candidates; skip the test for an installed package."""
+    file = peers.default_file()
+    if file is None:
+        pytest.skip("the package is not imported from a checkout")
+    return peers.load(file, candidates.PROBLEMS)
+
+
+def test_baselines_say_why_they_cannot_run(baselines):
+    assert {one.method for one in baselines} == {"numba field", "numba march", "range_libc", "f1tenth_gym"}
+    for one in baselines:
+        assert one.outside
+        if one.missing:
+            assert "cannot be imported" in one.missing or "pip install numba" in one.missing
+
+
+def test_numba_computes_what_it_says(baselines):
+    pytest.importorskip("numba")
+    scene = quick_scene(beams=30)
+    truth = accuracy.Truth(scene, scene.clouds["tracking"], get_backend("numpy"))
+    found = {}
+    for one in baselines:
+        if not one.method.startswith("numba") or one.value in (500, 8000):
+            continue
+        result = one.make(scene, None, one.precision).run(truth.poses)
+        ranges, log_p = (result, None) if one.problem == "ranges" else (None, result)
+        found[one.label] = accuracy.errors(truth, one.problem, ranges=ranges, log_p=log_p)
+    assert found["numba field, log grid"]["log_p"]["max"] < 1e-3
+    assert found["numba field, log of products"]["log_p"]["max"] < 1e-3
+    # Another package's weight is no likelihood.
+    assert found["numba field, sum of cubes"]["log_p"]["max"] > 1
+    assert found["numba march, headings = 2000"]["ranges"]["median"] < 2

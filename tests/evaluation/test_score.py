@@ -1,0 +1,245 @@
+"""Scoring logs: ranks, means and agreement by hand on small cases, and the command on a log made up here."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+import gpusense as gs
+from gpusense.commands.cli import main
+from gpusense.evaluation import agreement, scoring
+from gpusense.evaluation.worlds import building, free_pose, simulate_scan
+
+
+def score(log_p, poses=None):
+    log_p = np.asarray(log_p, np.float32)
+    poses = np.zeros((len(log_p), 3)) if poses is None else np.asarray(poses, float)
+    return scoring.score_scan(7, poses, log_p, 10, 0.5)
+
+
+@pytest.mark.parametrize(
+    "log_p, rank, percentile",
+    [
+        ([0, -1, -2, -3, -4], 1, 100),
+        ([-4, -1, -2, -3, 0], 5, 0),
+        ([-2, -1, -2, -2, -4], 3, 50),
+        ([5, 5, 5], 2, 50),
+        ([-math.inf, -math.inf, -1], 2.5, 25),
+        ([-1, -math.inf, -math.inf], 1, 100),
+    ],
+)
+def test_rank_and_percentile_count_ties_half(log_p, rank, percentile):
+    found = score(log_p)
+    assert (found.rank, found.percentile) == (rank, percentile)
+
+
+def test_mean_is_weighted_circular_and_without_the_logged_pose():
+    poses = [[1, 2, math.pi], [0, 0, math.pi - 0.1], [4, 8, -math.pi + 0.3], [100, 100, 0]]
+    found = score([0, math.log(0.75) - 1e4, math.log(0.25) - 1e4, -math.inf], poses)
+    x = 0.75 * math.sin(math.pi - 0.1) + 0.25 * math.sin(0.3 - math.pi)
+    y = 0.75 * math.cos(math.pi - 0.1) + 0.25 * math.cos(0.3 - math.pi)
+    # float32 holds -1e4 to about 1e-3.
+    np.testing.assert_allclose(found.mean, (1, 2, math.atan2(x, y)), atol=2e-3)
+    assert found.error_position == pytest.approx(0, abs=5e-3)
+    assert found.error_heading == pytest.approx(abs(math.remainder(math.atan2(x, y) - math.pi, math.tau)), abs=2e-3)
+    assert found.effective == pytest.approx(1 / (0.75**2 + 0.25**2), abs=1e-2)
+
+
+def test_only_impossible_particles_are_flagged_and_nothing_is_nan():
+    found = score([0] + [-math.inf] * 4)
+    assert found.degenerate
+    assert found.mean is found.error_position is found.error_heading is found.effective is None
+    assert found.percentile == 100
+
+
+def test_ranks_share_places_and_correlation_is_spearmans():
+    assert agreement.ranks(np.array([3.0, 1.0, 3.0, -np.inf])).tolist() == [3.5, 2, 3.5, 1]
+    a, b = np.random.default_rng(0).normal(size=(2, 50)).round(1)
+    from scipy.stats import spearmanr
+
+    assert agreement.correlation(agreement.ranks(a), agreement.ranks(b)) == pytest.approx(spearmanr(a, b).statistic)
+    assert agreement.correlation(np.ones(3), np.ones(3)) == 1
+
+
+def test_gap_is_the_largest_difference_of_particles_that_change_places():
+    left = np.array([0.0, -1.0, -2.0, -3.0])
+    assert agreement.largest_gap(left, left) == 0
+    assert agreement.largest_gap(left, np.array([0.0, -1.5, -1.25, -3.0])) == 0.25
+    assert agreement.largest_gap(left, np.array([-3.0, -2.0, -1.0, 0.0])) == 3
+    # Equal on the left: any order on the right is one that the left allows.
+    assert agreement.largest_gap(np.zeros(4), left) == 0
+    assert agreement.largest_gap(np.full(2, -np.inf), np.full(2, -np.inf)) == 0
+    assert agreement.largest_gap(left, np.array([-np.inf, 0, -1, -2])) == np.inf
+
+
+def test_cloud_is_the_pose_its_surroundings_and_the_free_cells():
+    grid = building(1)
+    cloud = scoring.ParticleSampler(1001, 0.5, 0.25, seed=3)
+    poses = cloud.draw(5, (8.0, 9.0, 1.0), grid)
+    assert poses.shape == (1001, 3)
+    assert poses[0].tolist() == [8, 9, 1]
+    near = poses[1:501]
+    np.testing.assert_allclose(near.mean(axis=0), (8, 9, 1), atol=0.1)
+    np.testing.assert_allclose(near.std(axis=0), (0.5, 0.5, 0.25), rtol=0.15)
+    col, row = np.floor(grid.world_to_cells(poses[501:, :2])).astype(int).T
+    assert grid.free[row, col].all()
+    assert (poses == cloud.draw(5, (8.0, 9.0, 1.0), grid)).all()
+    assert (poses[1:] != cloud.draw(6, (8.0, 9.0, 1.0), grid)[1:]).any()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Write a map of a building and a CARMEN log of eight scans in it."""
+    folder = tmp_path_factory.mktemp("recorded")
+    grid = building(2, (14.0, 12.0))
+    gs.write_map(grid, folder / "map.yaml")
+    scanner = gs.Scanner.uniform(angle_min=-math.pi / 2, angle_increment=math.pi / 60, count=61, range_max=10.0)
+    random = np.random.default_rng(4)
+    parameters = gs.BeamParameters(z_hit=0.9, z_short=0.02, z_max=0.04, z_rand=0.04, sigma_hit=0.03)
+    lines = []
+    for i in range(8):
+        x, y, theta = free_pose(grid, random)
+        ranges = simulate_scan(grid, scanner, (x, y, theta), parameters, random)
+        readings = " ".join(f"{z:.4f}" for z in np.where(np.isfinite(ranges), ranges, 10.0))
+        lines.append(f"FLASER 61 {readings} {x} {y} {theta} {x} {y} {theta} {i}.0 host {i}.0")
+    (folder / "run.log").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def run(capsys, recorded, *arguments):
+    code = main(["score", "--map", str(recorded / "map.yaml"), "--log", str(recorded / "run.log"), *arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.mark.parametrize("model", ["beam", "field"])
+def test_command_ranks_the_logged_pose_first(capsys, recorded, model):
+    code, out, err = run(capsys, recorded, "--model", model, "--particles", "400", "--backend", "numpy", "--limit", "3",
+                         "--every", "2", "--offset", "1", "--json")  # fmt: skip
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    (backend,) = document["backends"]
+    assert [scan["index"] for scan in backend["scans"]] == [1, 3, 5]
+    assert backend["summary"]["percentile_min"] > 97
+    assert backend["summary"]["error_position_median"] < 0.5
+    assert backend["device"]["selection"] == "numpy"
+    assert backend["summary"]["particle_beams_per_second"] > 0
+    assert document["agreement"] == []
+
+
+def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(yaml.safe_dump({"beam_model": gs.BeamParameters(sigma_hit=0.07).to_dict(), "amcl": {}}))
+    options = ["--particles", "50", "--backend", "numpy", "--limit", "1", "--json", "--parameters", str(file)]
+    code, out, _ = run(capsys, recorded, *options)
+    assert (code, json.loads(out)["parameters"]) == (0, gs.BeamParameters(sigma_hit=0.07).to_dict())
+    code, out, _ = run(capsys, recorded, *options, "--sigma-hit", "0.2")
+    assert json.loads(out)["parameters"]["sigma_hit"] == 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "model", "message"),
+    [
+        ("beam_model: {z_hit: 2}", "beam", "parameters.yaml: beam_model: z_hit + z_short + z_max + z_rand: must be 1"),
+        ("beam_model: 3", "beam", "parameters.yaml: must hold a mapping beam_model, got 3"),
+        ("{}", "beam", "parameters.yaml: must hold a mapping beam_model, got None"),
+        ("[", "beam", "parameters.yaml: must be plain YAML, got an error"),
+        ("beam_model: {}", "field", "--parameters: must be left out with the field"),
+    ],
+)
+def test_bad_files_of_parameters(capsys, recorded, tmp_path, text, model, message):
+    file = tmp_path / "parameters.yaml"
+    file.write_text(text)
+    code, out, err = run(capsys, recorded, "--model", model, "--backend", "numpy", "--parameters", str(file))
+    assert (code, out) == (2, "") and message in err and err.count("\n") == 1
+
+
+def test_backends_are_compared(capsys, recorded):
+    present = [d.selection for d in gs.devices() if d.available and d.kind != "simulator" and d.backend != "numpy"]
+    if not present:
+        pytest.skip("only NumPy is here")
+    options = [text for name in ("numpy", *present) for text in ("--backend", name)]
+    code, out, _ = run(capsys, recorded, "--particles", "300", "--limit", "2", "--json", *options)
+    agreements = json.loads(out)["agreement"]
+    assert len(agreements) == (len(present) + 1) * len(present) // 2
+    assert code == 0
+    assert all(agreement["same_ranking"] and agreement["spearman"] > 0.999 for agreement in agreements)
+    code, out, _ = run(capsys, recorded, "--particles", "300", "--limit", "2", *options)
+    assert f"numpy and {present[0]}: the same ranking" in out or f"{present[0]}: the same ranking" in out
+
+
+def test_another_ranking_is_noticed(capsys, recorded, monkeypatch):
+    present = [d.selection for d in gs.devices() if d.available and d.backend == "opencl" and d.kind != "simulator"]
+    if not present:
+        pytest.skip("no OpenCL device")
+    from gpusense.reference import beam
+
+    score_beams = beam.score_beams
+
+    def wrong(flags, *arguments):
+        score_beams(flags, *arguments)
+        log_p = arguments[12]
+        log_p[: len(log_p) // 2] += 1
+
+    monkeypatch.setattr(beam, "score_beams", wrong)
+    code, out, _ = run(capsys, recorded, "--particles", "50", "--limit", "1", "--backend", "numpy",
+                       "--backend", present[0])  # fmt: skip
+    assert code == 1
+    assert "ANOTHER RANKING" in out
+
+
+def test_plot_is_drawn_and_text_names_device(capsys, recorded, tmp_path):
+    picture = tmp_path / "scores.png"
+    code, out, _ = run(capsys, recorded, "--model", "field", "--particles", "100", "--backend", "numpy", "--plot",
+                       str(picture))  # fmt: skip
+    assert code == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "NumPy reference" in out and "particle-beams/s" in out and "percentile" in out
+
+
+def test_impossible_particles_are_reported_and_json_has_no_nan(capsys, recorded):
+    code, out, _ = run(capsys, recorded, "--model", "beam", "--particles", "20", "--backend", "numpy", "--limit", "1",
+                       "--z-hit", "0", "--z-short", "0", "--z-rand", "0", "--z-max", "1", "--json")  # fmt: skip
+    assert code == 0
+    assert "NaN" not in out
+    (backend,) = json.loads(out)["backends"]
+    assert backend["summary"]["degenerate"] == 1
+    assert backend["scans"][0]["mean"] is None
+    code, out, _ = run(capsys, recorded, "--model", "beam", "--particles", "20", "--backend", "numpy", "--limit", "1",
+                       "--z-hit", "0", "--z-short", "0", "--z-rand", "0", "--z-max", "1")  # fmt: skip
+    assert "all -inf" in out
+
+
+@pytest.mark.parametrize(
+    "arguments, complaint",
+    [
+        (["--offset", "99"], "scan of index 99"),
+        (["--z-hit", "0.9"], "must be 1"),
+        (["--model", "field", "--lambda-short", "1"], "--lambda-short"),
+        (["--interpolation", "bilinear"], "--interpolation"),
+        (["--backend", "opencl:no such device"], "no such device"),
+        (["--temperature", "2"], "temperature"),
+        (["--particles", "1"], "particles"),
+        (["--sigma-heading", "-1"], "sigma-heading"),
+        (["--plot", "picture.txt"], "picture.txt"),
+    ],
+)
+def test_bad_input_is_one_line(capsys, recorded, arguments, complaint):
+    code, out, err = run(capsys, recorded, *arguments)
+    assert code == 2
+    assert out == ""
+    assert err.count("\n") == 1
+    assert complaint in err
+
+
+def test_a_raw_map_without_free_cells_is_refused(capsys, recorded, tmp_path):
+    gs.write_map(gs.OccupancyGrid(np.full((20, 20), 100)), tmp_path / "full.yaml")
+    code = main(
+        ["score", "--map", str(tmp_path / "full.yaml"), "--log", str(recorded / "run.log"), "--backend", "numpy"]
+    )
+    assert code == 2
+    assert "free cell" in capsys.readouterr().err

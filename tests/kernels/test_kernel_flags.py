@@ -1,0 +1,202 @@
+"""Flags that are off leave no trace in the code; Warp's code rounds each operation and is made once."""
+
+from __future__ import annotations
+
+import functools
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.kernel_scenes import PRECISIONS, scene_flags
+
+from gpusense.backends import get_backend
+from gpusense.interface.kernel_files import warp_module
+from gpusense.interface.signatures import FLAGS, KERNELS
+from gpusense.interface.sources import assemble, relevant
+
+# Kernel, the flag, flags beside it, and what only the flag's code has, in OpenCL and in Warp's C++.
+TRACES = [
+    ("cast_ranges", "FLOAT64", (), r"\bdouble\b", r"\bfloat64\b"),
+    ("cast_ranges", "ORIGINS_OUTSIDE", (), r"\benter_x\b", r"\bwp::neg\("),
+    (
+        "cast_ranges",
+        "MARCH",
+        (),
+        r"\btolerance \+",
+        r"\bwp::float32\* *var_map_table|array_t<wp::float32> var_map_table",
+    ),
+    ("score_beams", "SENSOR_TABLE", ("LINEAR",), r"\btabulated_density\(z", r"tabulated_density_\d+\("),
+    ("score_beams", "HIT", ("LINEAR", "RAND"), r"\berf\(", r"\bwp::erf\("),
+    ("score_beams", "SHORT", ("LINEAR", "RAND"), r"\btanh\(", r"\bwp::tanh\("),
+    ("score_beams", "SHORT", ("HIT",), r"\btanh\(", r"\bwp::tanh\("),
+    ("score_beams", "SHARED_RAYS", ("RAND", "LINEAR"), r"\bfirst\[", r"address\(var_first\b"),
+    ("score_beams", "ALL_READINGS", ("RAND", "LINEAR"), r"\bisnan\(", r"\bwp::isnan\("),
+    ("score_beams", "PER_BEAM", ("RAND", "LINEAR"), r"\bparts\[\(long\)n \* readings", r"array_store\(var_parts\b"),
+    ("score_beams", "ECHO", ("RAND", "LINEAR"), r"\bnearest_echo\(map_table", r"nearest_echo_\d+\("),
+    ("score_beams", "INCIDENCE", ("RAND", "LINEAR", "ECHO"), r"\bincidence_terms\(", r"incidence_terms_\d+\("),
+    ("beam_tiles", "ECHO", ("RAND", "LINEAR"), r"\bnearest_echo\(map_table", r"nearest_echo_\d+\("),
+    ("place_poses", "CAREFUL", (), r"\bpose_low\[", r"array_store\(var_pose_low\b"),
+    ("place_poses", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32>"),
+    ("place_poses", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
+    ("place_inputs", "RANGES_FLOAT32", (), r"\bfloat measured\b", r"array_t<wp::float32> var_ranges"),
+    ("place_inputs", "SOME_BEAMS", (), r"\branges\[beam\[k\]", r"address\(var_beam\b"),
+    ("place_inputs", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32> var_poses"),
+    ("place_inputs", "END_POINTS", (), r"\bguard_scale \*", r"array_store\(var_guard\b"),
+    ("cast_ranges", "SECTORS_2", (), r"define SECTORS 2$", r"var_speed_y > var_speed_x"),
+    ("cast_ranges", "SECTORS_4", (), r"\b2\.4142136\b", r"\b2\.41421"),
+    ("cast_tiles", "ORDERED", (), r"\border\[", r"address\(var_order\b"),
+    ("beam_tiles", "ORDERED", ("RAND", "LINEAR"), r"\border\[", r"address\(var_order\b"),
+    ("beam_tiles", "SHARED_RAYS", ("RAND", "LINEAR"), r"\bfirst\[", r"address\(var_first\b"),
+    ("beam_tiles", "STRANDED", ("RAND", "LINEAR"), r"\bsum \+= term", r"tile_group_\d+\("),
+    ("sum_parts", "ORDERED", (), r"\border\[", r"address\(var_order\b"),
+    ("sum_parts", "STRANDED", ("SCANS",), r"\bterms / BLOCK_TERMS", r"wp::min\("),
+    ("sum_parts", "CUBES", (), r"\blog\(", r"\bwp::log\("),
+    ("field_blocks", "QUICK", ("LOG_TABLE", "CAREFUL"), r"\brounded_cell\(", r"rounded_cell_\d+\("),
+    (
+        "field_blocks",
+        "INSIDE",
+        ("LOG_TABLE", "CAREFUL", "QUICK"),
+        r"\(uint\)near\.y \* ",
+        r"table_cell_\d+\([^{;]*\{[^}]*wp::mul\(",
+    ),
+    ("place_relative", "POSES_FLOAT32", (), r"\bfloat coordinate\b", r"array_t<wp::float32> var_poses"),
+    ("place_relative", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
+    ("wrap_headings", "HUGE_HEADINGS", (), r"\breduce_huge\(", r"reduce_huge_\d+\("),
+    ("score_position", "RAND", (), r"= either\(log_density, terms\[8\]", r"either_\d+\("),
+    ("score_heading", "RAND", (), r"= either\(log_density, terms\[RANDOM\]", r"either_\d+\("),
+    ("score_beacons", "RAND", (), r"\beither\(log_p, terms\[RANDOM\]", r"(?:either_\d+\([\s\S]*){4}"),
+    ("score_contact", "CAREFUL", (), r"\bpose_low\[n\]", r"address\(var_pose_low\b"),
+    ("score_contact", "FLOAT64", (), r"\btypedef double real\b", r"vec_t<2, wp::float64> var_point,"),
+    ("score_beams", "SCANS", ("RAND", "LINEAR"), r"\bstart\[", r"address\(var_start\b"),
+    ("beam_tiles", "SCANS", ("RAND", "LINEAR"), r"\bstart\[", r"address\(var_start\b"),
+    ("score_field", "SCANS", ("LOG_TABLE",), r"\bstart\[", r"address\(var_start\b"),
+    ("field_blocks", "SCANS", ("LOG_TABLE",), r"\bstart\[", r"address\(var_start\b"),
+    ("sum_parts", "SCANS", (), r"\bcounts\[", r"address\(var_counts\b"),
+    ("score_features", "RANGE", (), r"\brange_mass\(", r"range_mass_\d+\("),
+    ("score_features", "BEARING", (), r"\bangle_pair\(", r"angle_pair_\d+\("),
+    ("score_features", "SIGNATURE", (), r"\bSIGNATURE_AT\]", r"pair_product_\d+\("),
+    ("score_features", "FIELD", ("BEARING",), r"\bfield_mass\(", r"field_mass_\d+\("),
+    ("score_features", "KNOWN", ("RANGE",), r"= partner\[k\]", r"address\(var_partner\b"),
+    ("score_features", "MARGINAL", ("RANGE",), r"\badd_term\(\*sum", r"(?:\bwp::exp\([\s\S]*){2}"),
+    ("score_features", "PER_BEAM", ("RANGE",), r"\bparts\[", r"array_store\(var_parts\b"),
+    ("score_field", "HIT", ("LINEAR",), r"\bexp\(", r"\bwp::exp\("),
+    ("score_field", "CAREFUL", ("LOG_TABLE",), r"\bcareful_offset\(", r"careful_offset_\d+\("),
+    ("score_field", "BILINEAR", ("LINEAR",), r"\bbilinear\(", r"bilinear_\d+\("),
+    ("score_field", "ALL_READINGS", ("LOG_TABLE",), r"\bisnan\(", r"\bwp::isnan\("),
+    ("e_step", "INFORMATION", ("HIT", "SHORT", "RAND"), r"\bsums\[39\]", r"\bvec_t<40\b"),
+    ("score_field", "PER_BEAM", ("LOG_TABLE",), r"\bparts\[\(long\)n \* readings", r"array_store\(var_parts\b"),
+]
+traces = pytest.mark.parametrize(
+    ("kernel", "flag", "beside", "opencl", "warp"),
+    TRACES,
+    ids=[f"{t[0]}-{t[1]}-beside-{'-'.join(t[2])}" for t in TRACES],
+)
+
+
+def without_comments(source: str) -> str:
+    return re.sub(r"//.*", "", source)
+
+
+@traces
+def test_flags_that_are_off_leave_no_trace_in_opencl(
+    kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str
+) -> None:
+    file = KERNELS[kernel].file
+    assert re.search(opencl, without_comments(assemble(file, frozenset({flag, *beside}))), re.MULTILINE)
+    source = assemble(file, frozenset(beside))
+    assert not re.search(opencl, without_comments(source), re.MULTILINE)
+    assert "#if" not in source
+
+
+@traces
+def test_flags_that_are_off_leave_no_trace_in_warp(
+    kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str, needs: Callable[[str], str]
+) -> None:
+    needs("warp")
+    assert re.search(warp, warp_code(kernel, frozenset({flag, *beside})))
+    assert not re.search(warp, warp_code(kernel, frozenset(beside)))
+
+
+@functools.cache
+def warp_code(kernel: str, flags: frozenset[str]) -> str:
+    """Return the C++ that Warp generates for a kernel, without comments, which quote the Python source."""
+    import warp as wp
+
+    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
+    with tempfile.TemporaryDirectory() as folder:
+        wp.compile_aot_module(made.module, device="cpu", module_dir=folder)
+        (source,) = Path(folder).glob("*.cpp")
+        return without_comments(source.read_text(encoding="utf-8"))
+
+
+def cuda_code(kernel: str, flags: frozenset[str], folder: Path) -> str:
+    """Return the PTX that Warp makes of a kernel for a CUDA device."""
+    import warp as wp
+
+    architectures = wp.get_cuda_supported_archs()
+    if not architectures:
+        pytest.skip("this build of Warp has no CUDA compiler")
+    made = warp_module(KERNELS[kernel].file).make(kernel, flags)
+    arch = min(architectures, key=lambda number: abs(number - 90))
+    wp.compile_aot_module(made.module, arch=arch, module_dir=folder, use_ptx=True)
+    (code,) = folder.glob("*.ptx")
+    return code.read_text(encoding="utf-8")
+
+
+def cuda_operations(kernel: str, flags: frozenset[str], folder: Path) -> set[str]:
+    """Return the floating-point operations that round in Warp's code of a kernel for a CUDA device."""
+    return cuda_operations_of(cuda_code(kernel, flags, folder))
+
+
+def cuda_operations_of(code: str) -> set[str]:
+    return set(re.findall(r"\b(?:fma|mad|mul|add|sub|div|rcp)\.\S*f(?:32|64)\b", code))
+
+
+@pytest.mark.parametrize("kernel", ["cast_ranges", "cast_tiles"])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_cuda_code_rounds_every_operation_by_itself(
+    precision: type, kernel: str, needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    operations = cuda_operations(kernel, scene_flags(precision, "ORIGINS_OUTSIDE"), tmp_path)
+    bits = "f64" if precision is np.float64 else "f32"
+    assert {f"rcp.rn.{bits}"} <= operations <= {f"{name}.rn.{bits}" for name in ("mul", "add", "sub", "div", "rcp")}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_cuda_code_places_poses_by_rounded_operations(
+    precision: type, needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    operations = cuda_operations("place_poses", scene_flags(precision, "CAREFUL", "HUGE_HEADINGS"), tmp_path)
+    assert {"div.rn.f64"} <= operations <= {f"{name}.rn.f64" for name in ("mul", "add", "sub", "div")}
+
+
+def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(
+    needs: Callable[[str], str], tmp_path: Path
+) -> None:
+    needs("warp")
+    flags = frozenset({"LOG_TABLE", "CAREFUL", "QUICK", "INSIDE"})
+    code = cuda_code("field_blocks", flags, tmp_path)
+    operations = cuda_operations_of(code)
+    # Where an end point's place has a bound, products and sums are one operation.
+    assert "fma.rn.f32" in operations <= {f"{name}.rn.f32" for name in ("mul", "add", "sub", "fma")}
+    blocks = re.split(r"^\$L\w+:|\bbra\b.*", code.partition(".entry")[2], flags=re.MULTILINE)
+    whole = max(blocks, key=len)
+    loads = re.findall(r"\bld\.global\S*", whole)
+    # 16 readings, a point for two of them and a cell each, by their addresses: no strides, no checks of signs.
+    assert sorted(loads) == ["ld.global.nc.f32"] * 16 + ["ld.global.nc.v4.f32"] * 8
+    assert not re.search(r"\bmul\.lo\.s64\b|\bshr\.s32\b", whole)
+
+
+@pytest.mark.parametrize("kernel", [*KERNELS])
+def test_a_warp_kernel_is_made_once_for_the_flags_that_matter(kernel: str, needs: Callable[[str], str]) -> None:
+    backend = get_backend(needs("warp"))
+    all_flags = frozenset(FLAGS)
+    file = KERNELS[kernel].file
+    assert backend.compile(kernel, all_flags) is backend.compile(kernel, relevant(file, all_flags))
+    with pytest.raises(ValueError, match="flags: must be among"):
+        backend.compile(kernel, frozenset({"NO_SUCH_FLAG"}))

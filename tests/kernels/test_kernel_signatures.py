@@ -1,0 +1,101 @@
+"""The bodies of every kernel have one signature in all languages."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from support.kernel_scenes import PRECISIONS
+
+from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source, warp_module
+from gpusense.interface.signatures import KERNELS, Argument
+
+each_kernel = pytest.mark.parametrize("kernel", list(KERNELS))
+
+
+@functools.cache
+def opencl_declarations() -> dict[str, list[tuple[str, str]]]:
+    """Return parameters and body of every kernel in the OpenCL files, by name; some have a second body for vectors."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for file in opencl_names():
+        text = opencl_source(file)
+        for match in re.finditer(r"kernel void (\w+)\((.*?)\) \{(.*?)^\}", text, re.DOTALL | re.MULTILINE):
+            found.setdefault(match.group(1), []).append((match.group(2), match.group(3)))
+    return found
+
+
+def opencl_argument(declaration: str) -> tuple[str, str, bool, bool]:
+    """Return name, type, whether an array, whether written, of one C parameter."""
+    match = re.fullmatch(r"(global )?(const )?(\w+) (\*)?(?:restrict )?(\w+)", " ".join(declaration.split()))
+    assert match is not None, declaration
+    space, constant, kind, pointer, name = match.groups()
+    assert bool(space) == bool(pointer)
+    assert pointer or constant, f"{name}: scalars are const"
+    return name, kind, bool(pointer), not constant
+
+
+def row_argument(argument: Argument) -> tuple[str, str, bool, bool]:
+    return argument.name, argument.type, argument.shape is not None, argument.output
+
+
+def test_every_opencl_kernel_has_a_row_and_every_row_a_kernel() -> None:
+    assert sorted(opencl_declarations()) == sorted(KERNELS)
+
+
+@each_kernel
+def test_opencl_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
+    for parameters, body in opencl_declarations()[kernel]:
+        assert [opencl_argument(one) for one in parameters.split(",")] == [
+            row_argument(argument) for argument in KERNELS[kernel].arguments
+        ]
+        axes = {int(axis) for axis in re.findall(r"get_global_id\((\d)\)", body)}
+        assert axes == set(range(len(KERNELS[kernel].launch)))
+
+
+def test_five_kernels_have_a_second_body_in_lanes() -> None:
+    twice = {name for name, bodies in opencl_declarations().items() if len(bodies) > 1}
+    assert twice == {"cast_ranges", "e_step", "score_beams", "score_features", "score_field"}
+    for name in twice:
+        assert f"kernel void {name}(" in opencl_source(f"lanes/{KERNELS[name].file}")
+
+
+@each_kernel
+def test_reference_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
+    row = KERNELS[kernel]
+    body = getattr(importlib.import_module(f"gpusense.reference.{row.file}"), kernel)
+    assert list(inspect.signature(body).parameters) == ["flags", *(argument.name for argument in row.arguments)]
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@each_kernel
+def test_warp_kernels_have_the_arguments_of_their_row(
+    kernel: str, precision: type, needs: Callable[[str], str]
+) -> None:
+    needs("warp")
+    import warp as wp
+
+    real = {np.float32: (wp.float32, wp.vec2f, wp.vec4f), np.float64: (wp.float64, wp.vec2d, wp.vec4d)}[precision]
+    types = dict(zip(("real", "real2", "real4"), real, strict=True))
+    types |= {"int": wp.int32, "int2": wp.vec2i, "uchar": wp.uint8, "ushort": wp.uint16, "entry": wp.uint16}
+    types |= {"double": wp.float64, "coordinate": wp.float64, "measured": wp.float64}
+    row = KERNELS[kernel]
+    made = warp_module(row.file).make(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
+    expected = {a.name: (types[a.type], a.shape is not None) for a in row.arguments}
+    found = {
+        name: (getattr(annotation, "dtype", annotation), isinstance(annotation, wp.array))
+        for name, annotation in inspect.get_annotations(made.func).items()
+    }
+    assert list(found.items()) == list(expected.items())
+    # The last thread index runs fastest in Warp, the first axis of the row everywhere else.
+    (indices,) = re.findall(r"^ *(.*) = (?:work_item\()?wp\.tid\(\)\)?$", inspect.getsource(made.func), re.MULTILINE)
+    assert len(indices.split(",")) == len(row.launch)
+
+
+def test_both_languages_have_the_same_files() -> None:
+    names = {path.stem for path in (kernel_root() / "opencl").glob("*.cl")}
+    assert {path.stem for path in (kernel_root() / "warp").glob("*.py")} == names | {"__init__", "prelude"}

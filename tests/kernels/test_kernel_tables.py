@@ -1,0 +1,333 @@
+"""Tables made of a map: distances, bits, empty rectangles and the field have the same numbers in every language."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from support.kernel_scenes import (
+    GRIDS,
+    PRECISIONS,
+    SECTORS,
+    UNREACHABLE,
+    each_grid,
+    on_both,
+    planes_of,
+    scene_flags,
+    squared_distances,
+)
+
+from gpusense.backends import Backend, get_backend
+from gpusense.reference.rectangles import OCCUPIED, slope
+from gpusense.tables.distances import empty_rectangles, packed
+from gpusense.world.windows import Region
+
+# ---- distances
+
+
+@each_grid
+@pytest.mark.parametrize("columns_first", [True, False])
+def test_distances_are_the_squares_of_the_exact_transform(
+    occupied: np.ndarray, columns_first: bool, device: Backend
+) -> None:
+    rows, cols = occupied.shape
+    by_column, by_row = (cols, rows, 1, cols), (rows, cols, cols, 1)
+    first, second = (by_column, by_row) if columns_first else (by_row, by_column)
+    cells, blank = occupied.astype(np.uint8), np.zeros(occupied.shape, np.int32)
+    reference, found = on_both(device, "distance_lines", frozenset(), (first[0],), cells, blank, *first)
+    np.testing.assert_array_equal(found["along"], reference["along"])
+    reference, found = on_both(
+        device, "distance_envelope", frozenset(), (second[0],), reference["along"], blank, blank, *second
+    )
+    np.testing.assert_array_equal(found["squared"], reference["squared"])
+    np.testing.assert_array_equal(found["squared"], squared_distances(occupied))
+
+
+@each_grid
+@pytest.mark.parametrize("most", [0, 29, 1601, UNREACHABLE])
+def test_distances_of_a_work_item_a_cell_are_exact_up_to_a_cap(
+    occupied: np.ndarray, most: int, device: Backend
+) -> None:
+    rows, cols = occupied.shape
+    bits, blocks = packed(occupied), -(-rows // 32)
+    blank, least = np.zeros(occupied.shape, np.uint16), np.zeros((blocks, cols), np.uint16)
+    reach = min(math.isqrt(most), 32767)
+    call = ("distance_bits", frozenset(), (cols, rows), bits, blank, rows, cols, bits.shape[1], reach)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["nearest"], reference["nearest"])
+    nearest = found["nearest"]
+    call = ("distance_blocks", frozenset(), (cols, blocks), nearest, least, rows, cols, blocks)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["blocks"], reference["blocks"])
+    squared = np.zeros(occupied.shape, np.int32)
+    call = ("distance_search", frozenset(), (cols, rows), nearest, found["blocks"], squared, rows, cols, blocks, most)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["squared"], reference["squared"])
+    exact = squared_distances(occupied)
+    np.testing.assert_array_equal(found["squared"], np.where(exact <= most, exact, UNREACHABLE))
+
+
+def test_bits_of_a_map_are_its_cells() -> None:
+    for occupied in GRIDS.values():
+        for part in (occupied, occupied[:, 1:], occupied[::2, ::2]):
+            words = packed(part)
+            assert (words.dtype, words.shape) == (np.int32, (len(part), -(-part.shape[1] // 32)))
+            cells = (words[:, :, None] >> np.arange(32)) & 1
+            np.testing.assert_array_equal(cells.reshape(len(part), -1)[:, : part.shape[1]], part)
+            assert words.size == 0 or cells.sum() == part.sum()
+
+
+# ---- empty rectangles
+
+
+def blocked_before(occupied: np.ndarray) -> np.ndarray:
+    """Count the obstacles in all rows and columns before each corner of a cell."""
+    return np.pad(occupied.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+
+
+def empty_sides(occupied: np.ndarray, quadrant: int, longest: int) -> np.ndarray:
+    """Return (longest, longest, rows, cols): is a rectangle of height i + 1 and width j + 1 empty and in the grid?"""
+    seen = occupied[:: -1 if quadrant & 2 else 1, :: -1 if quadrant & 1 else 1]
+    rows, cols = seen.shape
+    before = blocked_before(np.pad(seen, ((0, longest), (0, longest)), constant_values=True))
+    found = np.zeros((longest, longest, rows, cols), bool)
+    for height in range(1, longest + 1):
+        for width in range(1, longest + 1):
+            ends = [before[i : i + rows, j : j + cols] for i in (0, height) for j in (0, width)]
+            found[height - 1, width - 1] = ends[3] - ends[2] - ends[1] + ends[0] == 0
+    return found[:, :, :: -1 if quadrant & 2 else 1, :: -1 if quadrant & 1 else 1]
+
+
+def sides_of(planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return widths and heights inside the ring, as int."""
+    inner = planes[..., 1:-1, 1:-1].astype(int)
+    return inner & 255, inner >> 8
+
+
+def score(planes: np.ndarray) -> np.ndarray:
+    """Return the length for which the ray in the middle of the sector stays in each rectangle."""
+    sectors = planes.shape[1]
+    width, height = sides_of(planes)
+    middle = np.array([slope(sectors, sector) for sector in range(sectors)])[:, :, None, None]
+    return np.minimum(width * middle[:, 0], height * middle[:, 1])
+
+
+def check_empty(occupied: np.ndarray, planes: np.ndarray) -> None:
+    """Check that every rectangle is free and inside the grid, and that only the ring and obstacles have marks."""
+    rows, cols = occupied.shape
+    assert planes[..., [0, -1], :].max() == planes[..., [0, -1]].max() == 0
+    width, height = sides_of(planes)
+    assert width.min() > 0
+    np.testing.assert_array_equal(height == 0, np.broadcast_to(occupied, height.shape))
+    np.testing.assert_array_equal(planes[..., 1:-1, 1:-1] == OCCUPIED, height == 0)
+    before = blocked_before(occupied)
+    row, col = np.indices(occupied.shape)
+    for quadrant in range(4):
+        top = row - height[quadrant] + 1 if quadrant & 2 else np.broadcast_to(row, height[quadrant].shape)
+        left = col - width[quadrant] + 1 if quadrant & 1 else np.broadcast_to(col, width[quadrant].shape)
+        free = height[quadrant] > 0
+        top, left = top[free], left[free]
+        bottom, right = top + height[quadrant][free], left + width[quadrant][free]
+        assert top.min(initial=0) >= 0 and left.min(initial=0) >= 0
+        assert bottom.max(initial=0) <= rows and right.max(initial=0) <= cols
+        inside = before[bottom, right] - before[top, right] - before[bottom, left] + before[top, left]
+        assert inside.max(initial=0) == 0
+
+
+@pytest.fixture
+def as_kind(backend: str, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Backend]:
+    """Return a function that gives each backend the kernels for processors or for GPUs."""
+    device = get_backend(backend)
+
+    def pretend(kind: str) -> Backend:
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind))
+        return device
+
+    return pretend
+
+
+def made(device: Backend, occupied: np.ndarray, sectors: int, *mend: Any) -> np.ndarray:
+    rows, cols = occupied.shape
+    planes = np.empty((4, sectors, rows + 2, cols + 2), np.uint16)
+    return device.download(empty_rectangles(device, occupied, sectors, *mend), planes)
+
+
+@pytest.mark.parametrize("sectors", SECTORS)
+def test_rectangles_of_small_maps_are_the_best_there_are(sectors: int, as_kind: Callable[[str], Backend]) -> None:
+    rng = np.random.default_rng(21)
+    for shape in ((1, 1), (1, 9), (14, 1), (3, 5), (11, 13), (16, 16)):
+        for share in (0.0, 0.03, 0.15, 0.5, 1.0):
+            occupied = rng.random(shape) < share
+            longest = max(shape)
+            size = np.arange(1, longest + 1)
+            best = np.empty((4, sectors, *shape), int)
+            for quadrant in range(4):
+                empty = empty_sides(occupied, quadrant, longest)
+                for sector in range(sectors):
+                    num, den = slope(sectors, sector)
+                    worth = np.minimum(size * num, size[:, None] * den)[:, :, None, None]
+                    best[quadrant, sector] = np.where(empty, worth, 0).max(axis=(0, 1))
+            for kind in ("cpu", "gpu"):
+                planes = made(as_kind(kind), occupied, sectors)
+                check_empty(occupied, planes)
+                np.testing.assert_array_equal(score(planes), best)
+
+
+def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> None:
+    for shape in ((300, 310), (1, 600), (600, 2)):
+        occupied = np.zeros(shape, bool)
+        for kind in ("cpu", "gpu"):
+            for sectors in SECTORS:
+                planes = made(as_kind(kind), occupied, sectors)
+                check_empty(occupied, planes)
+                width, height = sides_of(planes)
+                middle = np.array([slope(sectors, sector) for sector in range(sectors)])
+                room = [np.minimum(255, np.arange(n, 0, -1)) for n in shape]
+                best = np.minimum(room[1] * middle[:, 0, None, None], room[0][:, None] * middle[:, 1, None, None])
+                np.testing.assert_array_equal(score(planes)[0], best)
+                np.testing.assert_array_equal(score(planes)[3], best[:, ::-1, ::-1])
+                assert width.max() == min(255, shape[1]) or height.max() == min(255, shape[0])
+
+
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
+    kind: str, as_kind: Callable[[str], Backend]
+) -> None:
+    occupied = np.random.default_rng(27).random((2, 70_000)) < 1e-3
+    for seen in (occupied, np.ascontiguousarray(occupied.T)):
+        expected = planes_of(seen, 2, kind)
+        check_empty(seen, expected)
+        np.testing.assert_array_equal(made(as_kind(kind), seen, 2), expected)
+
+
+@each_grid
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_rectangles_have_the_bits_of_the_reference(
+    occupied: np.ndarray, kind: str, as_kind: Callable[[str], Backend]
+) -> None:
+    for sectors in SECTORS:
+        expected = planes_of(occupied, sectors, kind)
+        check_empty(occupied, expected)
+        np.testing.assert_array_equal(made(as_kind(kind), occupied, sectors), expected)
+        np.testing.assert_array_equal(score(expected), score(planes_of(occupied, sectors, "cpu")))
+
+
+@each_grid
+def test_free_cells_of_a_part_leave_the_others_alone(occupied: np.ndarray, device: Backend) -> None:
+    rows, cols = occupied.shape
+    for begin, end in ((0, cols), (cols // 3, cols - cols // 4)):
+        blank = np.full((2, rows, cols), 7, np.uint8)
+        strips = -(-(end - begin) // 64)
+        cells, bits = occupied.astype(np.uint8), packed(occupied)
+        call = ("free_columns", frozenset(), (strips, 2), cells, blank, rows, cols, begin, end)
+        reference, found = on_both(device, *call)
+        np.testing.assert_array_equal(found["runs"], reference["runs"])
+        call = ("free_rows", frozenset(), (end - begin, rows), bits, blank, rows, cols, bits.shape[1], begin, end)
+        reference, found = on_both(device, *call)
+        np.testing.assert_array_equal(found["runs"], reference["runs"])
+        outside = np.delete(found["runs"], np.s_[begin:end], axis=2)
+        assert (outside == 7).all()
+
+
+def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Region]:
+    """Return edits of single cells, among them the four corners, and of windows, among them those at borders."""
+    rows, cols = shape
+    places = [(0, 0), (0, cols - 1), (rows - 1, 0), (rows - 1, cols - 1), (rows // 2, cols // 2)]
+    windows = [Region(row, col, 1, 1) for row, col in places]
+    for number in range(6):
+        high, wide = min(int(rng.integers(1, 40)), rows), min(int(rng.integers(1, 40)), cols)
+        row, col = int(rng.integers(0, rows - high + 1)), int(rng.integers(0, cols - wide + 1))
+        row = [0, rows - high, row][number % 3]
+        col = [0, col, cols - wide][number // 2]
+        windows.append(Region(row, col, high, wide))
+    return windows
+
+
+@functools.cache
+def made_anew(
+    shape: tuple[int, int], share: float, sectors: int, kind: str
+) -> list[tuple[np.ndarray, Region | None, bytes]]:
+    """Yield a map after each edit: the map, the changed window, and the compressed rectangles made anew."""
+    rng = np.random.default_rng(5)
+    occupied = rng.random(shape) < share
+    found: list[tuple[np.ndarray, Region | None, bytes]] = []
+    for number, changed in enumerate([None, *edits(rng, shape)], -1):
+        if changed is not None:
+            part = changed.cut(occupied)
+            part[...] = ~part if changed.cells == 1 else rng.random(part.shape) < [0, 0.02, 1][number % 3]
+        found.append((occupied.copy(), changed, zlib.compress(planes_of(occupied, sectors, kind).tobytes(), 1)))
+    return found
+
+
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+@pytest.mark.parametrize(
+    ("shape", "share"), [((610, 590), 0.0), ((610, 590), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)]
+)
+def test_updated_rectangles_are_those_made_anew(
+    shape: tuple[int, int], share: float, kind: str, as_kind: Callable[[str], Backend]
+) -> None:
+    device, sectors = as_kind(kind), 2
+    rectangles, planes = None, np.empty((4, sectors, shape[0] + 2, shape[1] + 2), np.uint16)
+    for occupied, changed, anew in made_anew(shape, share, sectors, kind):
+        mended = empty_rectangles(device, occupied, sectors, *(() if changed is None else (rectangles, changed)))
+        assert changed is None or mended is rectangles
+        rectangles = mended
+        device.download(rectangles, planes)
+        np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
+
+
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+@pytest.mark.parametrize("sectors", SECTORS)
+def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(
+    sectors: int, kind: str, as_kind: Callable[[str], Backend]
+) -> None:
+    """In an empty map, 255 cells from the borders, the change reaches as far as it can, and no farther."""
+    device, shape, place = as_kind(kind), (520, 530), (257, 262)
+    occupied = np.zeros(shape, bool)
+    rectangles = empty_rectangles(device, occupied, sectors)
+    empty = made(device, occupied, sectors)
+    for number in range(2):
+        occupied[place] = number == 0
+        mended = made(device, occupied, sectors, rectangles, Region(*place, 1, 1))
+        expected = planes_of(occupied, sectors, kind) if number == 0 else empty
+        np.testing.assert_array_equal(mended, expected)
+        if number == 0:
+            differ = np.argwhere((mended != empty).any(axis=(0, 1))) - 1
+            assert np.abs(differ - place).max() == 254
+
+
+# ---- the likelihood field
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+def test_the_table_is_filled_with_its_ring(real: type, device: Backend) -> None:
+    squared = squared_distances(GRIDS["sparse"])
+    rows, cols = squared.shape
+    cap, beyond = 50, -3.5
+    density = np.random.default_rng(19).random(cap + 1).astype(real)
+    table = np.full((rows + 4, cols + 4), -7, real)
+    place = (-2, -2, cols + 4, rows + 4, 0, cols + 4)
+    call = ("fill_field", scene_flags(real), (cols + 4, rows + 4), squared, density, table, rows, cols, cap, beyond)
+    reference, found = on_both(device, *call, *place)
+    np.testing.assert_array_equal(found["table"], reference["table"])
+    expected = np.pad(density[np.minimum(squared, cap)], 2, constant_values=beyond)
+    np.testing.assert_array_equal(found["table"], expected)
+
+
+@pytest.mark.parametrize("real", PRECISIONS)
+def test_a_part_of_the_table_is_filled(real: type, device: Backend) -> None:
+    squared, density = squared_distances(GRIDS["sparse"]), np.arange(51).astype(real)
+    rows, cols = squared.shape
+    table = np.full((30, 40), -7, real)
+    # Rows 20 to 24 and columns 3 to 9 go to row 6 and column 11.
+    call = ("fill_field", scene_flags(real), (7, 5), squared, density, table, rows, cols, 50, 0.0, 3, 20, 7, 5, 251, 40)
+    reference, found = on_both(device, *call)
+    np.testing.assert_array_equal(found["table"], reference["table"])
+    table[6:11, 11:18] = np.minimum(squared[20:25, 3:10], 50)
+    np.testing.assert_array_equal(found["table"], table)

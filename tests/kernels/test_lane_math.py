@@ -1,0 +1,131 @@
+"""Functions of kernels/opencl/lanes/math.cl against float64, in ulps of float32, and where their constants are from."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from types import ModuleType
+
+import mpmath as mp
+import numpy as np
+import pytest
+from scipy import special
+from support.paths import ROOT
+
+from gpusense.evaluation.tolerances import TOLERANCES
+from gpusense.interface.kernel_files import opencl_source
+from gpusense.interface.signatures import LANES
+from gpusense.interface.sources import prelude, resolve
+
+NORMAL = float(np.finfo(np.float32).tiny)
+COUNT = 1 << 22
+
+
+def spread(low: float, high: float) -> np.ndarray:
+    """Return positive float32 numbers between two, both among them, evenly in their bits and in their values."""
+    ends = np.array([low, high], np.float32)
+    bits = np.linspace(*ends.view(np.int32).astype(np.float64), COUNT // 2).astype(np.int32).view(np.float32)
+    return np.concatenate([bits, np.linspace(*ends, COUNT // 2, dtype=np.float32)])
+
+
+# Arguments, and the function in float64.
+FUNCTIONS = {
+    "exp_lanes": (-spread(1e-30, 87.0), np.exp),
+    "one_minus_exp_lanes": (-spread(1e-36, 200.0), lambda a: -np.expm1(a)),
+    "log_lanes": (np.concatenate([spread(NORMAL, 3e38), spread(0.5, 2.0)]), np.log),
+    "erf_lanes": (spread(1e-36, 6.0), special.erf),
+}
+
+
+@pytest.fixture
+def evaluate(needs):
+    """Return a function that evaluates a function of the file at every number of an array, on the OpenCL device."""
+    selection = needs("opencl")
+    import pyopencl as cl
+
+    from gpusense.backends import get_backend
+
+    backend = get_backend(selection)
+    files = [resolve(opencl_source(name), frozenset(), name) for name in ("lanes/types", "lanes/math")]
+    context = backend._context
+    queue = cl.CommandQueue(context)
+
+    def run(function: str, numbers: np.ndarray) -> np.ndarray:
+        kernel = (
+            "kernel void each(global const float *in, global float *out) {\n"
+            f"    store_lanes({function}(load_lanes(get_global_id(0), in)), get_global_id(0), out);\n}}\n"
+        )
+        source = prelude(float64=False) + "".join(files) + kernel
+        program = backend._built(cl.Program(context, source))
+        flags = cl.mem_flags.COPY_HOST_PTR
+        given = cl.Buffer(context, cl.mem_flags.READ_ONLY | flags, hostbuf=numbers)
+        made, found = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, numbers.nbytes), np.empty_like(numbers)
+        program.each(queue, (len(numbers) // LANES,), None, given, made)
+        cl.enqueue_copy(queue, found, made)
+        return found
+
+    return run
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_errors_in_ulps(function, evaluate):
+    numbers, exact = FUNCTIONS[function]
+    truth = exact(numbers.astype(np.float64))
+    ulp = np.spacing(np.abs(truth).astype(np.float32)).astype(np.float64)
+    off = np.abs(evaluate(function, numbers) - truth) / ulp
+    worst = int(np.argmax(off))
+    print(f"{function}: {off[worst]:.3f} ulp at {numbers[worst]!r}")
+    row = "erf in lanes" if function == "erf_lanes" else "exp, 1 - exp and log in lanes"
+    assert off[worst] <= TOLERANCES[row].value
+
+
+def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
+    """The rest that is added to t for arctan t, in ulps of arctan t."""
+    t = spread(1e-30, 0.41421356)
+    exact = np.arctan(t.astype(np.float64))
+    off = np.abs(evaluate("arc_rest_lanes", t) - (exact - t)) / np.spacing(exact.astype(np.float32))
+    print(f"arc_rest_lanes: {off.max():.3f} ulp at {t[int(np.argmax(off))]!r}")
+    assert off.max() <= 0.2
+
+
+def test_ends(evaluate):
+    """Exact values, far arguments, and none that depends on a neighbour."""
+
+    def at(function: str, *numbers: float) -> list[float]:
+        given = np.resize(np.array(numbers, np.float32), LANES)
+        alone = [evaluate(function, np.full(LANES, number, np.float32))[0] for number in given[: len(numbers)]]
+        together = evaluate(function, given)[: len(numbers)].tolist()
+        assert together == [float(value) for value in alone]
+        return together
+
+    assert at("exp_lanes", 0.0, -0.0, -88.0, -1e9, -3e38, -np.inf) == [1, 1, 0, 0, 0, 0]
+    assert at("one_minus_exp_lanes", 0.0, -20.0, -1e9, -np.inf) == [0, 1, 1, 1]
+    assert at("log_lanes", 1.0) == [0]
+    assert at("erf_lanes", 0.0, 4.0, 1e9, np.inf) == [0, 1, 1, 1]
+
+
+def derived() -> ModuleType:
+    """Import bench/lane_constants.py."""
+    path = ROOT / "bench" / "derive" / "lane_constants.py"
+    spec = importlib.util.spec_from_file_location("lane_constants", path)
+    module = importlib.util.module_from_spec(spec)
+    digits = mp.mp.dps
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        mp.mp.dps = digits
+    return module
+
+
+def test_constants_are_those_that_were_derived():
+    made, expected = derived(), {}
+    with mp.workdps(50):
+        polynomials = (made.exponential(), made.logarithm(), made.error_function(), made.arc())
+        for name, (powers, error) in zip("ELWA", polynomials, strict=True):
+            assert error < -24
+            expected |= {f"{name}{i}": powers[i] for i in range(len(powers))}
+        expected |= dict(zip(("LOG2_HIGH", "LOG2_LOW", "ONE_OVER_LOG2"), made.log_parts(), strict=True))
+    text = opencl_source("lanes/math")
+    defined = re.findall(r"^#define (\w+) (\S+)f$", text, re.MULTILINE)
+    found = {name: float(np.float32(value)) for name, value in defined}
+    assert {name: found[name] for name in expected} == expected

@@ -1,0 +1,194 @@
+"""Kernels that compute 16 particles or beams at once: the bits of the scalar ones, leftovers included."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import defaultdict
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.evaluation.tolerances import beam_tolerance, differing
+from gpusense.interface.kernel_files import opencl_names, opencl_source
+from gpusense.interface.lanes import widened
+from gpusense.interface.signatures import KERNELS, LANES, lanes_of
+from gpusense.interface.sources import assemble, relevant, required_files
+
+RANGE = 9.0
+KINDS = ("cast_ranges", "score_beams", "score_field")
+
+
+@pytest.fixture
+def device(needs):
+    """Return a function that opens the OpenCL device with a number of lanes."""
+    backend = get_backend(needs("opencl"))
+    before = backend.info
+
+    def ask(lanes: int):
+        backend.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
+        return backend
+
+    yield ask
+    backend.info = before
+
+
+def scene(particles: int, beams: int):
+    """Return poses inside, on edges, in walls and off the map; a scan with max and missing readings."""
+    rng = np.random.default_rng([particles, beams])
+    cells = rng.choice([0, 100, -1], (37, 53), p=[0.93, 0.05, 0.02])
+    grid = gs.OccupancyGrid(cells, 0.25, (3.0, -2.0, 0.3))
+    local = rng.uniform((-1, -1, -4), (14, 10, 4), (particles, 3))
+    local[1::3] = np.round(local[1::3] * 4) / 4
+    cos, sin = math.cos(0.3), math.sin(0.3)
+    poses = np.stack([3 + cos * local[:, 0] - sin * local[:, 1], -2 + sin * local[:, 0] + cos * local[:, 1],
+                      local[:, 2]], axis=1)  # fmt: skip
+    z = rng.uniform(0, RANGE, beams)
+    z[3::11], z[5::13] = np.inf, np.nan
+    return grid, gs.Scanner(np.linspace(-3, 3, beams), RANGE, mount=(0.1, 0.0, 0.2)), poses, z
+
+
+def results(device, particles: int, beams: int, outside: str):
+    grid, scanner, poses, z = scene(particles, beams)
+    options = dict(backend=device, outside=outside)
+    beam = gs.BeamModel(grid, scanner, gs.BeamParameters(0.6, 0.1, 0.1, 0.2, 0.1, 0.3), **options)
+    field = gs.LikelihoodFieldModel(grid, scanner, **options)
+    found = {"ranges": gs.RayCaster(grid, RANGE, **options).cast(poses, scanner.bearings)}
+    smooth = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(interpolation="bilinear"), **options)
+    for name, model in (("beam", beam), ("field", field), ("smooth field", smooth)):
+        found[f"{name} log p"], found[f"{name} parts"] = model.log_likelihood(poses, z, per_beam=True)
+        assert differing(model.log_likelihood(poses, z), found[f"{name} log p"]) == 0
+    return found
+
+
+@pytest.fixture
+def compiled(device, monkeypatch):
+    """Record the lanes of every kernel that is compiled, by its name."""
+    backend, found = device(1), defaultdict(set)
+    kind = type(backend)
+    compile_ = kind.compile
+
+    def record(backend, kernel, flags):
+        found[kernel].add(lanes_of(flags))
+        return compile_(backend, kernel, flags)
+
+    monkeypatch.setattr(kind, "compile", record)
+    return found
+
+
+@pytest.mark.parametrize("outside", ["free", "occupied"])
+@pytest.mark.parametrize(("particles", "beams"), [(1, 1), (15, 15), (16, 16), (17, 33), (63, 40), (130, 200)])
+def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled):
+    one = results(device(1), particles, beams, outside)
+    assert all(compiled[kernel] == {1} for kernel in KINDS)
+    compiled.clear()
+    found = results(device(LANES), particles, beams, outside)
+    assert all(compiled[kernel] == {LANES} for kernel in KINDS)
+    for name in ("ranges", "field log p", "field parts"):
+        assert differing(found[name], one[name]) == 0, name
+    # Drivers have elementary functions of their own for vectors.
+    allowed = beam_tolerance(np.float32).twice()
+    for name in ("beam parts", "beam log p", "smooth field parts", "smooth field log p"):
+        assert allowed.difference(found[name], one[name]) <= allowed.value, name
+
+
+def test_a_particle_does_not_depend_on_its_lane(device):
+    grid, scanner, poses, z = scene(140, 200)
+    smooth = gs.LikelihoodFieldParameters(interpolation="bilinear")
+    for make, *parameters in ((gs.BeamModel,), (gs.LikelihoodFieldModel,), (gs.LikelihoodFieldModel, smooth)):
+        model = make(grid, scanner, *parameters, backend=device(LANES))
+        together = model.log_likelihood(poses, z)
+        assert differing(model.log_likelihood(poses[::-1], z)[::-1], together) == 0
+        pieces = [model.log_likelihood(poses[i : i + 3], z) for i in range(0, len(poses), 3)]
+        assert differing(np.concatenate(pieces), together) == 0
+
+
+@pytest.mark.parametrize("resolution", [1e-5, 1e-3, 0.05, 3.0])
+def test_end_points_next_to_edges_and_far_away(resolution, device):
+    """Readings of up to 2^20 cells, most of them whole, at headings of quarter turns and nearly so."""
+    rng = np.random.default_rng(5)
+    grid = gs.OccupancyGrid(rng.choice([0, 100], (90, 70), p=[0.9, 0.1]), resolution)
+    scanner = gs.Scanner(np.append(np.arange(32) * math.pi / 4, rng.uniform(-3, 3, 50)), (1 << 20) * resolution)
+    poses = rng.uniform((0, 0, -4), (70, 90, 4), (300, 3)) * (resolution, resolution, 1)
+    poses[::2] = np.round(poses[::2] / resolution) * resolution
+    poses[::2, 2] = rng.integers(-4, 5, 150) * math.pi / 4
+    poses[2::8] += rng.normal(0, 1e-9, 3)
+    z = np.concatenate([np.arange(32), rng.integers(0, 60, 20), rng.uniform(0, 1 << 20, 30)]) * resolution
+    for interpolation in ("nearest", "bilinear"):
+        parameters = gs.LikelihoodFieldParameters(
+            sigma_hit=2 * resolution, max_distance=6 * resolution, interpolation=interpolation
+        )
+        found = [
+            gs.LikelihoodFieldModel(grid, scanner, parameters, backend=device(lanes)).log_likelihood(
+                poses, z, per_beam=True
+            )
+            for lanes in (1, LANES)
+        ]
+        for one, wide in zip(*found, strict=True):
+            if interpolation == "nearest":
+                assert differing(wide, one) == 0
+            else:
+                allowed = beam_tolerance(np.float32).twice()
+                assert allowed.difference(wide, one) <= allowed.value
+
+
+def test_only_scenes_that_have_such_kernels_get_them():
+    info = get_backend("numpy").info
+    wide = dataclasses.replace(info, lanes=LANES)
+    assert widened(info.lanes, "cast_ranges", set()) == frozenset()
+    assert widened(wide.lanes, "cast_ranges", set()) == {"WIDE"}
+    for flag in ("FLOAT64", "MARCH", "LOOKUP", "SHARED_RAYS", "SHARP"):
+        assert widened(wide.lanes, "cast_ranges", {flag}) == {flag}
+    assert widened(wide.lanes, "score_beams", {"HIT"}) == {"HIT"}
+    assert widened(wide.lanes, "score_beams", {"HIT", "LINEAR"}) == {"HIT", "LINEAR", "WIDE"}
+    assert widened(wide.lanes, "score_field", {"BILINEAR"}) == {"BILINEAR"}
+    assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
+    assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
+    assert widened(wide.lanes, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
+
+
+def test_programs_in_lanes_begin_in_their_folder():
+    for file in {row.file for row in KERNELS.values()}:
+        scalar, wide = required_files(file), required_files(file, frozenset({"WIDE"}))
+        assert not any(name.startswith("lanes/") for name in scalar)
+        assert scalar[-1] == file
+        if f"lanes/{file}" in opencl_names():
+            assert wide[-1] == f"lanes/{file}"
+            assert "lanes/types" in wide
+            assert file not in wide or "kernel void" not in opencl_source(file)
+            assert "WIDE" in relevant(file, frozenset({"WIDE"}))
+            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"WIDE"}))
+        else:
+            assert wide == scalar
+            assert "WIDE" not in relevant(file, frozenset({"WIDE"}))
+
+
+def test_scalar_files_hold_nothing_of_vectors():
+    for name in opencl_names():
+        text = opencl_source(name)
+        assert "WIDE" not in text.replace("WIDE_", "")
+        if not name.startswith("lanes/"):
+            assert "lanes" not in text.split("// requires:")[-1].splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("platform", "kind", "width", "lanes"),
+    [
+        ("Portable Computing Language", "CPU", 16, 16), ("Portable Computing Language", "CPU", 8, 8),
+        ("Intel(R) OpenCL", "CPU", 16, 16), ("Intel(R) OpenCL", "CPU", 8, 8),
+        ("Intel(R) OpenCL Graphics", "GPU", 16, 1), ("Another", "CPU", 16, 1), ("NVIDIA CUDA", "GPU", 1, 1),
+    ],
+)  # fmt: skip
+def test_which_devices_are_asked_for_lanes(platform, kind, width, lanes, needs):
+    needs("opencl")
+    import pyopencl as cl
+
+    from gpusense.backends.opencl.devices import _lanes
+
+    device = SimpleNamespace(
+        platform=SimpleNamespace(name=platform), type=getattr(cl.device_type, kind), native_vector_width_float=width
+    )
+    assert _lanes(device) == lanes

@@ -1,0 +1,128 @@
+"""Ranges of many cells: long corridors, far origins and the longest range there may be."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from support.ray_oracles import backward_error_is_small, walk
+from support.raycast_scenes import (
+    FLOAT32_CELLS,
+    FLOAT64_RELATIVE,
+    FLOAT64_TURN,
+    LAST_FLOAT32,
+    PRECISIONS,
+    Scene,
+    as_float32,
+    cast,
+    unit,
+)
+
+from gpusense.backends import get_backend
+from gpusense.evaluation.tolerances import differing
+from gpusense.reference.ray import crossed
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_long_corridors(backend, precision):
+    """20 000 cells along an axis and aslant: the far wall at its distance, whatever lies beside the ray."""
+    length = 20_000
+    occupied = np.zeros((9, length), bool)
+    occupied[:, -1] = True
+    occupied[0, 9::10] = occupied[-1, 4::10] = True
+    rng = np.random.default_rng(1)
+    frac = rng.integers(0, 1 << 24, (200, 2)) / (1 << 24)
+    slope = as_float32(np.where(np.arange(200) % 2, rng.uniform(-1e-4, 1e-4, 200), 0.0))
+    cell = np.stack([rng.integers(0, 50, 200), np.full(200, 4)], axis=1)
+    scene = Scene(occupied, cell, frac, np.stack([np.ones(200), slope], axis=1), 30_000.0)
+    expected = length - 1 - cell[:, 0] - frac[:, 0]
+    error = np.abs(cast(scene, backend, precision) - expected)
+    assert (error <= (FLOAT32_CELLS if precision == "float32" else FLOAT64_RELATIVE * expected)).all()
+
+
+# The most cells that a range may have.
+MOST = 1 << 20
+
+
+def rounded(value: Fraction, real: np.dtype) -> Fraction:
+    """Return the nearest number of a precision, ties to even; for 0 and positive normal numbers."""
+    if value == 0:
+        return value
+    exponent = math.floor(math.log2(value))
+    # Next to a power of two the logarithm may be off.
+    exponent += (value >= Fraction(2) ** (exponent + 1)) - (value < Fraction(2) ** exponent)
+    unit_in_last_place = Fraction(2) ** (exponent - np.finfo(real).nmant)
+    return round(value / unit_in_last_place) * unit_in_last_place
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_counts_of_boundaries_near_the_longest_range(precision):
+    """Those whose rounded distances are below t, or t itself: at such distances and next to them, by fractions."""
+    real, rng, count = np.dtype(precision), np.random.default_rng(17), 1500
+    speed = np.concatenate(
+        [rng.uniform(0.5, 1, count), np.sqrt(np.full(count, 0.5)), 2.0 ** rng.uniform(-20, 0, count)]
+    )
+    speed = speed.astype(real)
+    inv, size = 1 / speed, len(speed)
+    a = rng.choice([0, 2.0**-24, 0.25, 0.5, 1 - 2.0**-24, 1], size).astype(real)
+    a = np.where(rng.random(size) < 0.5, rng.random(size).astype(real), a)
+    most = np.minimum(np.floor(MOST * speed.astype(float)), MOST - 2)
+    k = np.maximum(most - rng.integers(0, 1000, size), 0).astype(real)
+    near = (k + a) * inv
+    for t in (near, np.nextafter(near, real.type(0)), np.nextafter(near, real.type(np.inf)), near + inv / 2):
+        t = np.minimum(np.maximum(t, 0), real.type(MOST))
+        found = [crossed(t, speed, a, inv, until) for until in (False, True)]
+        for i in range(size):
+            at, pace, first, inverse = (Fraction(float(v[i])) for v in (t, speed, a, inv))
+            low = max(math.floor(at * pace - first) - 2, 0)
+            far = [rounded(rounded(n + first, real) * inverse, real) for n in range(low, low + 6)]
+            assert far[-1] > at and (low == 0 or far[0] < at)
+            assert found[0][i] == low + sum(one < at for one in far)
+            assert found[1][i] == low + sum(one <= at for one in far)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
+    """float64 is the rational walk; float32 has the bits of numpy's walk from cell to cell."""
+    rng = np.random.default_rng(19)
+    occupied = rng.random((50, 60)) < 0.02
+    target = rng.uniform((0, 0), (60, 50), (600, 2))
+    turn = np.where(np.arange(600) % 3, rng.uniform(-np.pi, np.pi, 600), rng.integers(0, 8, 600) * (np.pi / 4))
+    direction = unit(turn)
+    away = np.floor(rng.uniform(0.9, 0.9999, 600) * MOST)
+    origin = target - direction * away[:, None]
+    cell = np.floor(origin).astype(int)
+    scene = Scene(occupied, cell, as_float32(np.minimum(origin - cell, LAST_FLOAT32)), direction, float(MOST))
+    found = cast(scene, backend, precision)
+    assert 100 < np.count_nonzero(found < MOST) < 600
+    for sectors in (2, 4):
+        assert differing(cast(scene, backend, precision, sectors), found) == 0
+    assert differing(found, cast(scene, "numpy", precision)) == 0
+    if precision == "float64" and backend == "numpy":
+        # The walk begins near the map, at a place on the ray that is exact.
+        for i in range(0, 600, 4):
+            ray, skipped = scene.ray(i), int(away[i]) - 100
+            near = ray.moved(*(skipped * Fraction(d) for d in ray.direction), 0)
+            near = dataclasses.replace(near, limit=MOST - skipped)
+            assert abs(skipped + walk(occupied.tolist(), near).t - found[i]) <= 1e-9 or backward_error_is_small(
+                occupied.tolist(), near, found[i] - skipped, move=1e-9, turn=FLOAT64_TURN, tolerance=1e-9
+            )
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_the_longest_corridor(precision, backend):
+    """A million cells inside the map: counts of boundaries as they were at its begin."""
+    length = MOST - 100 if get_backend(backend).info.backend != "numpy" else 100_000
+    occupied = np.zeros((3, length), bool)
+    occupied[:, -1] = True
+    rng = np.random.default_rng(23)
+    frac = rng.integers(0, 1 << 24, (60, 2)) / (1 << 24)
+    slope = as_float32(np.where(np.arange(60) % 2, rng.uniform(-9e-7, 9e-7, 60), 0.0))
+    cell = np.stack([rng.integers(0, 50, 60), np.full(60, 1)], axis=1)
+    scene = Scene(occupied, cell, frac, np.stack([np.ones(60), slope], axis=1), float(MOST))
+    expected = length - 1 - cell[:, 0] - frac[:, 0]
+    found = cast(scene, backend, precision, 2, wide=True)
+    assert (np.abs(found - expected) <= np.spacing(expected.astype(precision))).all()

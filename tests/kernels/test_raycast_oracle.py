@@ -1,0 +1,123 @@
+"""The exact caster's kernels against walks in rational arithmetic; no pair of walls leaks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.ray_oracles import backward_error_is_small, fraction_walk
+from support.raycast_scenes import (
+    FAMILIES,
+    FLOAT32_CELLS,
+    FLOAT32_MOVE,
+    FLOAT32_TURN,
+    FLOAT64_MOVE,
+    FLOAT64_RELATIVE,
+    FLOAT64_TURN,
+    PRECISIONS,
+    Scene,
+    as_float32,
+    cast,
+    scenes_of,
+)
+
+from gpusense.backends import get_backend
+
+
+def test_there_are_enough_rays():
+    assert sum(len(scene.cell) for family in FAMILIES for scene in scenes_of(family)) >= 100_000
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_integer_walk_is_the_walk_in_fractions(family):
+    for scene in scenes_of(family)[::2]:
+        for i in range(0, len(scene.cell), 40):
+            exact = fraction_walk(scene.occupied, scene.ray(i), scene.outside_occupied)
+            assert scene.exact[i] == (scene.limit if exact is None else float(exact))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_float64_is_the_rational_walk(family, backend):
+    for scene in scenes_of(family):
+        found = cast(scene, backend, "float64")
+        wrong = np.flatnonzero(np.abs(found - scene.exact) > FLOAT64_RELATIVE * scene.exact)
+        if scene.grazes:
+            wrong = unexplained(scene, found, wrong, FLOAT64_MOVE, FLOAT64_TURN, FLOAT64_RELATIVE)
+        assert not len(wrong), [(scene.ray(i), scene.outside_occupied, found[i], scene.exact[i]) for i in wrong[:3]]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_float32_is_the_rational_walk_of_a_ray_near_by(family):
+    for scene in scenes_of(family):
+        found = cast(scene, "numpy", "float32").astype(np.float64)
+        wrong = np.flatnonzero(np.abs(found - scene.exact) > FLOAT32_CELLS)
+        wrong = unexplained(scene, found, wrong, FLOAT32_MOVE, FLOAT32_TURN, FLOAT32_CELLS)
+        assert not len(wrong), [(scene.ray(i), scene.outside_occupied, found[i], scene.exact[i]) for i in wrong[:3]]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("sectors", [1, 2, 4])
+def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, backend, precision, sectors):
+    bits = np.dtype(precision).str.replace("f", "u")
+    for scene in scenes_of(family):
+        expected = cast(scene, "numpy", precision)
+        # Vectors too, where the device has them.
+        for wide in (False, True) if get_backend(backend).info.lanes > 1 else (False,):
+            found = cast(scene, backend, precision, sectors, wide=wide)
+            wrong = np.flatnonzero(expected.view(bits) != found.view(bits))
+            assert not len(wrong), [(scene.ray(i), found[i], expected[i]) for i in wrong[:3]]
+
+
+def unexplained(
+    scene: Scene, found: np.ndarray, suspects: np.ndarray, move: float, turn: float, tolerance: float
+) -> list[int]:
+    """Return the rays whose range is no near-by ray's either."""
+    cells = scene.occupied.tolist()
+    return [
+        i
+        for i in suspects
+        if not backward_error_is_small(
+            cells, scene.ray(i), float(found[i]), move=move, turn=turn, tolerance=tolerance,
+            outside_occupied=scene.outside_occupied,
+        )
+    ]  # fmt: skip
+
+
+def test_a_diagonal_pair_of_walls_never_leaks(backend):
+    """Neither pair of diagonal neighbours lets a ray through their common corner, from any side."""
+    for pair in (((5, 5), (6, 6)), ((5, 6), (6, 5))):
+        occupied = np.zeros((12, 12), bool)
+        for row, col in pair:
+            occupied[row, col] = True
+        for sign_x, sign_y in ((1, 1), (-1, 1), (1, -1), (-1, -1)):
+            starts = np.arange(1, 5)
+            cell = np.stack([6 - sign_x * starts, 6 - sign_y * starts], axis=1)
+            scene = Scene(occupied, cell, np.zeros((4, 2)), np.tile([0.5 * sign_x, 0.5 * sign_y], (4, 1)), 30.0)
+            for precision in PRECISIONS:
+                along_the_pair = (pair[0] == (5, 5)) == (sign_x == sign_y)
+                expected = 2.0 * (starts - 1 if along_the_pair else starts)
+                np.testing.assert_array_equal(cast(scene, backend, precision), expected)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_no_pair_of_walls_leaks_at_any_slope(precision, backend):
+    """Rays aimed at the common corner of two walls as exactly as floats can: however they round, a wall stops them."""
+    rng = np.random.default_rng(13)
+    for number in range(40):
+        sign = rng.choice([-1, 1], 2)
+        occupied = np.zeros((41, 41), bool)
+        # The corner is (20, 20). The cells before and behind it on the way are free, the two beside it are walls.
+        occupied[20 if sign[1] < 0 else 19, 20 if sign[0] > 0 else 19] = True
+        occupied[20 if sign[1] > 0 else 19, 20 if sign[0] < 0 else 19] = True
+        if number % 2:
+            away = rng.integers(1, 20, (100, 2)).astype(float)
+            direction = away / 2.0 ** rng.integers(5, 8, (100, 1))
+        else:
+            away = rng.integers(1, 20 << 16, (100, 2)) / (1 << 16)
+            direction = as_float32(away / np.hypot(*away.T)[:, None])
+        origin = 20 - sign * away
+        cell = np.floor(origin).astype(int)
+        scene = Scene(occupied, cell, origin - cell, direction * sign, 2000.0)
+        corner = np.hypot(*away.T) / np.hypot(*direction.T)
+        found = cast(scene, backend, precision)
+        assert (found <= corner * (1 + 1e-5)).all(), scene.ray(int(np.argmax(found - corner)))

@@ -1,0 +1,186 @@
+"""A concept has three bodies, in OpenCL, Warp and NumPy: functions of the same names in the same order."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import pytest
+
+import gpusense.reference
+from gpusense.interface.kernel_files import kernel_root, opencl_source
+from gpusense.interface.signatures import KERNELS
+
+OPENCL, WARP, NUMPY = LANGUAGES = "OpenCL", "Warp", "NumPy"
+FOLDERS = {WARP: kernel_root() / "warp", NUMPY: Path(gpusense.reference.__file__).parent}
+# Functions that make a file's Warp functions and kernels for a set of flags; they are no part of the concept.
+FACTORIES = {"functions", "make"}
+# Files of one language that are no concept of kernels.
+OTHER_FILES = {
+    WARP: {"__init__": "makes the folder a package", "prelude": "types and decorators of all Warp kernels"},
+    NUMPY: {
+        "__init__": "makes the folder a package",
+        "scans": "loops over the scans of a launch; a work-item finds its scan by a division",
+    },
+}
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """Functions of a concept that some languages have on purpose, and why the others do not."""
+
+    concept: str
+    functions: str
+    languages: tuple[str, ...]
+    reason: str
+
+
+ARRAYS = "works on all elements at once"
+FLOOR = "some OpenCL drivers call floor and clamp as functions; Warp and NumPy have their own"
+FLOAT64 = "error_free.cl has the precision of real, which may be float32; Warp and NumPy choose it by the call"
+TILES = "a work-item of a GPU finds its particle and rays; the reference takes all of them at once"
+QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
+KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
+
+ON_PURPOSE = [
+    Purpose("beam", "readings_of_scan sum_terms", REFERENCE_ONLY, ARRAYS),
+    Purpose("bits", "lowest_bit highest_bit", KERNELS_ONLY, "the reference unpacks words to bool"),
+    Purpose("bits", "unpacked", REFERENCE_ONLY, "the reference unpacks words to bool"),
+    Purpose("distance", "_lines _lowest", REFERENCE_ONLY, ARRAYS),
+    Purpose("echo", "echoes", REFERENCE_ONLY, ARRAYS),
+    Purpose("end_point", "within", (OPENCL,), FLOOR),
+    Purpose("end_point", "rounding_margin rounded_cell table_origin table_cell", KERNELS_ONLY, QUICK),
+    Purpose("error_free", "floor_int", (OPENCL,), FLOOR),
+    Purpose("error_free", "add_strands", KERNELS_ONLY, "the reference adds the terms of strand_sums"),
+    Purpose("error_free", "where_pair strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
+    Purpose("field", "quick_value careful_value", KERNELS_ONLY, QUICK),
+    Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
+    Purpose(
+        "landmark_grid", "squared_reach with_landmark", KERNELS_ONLY,
+        "kernels look at landmarks one by one and shrink the disc; the reference evaluates all in the disc",
+    ),
+    Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
+    Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
+    Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
+    Purpose("ray", "as_bits farther", (WARP,), "OpenCL has casts of bits, as_bits and as_real; NumPy needs none"),
+    Purpose("ray", "whole", KERNELS_ONLY, "counts of boundaries are integers in the bits of a float; in NumPy numbers"),
+    Purpose("ray", "start_casts", REFERENCE_ONLY, ARRAYS),
+    Purpose("rectangles", "reached _runs longest _quadrants", REFERENCE_ONLY, ARRAYS),
+    Purpose("relative", "pair_sum_float64", (OPENCL,), FLOAT64),
+    Purpose("tiles", "tile_place tile_group tile_ray tile_step", KERNELS_ONLY, TILES),
+]  # fmt: skip
+
+CONCEPTS = sorted(path.stem for path in (kernel_root() / "opencl").glob("*.cl"))
+each_concept = pytest.mark.parametrize("concept", CONCEPTS)
+
+
+def opencl_functions(text: str) -> list[str]:
+    """Names of the functions and kernels that an OpenCL file defines, in order; both branches of an #if are read."""
+    code = re.sub(r"//[^\n]*", "", text)
+    definition = r"^(?!typedef|#)(?:[a-zA-Z_][\w()]*[\s*]+)+(\w+)\([^;{}]*\)\s*\{"
+    return list(dict.fromkeys(re.findall(definition, code, re.MULTILINE)))
+
+
+def python_functions(text: str) -> list[str]:
+    """Names of the functions that a Python file defines, in order, nested ones too, but for factories."""
+    found = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
+    found.sort(key=lambda node: node.lineno)
+    return list(dict.fromkeys(node.name for node in found if node.name not in FACTORIES))
+
+
+@functools.cache
+def functions(concept: str, language: str) -> list[str]:
+    """Names of a concept's functions in a language, in order."""
+    if language == OPENCL:
+        return opencl_functions(opencl_source(concept))
+    return python_functions((FOLDERS[language] / f"{concept}.py").read_text(encoding="utf-8"))
+
+
+@each_concept
+def test_bodies_have_the_same_functions(concept):
+    allowed = {name: row.languages for row in ON_PURPOSE if row.concept == concept for name in row.functions.split()}
+    for language in LANGUAGES:
+        others = {name for other in LANGUAGES for name in functions(concept, other)}
+        missing = others - set(functions(concept, language))
+        unexplained = sorted(name for name in missing if name not in allowed)
+        assert not unexplained, f"{concept} lacks {unexplained} in {language}"
+
+
+@each_concept
+def test_bodies_have_their_functions_in_the_same_order(concept):
+    for one, other in combinations(LANGUAGES, 2):
+        both = set(functions(concept, one)) & set(functions(concept, other))
+        orders = [[name for name in functions(concept, language) if name in both] for language in (one, other)]
+        assert orders[0] == orders[1], f"{concept}: {one} and {other}"
+
+
+@pytest.mark.parametrize("row", ON_PURPOSE, ids=[f"{row.concept}-{row.functions.split()[0]}" for row in ON_PURPOSE])
+def test_every_exception_is_needed_and_true(row):
+    assert row.reason
+    for name in row.functions.split():
+        assert tuple(language for language in LANGUAGES if name in functions(row.concept, language)) == row.languages
+    assert row.languages != LANGUAGES
+
+
+def test_no_exception_stands_twice():
+    names = [(row.concept, name) for row in ON_PURPOSE for name in row.functions.split()]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("language", OTHER_FILES)
+def test_all_other_files_are_explained(language):
+    files = {path.stem for path in FOLDERS[language].glob("*.py")}
+    assert files - set(CONCEPTS) == set(OTHER_FILES[language])
+    assert files >= set(CONCEPTS)
+    assert all(OTHER_FILES[language].values())
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_every_kernel_of_the_signature_table_is_found(language):
+    for kernel, row in KERNELS.items():
+        assert kernel in functions(row.file, language), f"{row.file} in {language}"
+
+
+def test_functions_are_found_in_all_their_forms():
+    opencl = """
+    #define TWICE(a) ((a) * 2)
+    // real comment(const real a) { }
+    typedef struct { real x; } Part;
+    int prototype(const int a);
+    int first(const int a) { return call(a); }
+    global const real *second(
+        global const real *a, const int b) {
+        if (b) { return a; }
+    }
+    #if FLAG
+    __attribute__((noinline)) void third(int *a) {
+    }
+    #else
+    void third(int *a) {}
+    #endif
+    kernel void fourth(global real *a) {
+    }
+    """
+    lines = "\n".join(line[4:] for line in opencl.splitlines())
+    assert opencl_functions(lines) == ["first", "second", "third", "fourth"]
+    python = """
+def make(name, flags):
+    @wp.func
+    def first(): ...
+
+    if flags:
+        @wp.func
+        def second(): ...
+    else:
+        @wp.func
+        def second(): ...
+
+@kernel
+def third(): ...
+"""
+    assert python_functions(python) == ["first", "second", "third"]

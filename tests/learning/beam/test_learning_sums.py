@@ -1,0 +1,200 @@
+"""The sums that learning rests on: against mpmath, against the densities, and alike on every backend."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import mpmath as mp
+import numpy as np
+import pytest
+from support.kernel_scenes import PRECISIONS
+from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
+
+from gpusense.backends import get_backend
+from gpusense.evaluation.tolerances import TOLERANCES, per_beam
+from gpusense.learning.beam.point import BIAS, Point
+from gpusense.learning.beam.problem import Prior
+from gpusense.models.scan.densities import log_mixture
+
+POINTS = {
+    "ordinary": point(0.6, 0.2, 0.05, 0.15, sigma=0.2, rate=0.4),
+    "truncated": point(0.5, 0.3, 0.1, 0.1, sigma=4.0, rate=0.05, bias=0.03),
+    "hardly short": point(0.8, 1e-6, 0.1, 0.1 - 1e-6, sigma=0.05, rate=1e-3, bias=-0.02),
+    "steep": point(0.3, 0.3, 0.2, 0.2, sigma=0.01, rate=40.0),
+}
+PAIRS = ([4.1, 2.0, 9.9, 0.3, 7.0, np.inf, 5.0, np.inf, np.nan], [4.0, 6.0, 9.5, 0.4, 9.9, 8.0, 5.0, 1.0, 3.0])
+PRIOR = Prior(np.array([3.0, 2.0, 1.0, 0.5]), 0.3, 0.7, 0.01)
+
+
+def exact_objective(z: list[float], expected: list[float], prior: Prior | None, x: list[mp.mpf]) -> mp.mpf:
+    """Return log-likelihood and log prior by mpmath, from coordinates (log weights, log sigma, log rate, bias)."""
+    total = sum(mp.exp(log) for log in x[:4])
+    hit, short, top, rand = (mp.exp(log) / total for log in x[:4])
+    sigma, rate, bias = mp.exp(x[4]), mp.exp(x[5]), x[6]
+    found = mp.mpf(0)
+    for reading, ahead in zip(map(mp.mpf, z), map(mp.mpf, expected), strict=True):
+        if mp.isnan(reading):
+            continue
+        if reading >= RANGE_MAX:
+            found += mp.log(top)
+            continue
+        mean = ahead + bias
+        mass = mp.ncdf((RANGE_MAX - mean) / sigma) - mp.ncdf(-mean / sigma)
+        p = hit * mp.npdf(reading, mean, sigma) / mass + rand / RANGE_MAX
+        if reading <= ahead:
+            p += short * rate * mp.exp(-rate * reading) / -mp.expm1(-rate * ahead)
+        found += mp.log(p)
+    if prior is not None:
+        a = [mp.mpf(float(count)) for count in prior.counts]
+        found += sum(count * mp.log(weight) for count, weight in zip(a, (hit, short, top, rand), strict=True))
+        found -= a[0] * ((prior.sigma**2 + (bias - prior.bias) ** 2) / (2 * sigma**2) + mp.log(sigma))
+        found += a[1] * (mp.log(rate) - rate / prior.rate)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "prior"), [*((name, None) for name in POINTS), ("truncated", PRIOR)], ids=[*POINTS, "with a prior"]
+)
+def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | None) -> None:
+    at = POINTS[name]
+    z, expected = PAIRS
+    problem = problem_of(np.array(z), np.array(expected), **({} if prior is None else {"prior": prior}))
+    value = problem.value(at, second=True)
+    x = [mp.log(mp.mpf(float(weight))) for weight in at.weights]
+    x += [mp.log(mp.mpf(at.sigma)), mp.log(mp.mpf(at.rate)), mp.mpf(at.bias)]
+    with mp.workdps(50):
+        exact = float(exact_objective(z, expected, prior, x))
+        gradient, hessian = np.empty(7), np.empty((7, 7))
+
+        def along(*places: int) -> mp.mpf:
+            def moved(*steps: mp.mpf) -> mp.mpf:
+                y = list(x)
+                for place, step in zip(places, steps, strict=True):
+                    y[place] += step
+                return exact_objective(z, expected, prior, y)
+
+            return mp.diff(moved, (0,) * len(places), (1,) * len(places), h=mp.mpf(10) ** -15)
+
+        for i in range(7):
+            gradient[i] = along(i)
+            for j in range(i):
+                hessian[i, j] = hessian[j, i] = along(i, j)
+
+            def one(step: mp.mpf, i: int = i) -> mp.mpf:
+                return exact_objective(z, expected, prior, [*x[:i], x[i] + step, *x[i + 1 :]])
+
+            hessian[i, i] = mp.diff(one, 0, 2, h=mp.mpf(10) ** -15)
+    assert value.hessian is not None
+    assert value.objective == pytest.approx(exact, rel=1e-13, abs=1e-13)
+    # Sums of seven pairs lose a few eps of their largest terms, which grow with 1 / sigma^2 for the bias.
+    unit = np.where(np.arange(7) == BIAS, 1 / at.sigma, 1.0)
+    assert np.abs((value.gradient - gradient) / unit).max() < 1e-11 * (1 + np.abs(gradient / unit).max())
+    scaled = np.outer(unit, unit)
+    assert np.abs((value.hessian - hessian) / scaled).max() < 1e-11 * (1 + np.abs(hessian / scaled).max())
+
+
+def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
+    """Return whether sums are those of the reference, within the tolerance."""
+    # Terms of either sign: their magnitudes are at most some 30 times those of r u^2.
+    scale = np.maximum(np.abs(truth), np.abs(truth[7]))[: len(found)]
+    tolerance = TOLERANCES[f"{np.dtype(precision).name} sums to learn from"]
+    return bool((np.abs(found - truth[: len(found)]) <= tolerance.value * scale).all())
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_sums_are_alike_on_every_backend(precision: type, backend: str) -> None:
+    z, expected = draw(TYPICAL, 3001, 3)
+    at = POINTS["ordinary"]
+    truth = problem_of(z, expected).device.sums(at, information=True)
+    found = problem_of(z, expected, backend=backend, real=precision).device.sums(
+        at, information=precision is np.float64
+    )
+    assert alike(found, truth, precision)
+
+
+@pytest.mark.parametrize("lanes", [1, 16])
+def test_lanes_of_pairs_sum_to_the_same(lanes: int, needs: Callable[[str], str]) -> None:
+    opencl = get_backend(needs("opencl"))
+    # Nothing near, range_max ahead, both ends and what is just before them beside ordinary pairs; not a multiple of 16.
+    z, expected = draw(TYPICAL, 1003, 8, low=0, high=1)
+    expected[:40:4], expected[1:40:4], z[2:40:4] = 0, RANGE_MAX, 0
+    z[3:40:4] = expected[3:40:4]
+    none = point(0.0, 0.7, 0.1, 0.2, sigma=0.3, rate=2.0)
+    impossible = point(0.0, 0.9, 0.1, 0.0, sigma=0.3, rate=2.0)
+    before = opencl.info
+    try:
+        opencl.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
+        for precision in PRECISIONS:
+            # Both begin with the same rounded pairs.
+            pairs = z.astype(precision), expected.astype(precision)
+            # Squares of u at sigma = 0.01 carry the rounding of sigma to float32, beyond the tolerance.
+            known = [at for name, at in POINTS.items() if precision is np.float64 or name != "steep"]
+            for at in (*known, none):
+                truth = problem_of(*pairs).device.sums(at, information=True)
+                found = problem_of(*pairs, backend=opencl, real=precision).device.sums(at, information=True)
+                assert alike(found, truth, precision)
+            nothing = problem_of(*pairs, backend=opencl, real=precision).device.sums(impossible)
+            assert nothing[0] == -np.inf and np.isfinite(nothing[1:]).all()
+    finally:
+        opencl.info = before
+
+
+def test_log_likelihood_and_responsibilities_are_those_of_the_densities(backend: str) -> None:
+    z, expected = draw(TYPICAL, 999, 4)
+    hits = np.isfinite(z)
+    at = POINTS["truncated"]
+    at = Point(at.weights, at.sigma, at.rate)
+    problem = problem_of(z, expected, backend=backend)
+    parts = at.parameters().to_dict()
+    log_p = log_mixture(z, expected, range_max=RANGE_MAX, **parts)
+    assert problem.value(at).log_likelihood == pytest.approx(log_p.sum(), rel=1e-12)
+    causes = problem.device.causes(at)
+    assert (np.abs(causes[:, 0] - log_p[hits]) <= per_beam(log_p[hits], np.float64)).all()
+    np.testing.assert_allclose(causes[:, 1:].sum(axis=1), 1, rtol=1e-14)
+    for column, name in ((1, "z_hit"), (2, "z_short"), (3, "z_rand")):
+        alone = dict.fromkeys(("z_hit", "z_short", "z_max", "z_rand"), 0.0) | {name: parts[name]}
+        own = log_mixture(z[hits], expected[hits], range_max=RANGE_MAX, **(parts | alone))
+        np.testing.assert_allclose(causes[:, column], np.exp(own - log_p[hits]), rtol=1e-11, atol=1e-300)
+
+
+def test_sums_do_not_depend_on_how_pairs_are_cut(as_gpu, monkeypatch: pytest.MonkeyPatch) -> None:
+    z, expected = draw(TYPICAL, 4000, 6)
+    device = as_gpu(False)
+    whole = problem_of(z, expected, backend=device).device.sums(POINTS["ordinary"])
+    as_gpu(True)
+    monkeypatch.setattr("gpusense.learning.beam.device_sums._CHUNK", 700)
+    cut = problem_of(z, expected, backend=device).device.sums(POINTS["ordinary"])
+    np.testing.assert_allclose(cut, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max())
+    again = problem_of(z, expected, backend=device).device.sums(POINTS["ordinary"])
+    assert (cut == again).all()
+
+
+def test_a_held_mean_does_not_move_with_the_bias() -> None:
+    # z* + b beyond range_max is held there, so only the second pair says anything about b.
+    problem = problem_of(np.array([9.0, 5.0]), np.array([9.8, 5.0]))
+    alone = problem_of(np.array([5.0]), np.array([5.0]))
+    at = point(0.9, 0.0, 0.0, 0.1, sigma=0.5, rate=1.0, bias=0.4)
+    assert problem.value(at).gradient[BIAS] == alone.value(at).gradient[BIAS] != 0
+
+
+def test_extremes_underflow_nowhere(backend: str) -> None:
+    """Readings a million sigmas away, weights of 0 and z* = 0 leave finite sums."""
+    z, expected = np.array([0.0, 9.99, 5.0, 3.0, 1e-300]), np.array([0.0, 1.0, 5.0, 1e-310, 10.0])
+    problem = problem_of(z, expected, backend=backend)
+    for weights in ((0.5, 0.25, 0, 0.25), (1.0, 0, 0, 0), (0, 0, 0, 1.0)):
+        for sigma, rate in ((1e-5, 1e4), (10.0, 1e-4)):
+            value = problem.value(point(*weights, sigma=sigma, rate=rate), second=True)
+            assert np.isfinite(value.log_likelihood) and value.hessian is not None
+            assert np.isfinite(value.gradient).all() and np.isfinite(value.hessian).all()
+    impossible = problem.value(point(0, 1.0, 0, 0, sigma=1.0, rate=1.0))
+    assert impossible.log_likelihood == -np.inf
+
+
+def test_threads_share_the_blocks_with_the_same_bits(needs, monkeypatch: pytest.MonkeyPatch) -> None:
+    z, expected = draw(TYPICAL, 3001, 3)
+    device = problem_of(z, expected, backend=needs("warp")).device
+    sums, causes = device.sums(POINTS["ordinary"]), device.causes(POINTS["ordinary"])
+    monkeypatch.setattr("gpusense.backends.warp.pieces._PIECE_WORK", 64)
+    assert (device.sums(POINTS["ordinary"]) == sums).all()
+    assert (device.causes(POINTS["ordinary"]) == causes).all()

@@ -1,0 +1,137 @@
+"""Calls of the landmark model and of the sensors without a scan: impossible features, poses on a device, ``out=``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support import landmark_scenes as scenes
+from support.absolute_scenes import GRID, models, poses_around
+from support.array_libraries import Array, installed, to_device
+from support.frameworks import each_framework, framework
+
+import gpusense as gs
+from gpusense.evaluation.tolerances import differing
+from gpusense.models import run
+
+INF = float("inf")
+IMPOSSIBLE = {
+    "below 0": (-0.001, 0.1, 2.0), "too far": (12.001, 0.1, 2.0), "infinitely far": (INF, 0.1, 2.0),
+    "behind": (3.0, 2.5, 2.0), "no angle": (3.0, -INF, 2.0), "no signature": (3.0, 0.1, 99.0),
+    "no number": (3.0, 0.1, INF), "nothing": (np.nan, np.nan, np.nan),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+@pytest.mark.parametrize("how", ["nearest", "joint", "negative"])
+def test_features_that_the_sensor_cannot_measure_are_left_out(name, how):
+    """Such a feature counts as missing: live data must not stop a filter. ``explain`` counts it."""
+    options = {"negative": True} if how == "negative" else {"association": how}
+    model, poses, features = scenes.model("everything", "numpy", **options)
+    with_it = np.insert(features, 2, IMPOSSIBLE[name], axis=0)
+    expected = model.log_likelihood(poses, features)
+    np.testing.assert_array_equal(model.log_likelihood(poses, with_it), expected)
+    text = "1 of 6 features have a part that the sensor cannot measure"
+    assert (text in model.explain()) == (name != "nothing")
+    which, parts = model.associate(poses, with_it)
+    assert (which[:, 2] == -1).all() and (parts[:, 2] == 0).all()
+    for found, expected in zip((which, parts), model.associate(poses, features), strict=True):
+        np.testing.assert_array_equal(np.delete(found, 2, axis=1), expected)
+    expected = model.log_likelihood(poses, features, [0, 2, 4, 5, 6])
+    np.testing.assert_array_equal(model.log_likelihood(poses, with_it, [0, 2, 1, 4, 5, 6]), expected)
+
+
+def test_limits_of_the_sensor_are_possible():
+    p = gs.LandmarkParameters(range_max=12.0, field_of_view=2.0)
+    model = gs.LandmarkModel(gs.LandmarkMap([[3.0, 0.0]]), p, backend="numpy")
+    for feature in ([0.0, 0.0], [12.0, 0.0], [3.0, 1.0], [3.0, -1.0]):
+        assert model.log_likelihood([[0, 0, 0]], [feature])[0] != 0
+
+
+# ---------------------------------------------------------------------------------------------- where the poses are
+
+POSES = poses_around(GRID, 60)
+FEATURES = np.array([[3.0, 0.1], [6.0, np.nan], [2.0, -2.0]])
+
+
+def calls(backend: Any) -> dict[str, Any]:
+    """Return the calls that take poses and ``out=``, by sensor; each also with a reading without information."""
+    xy = [(5e6, 0.0), (5e6 + 9, 3.0), (5e6 - 4, -2.0)]
+    found = {name: (model, measured) for name, (model, measured) in models(backend).items()}
+    landmarks = gs.LandmarkMap(xy)
+    found["nearest"] = gs.LandmarkModel(landmarks, backend=backend), (FEATURES,)
+    found["known"] = gs.LandmarkModel(landmarks, backend=backend), (FEATURES, [0, -1, 2])
+    found["joint"] = gs.LandmarkModel(landmarks, backend=backend, association="joint", negative=True), (FEATURES,)
+    found["no feature"] = gs.LandmarkModel(landmarks, backend=backend), ([],)
+    found["missing"] = models(backend)["heading"][0], (np.nan,)
+    return {
+        name: lambda poses, model=model, measured=measured, **options: model.log_likelihood(poses, *measured, **options)
+        for name, (model, measured) in found.items()
+    }
+
+
+SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "joint", "no feature", "missing")
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypatch):
+    """Float32 and float64 poses, results and ``out=`` of the same library, in pieces, not finite, and none at all."""
+    call = calls(warp_as_gpu)[name]
+    expected = call(POSES)
+    for real in (np.float64, np.float32):
+        truth = call(POSES.astype(real))
+        for wrap in (lambda array: array, Array):
+            given, out = wrap(to_device(POSES.astype(real))), wrap(to_device(np.full(len(POSES), 7, np.float32)))
+            call(given)
+            warp_copies.clear()
+            found = call(given)
+            assert type(found) is type(given)
+            assert differing((found.held if wrap is Array else found).numpy(), truth) == 0
+            # Measurements go there, and the two numbers of the status of poses come back.
+            assert [size for way, size in warp_copies if way == "down"] == [8]
+            assert all(size <= 400 for _, size in warp_copies)
+            assert call(given, out=out) is out
+            assert differing((out.held if wrap is Array else out).numpy(), truth) == 0
+    bad = POSES.copy()
+    bad[17, 1] = np.nan
+    with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
+        call(to_device(bad))
+    assert call(to_device(np.empty((0, 3)))).shape == (0,)
+    monkeypatch.setattr(run, "CHUNK", 23)
+    assert differing(call(to_device(POSES)).numpy(), expected) == 0
+
+
+def test_associations_of_poses_on_the_device(warp_as_gpu):
+    model = gs.LandmarkModel(gs.LandmarkMap([(5e6, 0.0), (5e6 + 9, 3.0)]), backend=warp_as_gpu)
+    there, here = model.associate(to_device(POSES), FEATURES), model.associate(POSES, FEATURES)
+    for found, expected in zip(there, here, strict=True):
+        assert isinstance(found, np.ndarray)
+        np.testing.assert_array_equal(found, expected)
+
+
+@each_framework
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_frameworks(sensor, name):
+    cuda, there, back, _ = framework(name)
+    call, given = calls(cuda)[sensor], there(POSES)
+    found = call(given)
+    assert type(found) is type(given) and differing(back(found), call(POSES)) == 0
+    bad = POSES.copy()
+    bad[5, 2] = np.inf
+    with pytest.raises(ValueError, match="poses: must be finite"):
+        call(there(bad))
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_arrays_of_another_library_in_host_memory(name, monkeypatch):
+    installed(monkeypatch)
+    call = calls("numpy")[name]
+    found = call(Array(POSES))
+    assert type(found) is Array and differing(found.held, call(POSES)) == 0
+    out = np.empty(len(POSES), np.float32)
+    assert call(POSES, out=out) is out and differing(out, found.held) == 0
+    with pytest.raises(ValueError, match="out: shape must be"):
+        call(POSES, out=np.empty(3, np.float32))
+    with pytest.raises(TypeError, match="out: must hold float32, got float64"):
+        call(POSES, out=np.empty(len(POSES)))

@@ -1,0 +1,207 @@
+"""Position fixes, headings, beacons and bumpers against mpmath and SciPy, stiff cases, and integrals that are 1."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import absolute_oracle as oracle
+from support.absolute_scenes import assert_close, each_precision
+
+import gpusense as gs
+from gpusense.models.point.beacons import t_series
+
+STEPS = np.array([0.0, 0.3, -1.0, 2.5, -6.0, 12.0, 37.0])
+
+
+# ------------------------------------------------------------------------------------------------------ position
+
+WORLD = (4.9e6, 3.9e6, 5.1e6, 4.1e6)
+POSITIONS = {
+    "ordinary": gs.PositionParameters(sigma=2.0, z_hit=0.9, z_rand=0.1, region=WORLD, mount=(0.3, -0.2)),
+    "correlated": gs.PositionParameters(covariance=((4.0, -1.9), (-1.9, 1.0)), mount=(1.0, 0.0)),
+    "only outliers": gs.PositionParameters(sigma=1.0, z_hit=0.0, z_rand=1.0, region=WORLD),
+    "no room for outliers": gs.PositionParameters(sigma=1.0, z_hit=0.5, z_rand=0.5, region=(0, 0, 1, 1)),
+    **{f"sigma {s:g}": gs.PositionParameters(sigma=s) for s in (1e-8, 1e-3, 1e6)},
+    "needle": gs.PositionParameters(covariance=((1.0, 1 - 1e-9), (1 - 1e-9, 1.0))),
+    "uneven": gs.PositionParameters(covariance=((1e-12, 0.9e-6), (0.9e-6, 1.0)), z_hit=0.5, z_rand=0.5, region=WORLD),
+}
+
+
+@each_precision
+def test_positions(backend: str, precision: str) -> None:
+    rng = np.random.default_rng(3)
+    fix = np.array([5e6 + 0.25, 4e6 - 0.5])
+    for name, p in POSITIONS.items():
+        scale = p.sigma or np.sqrt(p.covariance[0][0])
+        steps = np.concatenate(
+            [np.stack(np.meshgrid(STEPS, STEPS[:4]), axis=-1).reshape(-1, 2), rng.normal(0, 1, (9, 2))]
+        )
+        poses = np.concatenate([fix + scale * steps, rng.uniform(-4, 4, (len(steps), 1))], axis=1)
+        poses[-1, 2] = 1e6
+        found = gs.PositionModel(p, backend=backend, precision=precision).log_likelihood(poses, fix)
+        assert found.dtype == precision, name
+        assert_close(found, [oracle.position(pose, fix, p) for pose in poses], precision)
+
+
+def test_positions_by_scipy_and_a_covariance_for_each(backend: str) -> None:
+    rng = np.random.default_rng(0)
+    model = gs.PositionModel(gs.PositionParameters(), backend=backend, precision="float64")
+    poses, fix = rng.normal(0, 3, (50, 3)), (0.4, -1.0)
+    for covariance in ([[2.0, 0.3], [0.3, 0.5]], np.eye(2)):
+        truth = stats.multivariate_normal(fix, covariance).logpdf(poses[:, :2])
+        np.testing.assert_allclose(model.log_likelihood(poses, fix, covariance=covariance), truth, rtol=1e-12)
+    own = gs.PositionModel(gs.PositionParameters(covariance=np.eye(2)), backend=backend, precision="float64")
+    np.testing.assert_array_equal(
+        own.log_likelihood(poses, fix), model.log_likelihood(poses, fix, covariance=np.eye(2))
+    )
+
+
+def test_a_position_integrates_to_1() -> None:
+    region = (-12.0, -9.0, 10.0, 11.0)
+    p = gs.PositionParameters(covariance=((1.0, 0.4), (0.4, 0.6)), z_hit=0.7, z_rand=0.3, region=region)
+    model = gs.PositionModel(p, backend="numpy", precision="float64")
+    node, weight = np.polynomial.legendre.leggauss(60)
+    x, y = -1 + 11 * node, 1 + 10 * node
+    p_each = [[np.exp(model.log_likelihood([[0.5, 0.2, 0.0]], (a, b))[0]) for b in y] for a in x]
+    assert abs(110 * weight @ np.array(p_each) @ weight - 1) < 1e-10
+
+
+# ------------------------------------------------------------------------------------------------------- heading
+
+HEADINGS = {
+    "compass": gs.HeadingParameters(sigma=0.2, z_hit=0.9, z_rand=0.1, offset=-0.4),
+    "only noise": gs.HeadingParameters(z_hit=0.0, z_rand=1.0),
+    "turned far": gs.HeadingParameters(sigma=0.5, offset=1e5),
+    **{f"sigma {s:g}": gs.HeadingParameters(sigma=s) for s in (1e-8, 1e-4, 0.7, 1.4999, 1.5001, 2.5, 6.0, 1e3, 1e6)},
+    **{
+        f"kappa {k:g}": gs.HeadingParameters(kind="von_mises", kappa=k)
+        for k in (0, 1e-300, 1e-9, 0.5, 30, 1e4, 1e9, 1e16)
+    },
+    "von mises": gs.HeadingParameters(kind="von_mises", kappa=20.0, z_hit=0.5, z_rand=0.5, offset=3.0),
+}
+
+
+@each_precision
+def test_headings(backend: str, precision: str) -> None:
+    for name, p in HEADINGS.items():
+        width = p.sigma if p.kind == "wrapped_normal" else 1 / np.sqrt(p.kappa) if p.kappa else 1.0
+        width = min(width, 0.1)
+        for reading in (0.0, 3.1, 4.7, -1e6 + 0.1):
+            at = np.remainder(reading - p.offset, 2 * np.pi)
+            around = np.array([at + step * width for step in STEPS] + [at + np.pi - 1e-7, at - np.pi + 1e-7])
+            theta = np.concatenate(
+                [around, [np.pi, -np.pi, 0.0, 1.5, 1e6, -1e6 + 0.3, 1e9, 1e22, at + 1e5 * 2 * np.pi]]
+            )
+            poses = np.stack([np.zeros_like(theta), np.ones_like(theta), theta], axis=1)
+            found = gs.HeadingModel(p, backend=backend, precision=precision).log_likelihood(poses, reading)
+            with np.errstate(all="raise"):
+                truth = [oracle.heading(t, reading, p) for t in theta]
+            truth = np.array(truth, float)
+            assert found.dtype == precision, name
+            assert_close(found, truth, precision)
+
+
+def test_headings_by_scipy(backend: str) -> None:
+    theta = np.linspace(-3, 3, 31)
+    poses = np.stack([theta, theta, theta], axis=1)
+    for kappa in (0.3, 5.0, 200.0):
+        model = gs.HeadingModel(
+            gs.HeadingParameters(kind="von_mises", kappa=kappa), backend=backend, precision="float64"
+        )
+        truth = stats.vonmises(kappa, loc=0.7).logpdf(theta)
+        np.testing.assert_allclose(model.log_likelihood(poses, 0.7), truth, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["compass", "sigma 0.7", "sigma 1.4999", "sigma 2.5", "kappa 0.5", "von mises"])
+def test_a_heading_integrates_to_1(name: str) -> None:
+    # The trapezoid rule converges exponentially for a smooth periodic function.
+    readings = 2 * np.pi * np.arange(120) / 120
+    model = gs.HeadingModel(HEADINGS[name], backend="numpy", precision="float64")
+    density = [np.exp(model.log_likelihood([[0, 0, 0.3]], reading)[0]) for reading in readings]
+    assert abs(np.mean(density) * 2 * np.pi - 1) < 1e-13
+
+
+# ------------------------------------------------------------------------------------------------------- beacons
+
+XY = np.array([(5e6, 4e6), (5e6 + 30.0, 4e6), (5e6, 4e6 + 40.0)])
+BEACONS = {
+    "normal": gs.BeaconParameters(mount=(0.2, 0.1), bias=0.15),
+    "near its end": gs.BeaconParameters(sigma_range=5.0, range_max=40.0, z_hit=1.0, z_rand=0.0),
+    "shrunk": gs.BeaconParameters(bias=-45.0, sigma_range=3.0, z_hit=0.999, z_rand=0.001),
+    "mixture": gs.BeaconParameters(kind="mixture", range_max=60.0),
+    "one wide": gs.BeaconParameters(kind="mixture", heavy_weight=1.0, sigma_heavy=20.0, range_max=60.0),
+    "one narrow": gs.BeaconParameters(kind="mixture", heavy_weight=0.0, z_hit=1.0, z_rand=0.0),
+    **{f"t {nu}": gs.BeaconParameters(kind="student_t", nu=nu, range_max=60.0) for nu in (1, 2, 3, 4, 7, 30, 99, 100)},
+    "t alone": gs.BeaconParameters(kind="student_t", nu=3, z_hit=1.0, z_rand=0.0, sigma_range=0.01, bias=0.1),
+    "flat t": gs.BeaconParameters(kind="student_t", nu=5, sigma_range=1e6, z_hit=1.0, z_rand=0.0),
+    "only noise": gs.BeaconParameters(z_hit=0.0, z_rand=1.0),
+    "sigma 1e6": gs.BeaconParameters(sigma_range=1e6, z_hit=1.0, z_rand=0.0),
+}
+
+
+@each_precision
+def test_beacons(backend: str, precision: str) -> None:
+    rng = np.random.default_rng(5)
+    poses = np.concatenate([rng.uniform((0, 0, -3), (35, 40, 3), (7, 3)), [[0, 0, 0], [30, 0, 1e6], [-400, 20, 1]]])
+    poses[:, :2] += XY[0]
+    ranges = np.array([24.5, 22.0, np.nan, 31.0])
+    for name, p in BEACONS.items():
+        ids = [0, 1, 1, 2]
+        found = gs.BeaconModel(XY, p, backend=backend, precision=precision).log_likelihood(poses, ranges, ids)
+        parts = np.array(
+            [[oracle.beacon(pose, XY[i], ranges[k], p) for k, i in enumerate(ids) if k != 2] for pose in poses]
+        )
+        assert found.dtype == precision, name
+        assert_close(found, parts.sum(axis=1), precision, parts)
+
+
+@each_precision
+@pytest.mark.parametrize(("kind", "nu"), [("normal", 1), ("student_t", 3), ("student_t", 99), ("mixture", 1)])
+def test_beacons_of_ten_nanometres(backend: str, precision: str, kind: str, nu: int) -> None:
+    p = gs.BeaconParameters(sigma_range=1e-8, kind=kind, nu=nu, sigma_heavy=1e-6, z_hit=1.0, z_rand=0.0, range_max=20.0)
+    poses = np.zeros((len(STEPS), 3))
+    poses[:, 0] = 1e-8 * STEPS
+    xy = [[3.0, 4.0]]
+    found = gs.BeaconModel(xy, p, backend=backend, precision=precision).log_likelihood(poses, [5.0])
+    assert_close(found, [oracle.beacon(pose, xy[0], 5.0, p) for pose in poses], precision)
+
+
+@pytest.mark.parametrize("name", BEACONS)
+@pytest.mark.parametrize("distance", [0.0, 2.0, 30.0])
+def test_a_range_integrates_to_1(name: str, distance: float) -> None:
+    p = BEACONS[name].replace(mount=(0.0, 0.0))
+    mean = distance + p.bias
+    if not 0 <= mean <= p.range_max:
+        assert name == "shrunk"
+        return
+    model = gs.BeaconModel([[0.0, 0.0]], p, backend="numpy", precision="float64")
+    wide = p.sigma_range * np.array([0, 1, 3, 8, 20, 60, 200, 1000])
+    cuts = np.unique(np.clip(np.concatenate([[0, p.range_max], mean + wide, mean - wide]), 0, p.range_max))
+    node, weight = np.polynomial.legendre.leggauss(24)
+    total = 0.0
+    for a, b in itertools.pairwise(cuts):
+        density = [model.log_likelihood([[distance, 0, 0]], [a + (b - a) * (x + 1) / 2])[0] for x in node]
+        total += (b - a) / 2 * (weight @ np.exp(density))
+    assert abs(total - 1) < 1e-7
+
+
+def test_student_t_by_scipy(backend: str) -> None:
+    x = np.linspace(0, 60, 41)
+    poses = np.stack([x, 0 * x, 0 * x], axis=1)
+    for nu in (1, 2, 5, 40):
+        p = gs.BeaconParameters(kind="student_t", nu=nu, sigma_range=2.0, z_hit=1.0, z_rand=0.0, range_max=60.0)
+        found = gs.BeaconModel([[0.0, 0.0]], p, backend=backend, precision="float64").log_likelihood(poses, [20.0])
+        own = stats.t(nu, loc=x, scale=2.0)
+        np.testing.assert_allclose(found, own.logpdf(20.0) - np.log(own.cdf(60.0) - own.cdf(0.0)), rtol=1e-11)
+
+
+@pytest.mark.parametrize("nu", [1, 2, 3, 4, 9, 10, 100])
+def test_series_of_a_t(nu: int) -> None:
+    arc, series = t_series(nu)
+    t = np.array([0.01, 0.5, 2.0, 30.0])
+    angle = np.arctan(t / np.sqrt(nu))
+    inner = np.sin(angle) * (np.cos(angle) if nu % 2 else 1) * np.polyval(series[::-1], np.cos(angle) ** 2)
+    np.testing.assert_allclose(arc * angle + inner, 2 * stats.t.cdf(t, nu) - 1, rtol=1e-12)

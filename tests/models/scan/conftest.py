@@ -1,0 +1,28 @@
+"""Fixtures of tests of scan models."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from support.array_libraries import Array, installed
+
+from gpusense.backends import arrays, get_backend
+
+
+@pytest.fixture
+def gathering(needs, monkeypatch):
+    """Return a backend that gathers, and a list that grows with each start of a graph."""
+    needs("warp")
+    import warp as wp
+
+    from gpusense.backends.warp.queue import Graphs
+
+    installed(monkeypatch)
+    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
+    device = get_backend("warp:cpu")
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, graphs=True))
+    monkeypatch.setattr(device, "_graphs", Graphs(device._device))
+    started, launch = [], wp.capture_launch
+    monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
+    return device, started

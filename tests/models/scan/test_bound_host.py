@@ -1,0 +1,117 @@
+"""Bound calls with arrays of the host, and of the host and the device, against ordinary ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.array_libraries import to_device
+from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, NEAR, SCANS, cloud, mixed
+
+import gpusense as gs
+from gpusense.evaluation.tolerances import differing
+from gpusense.models.scan import binding
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_short_calls_of_the_host_are_one_graph(case, gathering, monkeypatch):
+    """Copies there and back and all launches; the bits are those of the ordinary call."""
+    device, started = gathering
+    model = CASES[case](backend=device)
+    beams = model.scanner.count
+    for real in (np.float32, np.float64):
+        poses, ranges = cloud(0).astype(real), np.zeros(beams, real)
+        call = model.bind(poses, ranges)
+        assert type(call) is binding._StagedCall and call.waits
+        for seed, scan in enumerate(SCANS):
+            poses[...], ranges[...] = cloud(seed), scan[:beams]
+            expected = model.log_likelihood(poses, ranges)
+            before = len(started)
+            found = call()
+            assert found is call.out and len(started) - before == int(seed > 0), "not one graph"
+            if "," in case and model.temperature < 1 and not np.isfinite(scan).any():
+                assert np.allclose(found, expected, rtol=2e-7)
+            else:
+                assert differing(found, expected) == 0, (seed, real)
+    model.update_map(np.full((2, 3), 100), (5, 6))
+    for _ in range(3):
+        assert differing(call(), model.log_likelihood(poses, ranges)) == 0
+    poses[3, 1] = np.nan
+    for _ in range(2):
+        with pytest.raises(ValueError, match="poses: every value must be finite, got nan at index"):
+            call()
+    poses[3, 1] = 1.0
+    assert differing(call(), model.log_likelihood(poses, ranges)) == 0
+
+
+# Limits that float32 rounds, one up and one down, and readings beside them.
+ROUNDED = gs.Scanner(np.linspace(-3, 3, BEAMS), 5.6, 0.06)
+BESIDE = np.array(
+    [5.6, 0.06, np.nextafter(np.float32(5.6), np.float32(0)), 2.0, np.nextafter(np.float32(0.06), np.float32(0))]
+)
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", MODELS)
+def test_limits_are_rounded_as_readings_are(kind, real, gathering):
+    """A driver's largest float32 reading is a max reading, however it gets to the device."""
+    parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
+    model = kind(GRID, ROUNDED, parameters, backend=gathering[0])
+    poses, ranges = cloud(1), np.resize(BESIDE, BEAMS).astype(real)
+    expected = model.log_likelihood(to_device(poses), ranges).numpy()
+    assert differing(model.bind(to_device(poses), to_device(ranges))().numpy(), expected) == 0
+    call = model.bind(poses, ranges)
+    assert type(call) is binding._StagedCall and differing(call(), model.log_likelihood(poses, ranges)) == 0
+
+
+def test_calls_that_are_not_short_take_the_ordinary_path(gathering, monkeypatch):
+    device, _ = gathering
+    model = FIELD(GRID, NEAR, backend=device)
+    integers = np.zeros((COUNT, 3), np.int64)
+    for poses, ranges in ((integers, mixed(1)), (np.zeros((20_000, 3)), mixed(1))):
+        call = model.bind(poses, ranges)
+        assert type(call) is binding._HostCall
+        assert differing(np.asarray(call()), model.log_likelihood(poses, ranges)) == 0
+    for name, value in (("_MOST_CELLS", 10), ("DeviceCall", refuse_memory)):
+        with monkeypatch.context() as patch:
+            patch.setattr(binding, name, value)
+            assert type(model.bind(cloud(1), mixed(1))) is binding._HostCall
+    assert type(BEAM(GRID, NEAR, backend=device, compat="beluga").bind(cloud(1), mixed(1))) is binding._HostCall
+
+
+def refuse_memory(*arguments: Any) -> Any:
+    raise MemoryError("no room for a table")
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_arrays_of_the_host_on_every_backend(kind, backend):
+    model = kind(GRID, NEAR, backend=backend)
+    poses, ranges = cloud(1).astype(np.float32), mixed(1)
+    out = np.empty(COUNT, np.float32)
+    for call in (model.bind(poses, ranges), model.bind(poses, ranges, out=out)):
+        assert call.waits
+        for seed in range(3):
+            poses[...], ranges[...] = cloud(seed), mixed(seed)
+            found = call()
+            call.check()
+            assert found is call.out and differing(found, model.log_likelihood(poses, ranges)) == 0
+    assert found is out
+    poses[3, 1] = np.nan
+    with pytest.raises(ValueError, match="poses: every value must be finite, got nan at index"):
+        call()
+
+
+@pytest.mark.parametrize("compat", [None, "amcl"])
+def test_calls_that_take_the_ordinary_path_on_a_device(compat, gathering):
+    """Poses or readings of the host, and weights for which the host makes the readings."""
+    model = FIELD(GRID, NEAR, backend=gathering[0], compat=compat)
+    poses, ranges = to_device(cloud(1)), to_device(mixed(1))
+    pairs = [(poses, mixed(1)), (cloud(1), ranges), *([(poses, ranges)] if compat else [])]
+    expected = model.log_likelihood(cloud(1), mixed(1))
+    for some, readings in pairs:
+        call = model.bind(some, readings)
+        for _ in range(2):
+            found = call()
+            assert call.waits and type(found) is type(some)
+            assert differing(np.asarray(found.numpy() if some is poses else found), expected) == 0

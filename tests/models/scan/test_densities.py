@@ -1,0 +1,178 @@
+"""The densities on their own against mpmath at 60 digits and against quadrature, for any expected range."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import mpmath as mp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gpusense as gs
+from gpusense.models.scan import densities
+from gpusense.models.scan.densities import log_hit, log_mixture, log_rand, log_short, naive_log_hit, naive_log_short
+
+PRECISIONS = ("float64", "float32")
+BOUND = 16  # eps (1 + |log p|)
+
+
+def exact_hit(z: float, expected: float, sigma: float, range_max: float) -> mp.mpf:
+    """Return the truncated normal, its normaliser the difference of the tails on the far side of z*, at 90 digits."""
+    with mp.workdps(90):
+        z, expected, sigma, range_max = (mp.mpf(float(v)) for v in (z, expected, sigma, range_max))
+        root = sigma * mp.sqrt(2)
+        low, high = -expected / root, (range_max - expected) / root
+        if low > 0:
+            mass = (mp.erfc(low) - mp.erfc(high)) / 2
+        elif high < 0:
+            mass = (mp.erfc(-high) - mp.erfc(-low)) / 2
+        else:
+            mass = (mp.erf(high) - mp.erf(low)) / 2
+        return -(((z - expected) / sigma) ** 2) / 2 - mp.log(sigma * mp.sqrt(2 * mp.pi)) - mp.log(mass)
+
+
+def exact_short(z: float, expected: float, rate: float) -> mp.mpf:
+    z, expected, rate = (mp.mpf(float(v)) for v in (z, expected, rate))
+    return mp.log(rate / -mp.expm1(-rate * expected)) - rate * z if rate else -mp.log(expected)
+
+
+def eps_off(found: float, truth: mp.mpf, precision: str) -> float:
+    if not math.isfinite(found):
+        return math.inf
+    return float(abs(mp.mpf(float(found)) - truth) / (1 + abs(truth))) / float(np.finfo(precision).eps)
+
+
+def worst_of(cases, ours, naive, exact, precision):
+    """Return our worst error, and the shares of cases that the textbook's formula loses and gets wrong."""
+    real, worst, lost, wrong = np.dtype(precision).type, (0.0, ()), 0, 0
+    for case in cases:
+        case = tuple(real(v) for v in case)
+        truth = exact(*case)
+        found = ours(*case)
+        assert found.dtype == precision
+        worst = max(worst, (eps_off(found, truth, precision), case))
+        textbook = eps_off(naive(*case), truth, precision)
+        lost += math.isinf(textbook)
+        wrong += textbook > 1000
+    return worst, lost / len(cases), wrong / len(cases)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_hit_for_any_expected_range(precision):
+    cases = [
+        (z * top, expected * top, sigma * top, top)
+        for top, sigma, expected, z in itertools.product(
+            (1.0, 80.0, 1e4),
+            10.0 ** np.arange(-8, 7, 2),
+            (-100.0, -1.0, -1e-3, -1e-9, 0.0, 1e-6, 0.3, 1.0, 1.0001, 2.0, 100.0),
+            (0.0, 1e-9, 0.3, 0.999, 1.0),
+        )
+    ]
+    worst, lost, wrong = worst_of(cases, log_hit, naive_log_hit, exact_hit, precision)
+    assert worst[0] <= 4, worst
+    assert lost > 0.3
+    assert wrong > 0.4
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_short_for_any_rate(precision):
+    cases = [
+        (share * expected, expected, rate)
+        for expected, rate, share in itertools.product(
+            (1e-30, 1e-6, 0.1, 3.0, 80.0), (0.0, 1e-30, 1e-12, 1e-3, 0.2, 1.0, 30.0, 1e6), (0.0, 0.1, 0.5, 1.0)
+        )
+    ]
+    worst, lost, wrong = worst_of(cases, log_short, naive_log_short, exact_short, precision)
+    assert worst[0] <= 4, worst
+    assert lost > 0.2
+    assert wrong > 0.25
+
+
+finite = st.floats(-3, 3)
+
+
+@given(st.floats(0, 1), st.floats(-8, 6), finite, st.booleans(), st.floats(-2, 4), st.sampled_from(PRECISIONS))
+@settings(max_examples=300, deadline=None, derandomize=True)
+def test_hit_anywhere(share, sigma, expected, far, scale, precision):
+    real = np.dtype(precision).type
+    top = real(10**scale)
+    case = real(share) * top, real(expected * 30 if far else expected) * top, real(10**sigma) * top, top
+    assert eps_off(log_hit(*case), exact_hit(*case), precision) <= BOUND
+
+
+@given(st.floats(0, 1), st.floats(-9, 4), st.floats(-12, 6), st.sampled_from(PRECISIONS))
+@settings(max_examples=300, deadline=None, derandomize=True)
+def test_short_anywhere(share, expected, rate, precision):
+    real = np.dtype(precision).type
+    expected = real(10**expected)
+    case = real(share) * expected, expected, real(10**rate) / expected
+    assert eps_off(log_short(*case), exact_short(*case), precision) <= BOUND
+
+
+@pytest.mark.parametrize("expected", [-20.0, -1.0, 0.0, 1e-6, 2.4, 7.992, 8.0, 9.0, 30.0])
+@pytest.mark.parametrize("sigma", [1e-3, 0.1, 5.0, 1e5])
+@pytest.mark.parametrize("rate", [0.0, 1e-9, 0.5, 200.0])
+def test_continuous_part_and_atom_sum_to_one(expected, sigma, rate):
+    """Gauss-Legendre quadrature in panels around the peak; p_short has no mass where z* <= 0, as in the book."""
+    top = 8.0
+    p = gs.BeamParameters(0.5, 0.2, 0.1, 0.2, sigma_hit=sigma, lambda_short=rate)
+    steps = np.geomspace(1e-9, top, 60)
+    bends = np.concatenate([expected + sigma * np.linspace(-12, 12, 25), [expected], steps, top - steps])
+    edges = np.unique(np.clip(np.concatenate([[0, top], bends]), 0, top))
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    half = np.diff(edges)[:, None] / 2
+    z = edges[:-1, None] + half * (1 + nodes)
+    z = np.minimum(z, np.nextafter(top, 0))
+    continuous = (np.exp(log_mixture(z, expected, range_max=top, **p.to_dict())) * half * weights).sum()
+    atom = np.exp(log_mixture(top, expected, range_max=top, **p.to_dict()))
+    lost = p.z_short if expected <= 0 else 0.0
+    assert continuous + atom == pytest.approx(1 - lost, abs=1e-9)
+
+
+def test_supports_scalars_and_shapes():
+    assert log_hit([-1e-9, 8.1], 3.0, 0.1, 8.0).tolist() == [-np.inf, -np.inf]
+    assert np.isfinite(log_hit([0.0, 8.0], 3.0, 0.1, 8.0)).all()
+    assert log_short([3.1, -1.0, 0.0], 3.0, 0.5)[:2].tolist() == [-np.inf, -np.inf]
+    assert log_short(0.0, [0.0, -2.0], 0.5).tolist() == [-np.inf, -np.inf]
+    assert log_rand([-1.0, 0.0, 8.0], 8.0).tolist() == [-np.inf, -math.log(8.0), -np.inf]
+    assert np.isnan([log_hit(np.nan, 1.0, 1.0, 8.0), log_short(np.nan, 1.0, 1.0), log_rand(np.nan, 8.0)]).all()
+    assert isinstance(log_hit(1.0, 2.0, 0.1, 8.0), np.float64)
+    assert log_hit(np.float32(1), 2.0, 0.1, 8.0).dtype == np.float32
+    assert log_short(1, 2, 1).dtype == np.float64
+    z = np.zeros((3, 1), np.float32)
+    everything = dict(gs.BeamParameters().to_dict(), range_max=8.0)
+    assert log_mixture(z, np.ones(4, np.float32), **everything).shape == (3, 4)
+    assert log_mixture(z, np.ones(4, np.float32), **everything).dtype == np.float32
+    assert log_mixture(z, np.ones(4), **everything).dtype == np.float64
+
+
+def test_mixture_of_one_component_is_that_component_and_nothing_is_nan():
+    z, expected = np.array([0.0, 1.0, 7.5]), np.array([3.0, -4.0, 11.0])
+    shape = {"sigma_hit": 1e-3, "lambda_short": 0.0, "range_max": 8.0}
+    names = ("z_hit", "z_short", "z_max", "z_rand")
+    alone = [dict(zip(names, np.eye(4)[i], strict=True), **shape) for i in range(4)]
+    np.testing.assert_array_equal(log_mixture(z, expected, **alone[0]), log_hit(z, expected, 1e-3, 8.0))
+    np.testing.assert_array_equal(log_mixture(z, expected, **alone[1]), log_short(z, np.minimum(expected, 8.0), 0.0))
+    np.testing.assert_array_equal(log_mixture(z, expected, **alone[2]), np.full(3, -np.inf))
+    np.testing.assert_array_equal(log_mixture(z, expected, **alone[3]), log_rand(z, 8.0))
+    assert log_mixture(np.inf, 3.0, **alone[2]) == 0.0
+    assert log_mixture([8.0, np.inf], 3.0, **alone[0]).tolist() == [-np.inf, -np.inf]
+
+
+def test_mixture_is_the_mixture_of_the_kernels():
+    """Same numbers as the reference kernel where that is defined, for z* in [0, range_max]."""
+    from gpusense.reference.mixture import log_density
+
+    p = gs.BeamParameters()
+    model = gs.BeamModel(gs.OccupancyGrid([[0]], 1.0), gs.Scanner([0.0], 8.0), p, backend="numpy", precision="float64")
+    z, expected = (a.ravel() for a in np.meshgrid(np.linspace(0, 7.99, 50), np.linspace(0, 8, 41)))
+    ours = log_mixture(z, expected, range_max=8.0, **p.to_dict())
+    np.testing.assert_allclose(ours, log_density(model._components, z, expected, model._terms), rtol=0, atol=1e-12)
+
+
+def test_names_of_the_textbooks_forms_say_so():
+    naive = {name for name in vars(densities) if "naive" in name}
+    assert naive == {"naive_log_hit", "naive_log_short", "naive_log_mixture"}

@@ -1,0 +1,202 @@
+"""The same call gives the same bits: again, in another process, in any batches, in any order and on a full device."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, scan_tolerance
+from gpusense.world import windows
+
+KINDS = ("ranges", "beam", "field", "bilinear")
+PRECISIONS = ("float32", "float64")
+# 44 beams make two whole blocks of the sum over beams and a part of one; four of them repeat a bearing.
+BEARINGS = np.concatenate([np.linspace(-2.2, 2.2, 40), [0.0, 0.0, 1.0, 1.0]])
+RANGE, COUNT = 3.0, 301
+Call = Callable[[np.ndarray], np.ndarray]
+
+
+def room() -> gs.OccupancyGrid:
+    rng = np.random.default_rng(0)
+    return gs.OccupancyGrid(rng.choice([0, 100, -1], (120, 200), p=[0.96, 0.02, 0.02]), 0.1, (1.0, -2.0, 0.4))
+
+
+def cloud(count: int = COUNT) -> np.ndarray:
+    """Return poses in and around the map, off its lattice, on corners at multiples of 45 degrees, huge headings."""
+    rng = np.random.default_rng(1)
+    (rows, cols), third = room().shape, count // 3
+    centers = room().cell_centers(rng.integers(-5, rows + 5, count), rng.integers(-5, cols + 5, count))
+    poses = np.column_stack([centers + rng.uniform(-0.05, 0.05, centers.shape), rng.uniform(-4, 4, count)])
+    poses[:third] = np.column_stack([np.round(centers[:third]), rng.integers(-4, 5, third) * (np.pi / 4)])
+    poses[third::7, 2] += 1e6
+    return poses[rng.permutation(count)]
+
+
+def scans() -> np.ndarray:
+    """Return five scans: all hits, some of every class, all missing, all max, a single hit."""
+    rng = np.random.default_rng(2)
+    z = rng.uniform(0.1, RANGE, (5, len(BEARINGS)))
+    z[1, ::5], z[1, 1::7], z[1, 2::11] = np.nan, np.inf, 0.0
+    z[2], z[3], z[4, 1:] = np.nan, np.inf, np.nan
+    return z
+
+
+def scanner() -> gs.Scanner:
+    return gs.Scanner(BEARINGS, RANGE, mount=(0.2, 0.1, 0.3))
+
+
+def model(kind: str, precision: str, backend: str) -> gs.BeamModel | gs.LikelihoodFieldModel:
+    if kind == "beam":
+        p = gs.BeamParameters(0.6, 0.2, 0.1, 0.1, 0.1, 0.3)
+        return gs.BeamModel(room(), scanner(), p, backend=backend, precision=precision, temperature=0.3)
+    field = gs.LikelihoodFieldParameters(0.7, 0.1, 0.2, 0.15, 0.8, "bilinear" if kind == "bilinear" else "nearest")
+    return gs.LikelihoodFieldModel(room(), scanner(), field, backend=backend, precision=precision, temperature=0.3)
+
+
+def make(kind: str, precision: str, backend: str) -> tuple[object, Call]:
+    """Return a caster or model, and its function of poses: ranges (N, K), or log p without, with parts (N, 2 + K)."""
+    if kind == "ranges":
+        caster = gs.RayCaster(room(), RANGE, backend=backend, precision=precision)
+        return caster._caster, lambda poses: caster.cast(poses, BEARINGS)
+    scored, z = model(kind, precision, backend), scans()[1]
+
+    def score(poses: np.ndarray) -> np.ndarray:
+        log_p, parts = scored.log_likelihood(poses, z, per_beam=True)
+        return np.column_stack([scored.log_likelihood(poses, z), log_p, parts])
+
+    return scored, score
+
+
+# Models are shared by the tests: what was asked of one before must not matter either.
+shared = functools.cache(make)
+
+
+def same_bits(found: np.ndarray, expected: np.ndarray) -> None:
+    assert found.dtype == expected.dtype and found.shape == expected.shape
+    np.testing.assert_array_equal(*(a.view(a.dtype.str.replace("f", "u")) for a in (found, expected)))
+
+
+@pytest.fixture(params=KINDS)
+def kind(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(params=PRECISIONS)
+def call(request: pytest.FixtureRequest, kind: str, backend: str) -> Call:
+    return shared(kind, request.param, backend)[1]
+
+
+def test_twice(kind, call, backend):
+    first = call(cloud())
+    same_bits(call(cloud()), first)
+    same_bits(make(kind, first.dtype.name, backend)[1](cloud()), first)
+
+
+def hashes(backend: str) -> str:
+    """Return a line for each kind and precision."""
+    results = {(kind, p): make(kind, p, backend)[1](cloud()) for kind in KINDS for p in PRECISIONS}
+    return "".join(f"{kind} {p} {hashlib.sha256(bits.tobytes()).hexdigest()}\n" for (kind, p), bits in results.items())
+
+
+def test_in_a_fresh_process(backend):
+    """Sets of flags are ordered otherwise there, and there is one thread."""
+    alone = {"PYTHONHASHSEED": "2", "POCL_MAX_PTHREAD_COUNT": "1", "CL_CONFIG_CPU_TARGET_NUM_THREADS": "1"}
+    command = [sys.executable, "-W", "ignore", __file__, backend]
+    done = subprocess.run(command, env=os.environ | alone, capture_output=True, text=True, timeout=300)
+    assert done.stdout == hashes(backend), done.stderr
+
+
+def test_any_batches(call):
+    whole = call(cloud())
+    for places in ([1, 2, 9, 72, 137, 300], [150], range(64, COUNT, 64), [0, COUNT]):
+        same_bits(np.concatenate([call(some) for some in np.split(cloud(), list(places))]), whole)
+    for i in (0, 7, 100, COUNT - 1):
+        same_bits(call(cloud()[i : i + 1]), whole[i : i + 1])
+
+
+def test_any_batches_of_a_cropped_map(kind, call, backend, monkeypatch):
+    """Each batch of neighbouring particles sees a window of the map of its own."""
+    whole, along = call(cloud()), np.argsort(cloud()[:, 0])
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
+    owner, cropped = make(kind, whole.dtype.name, backend)
+    found = np.concatenate([cropped(some) for some in np.split(cloud()[along], [1, 40, 99, 250])])
+    table = owner._pipeline.map if hasattr(owner, "_pipeline") else owner.map
+    assert table.preparations > 1
+    same_bits(found, whole[along])
+
+
+def test_any_order(call):
+    whole = call(cloud())
+    for order in (np.arange(COUNT)[::-1], np.random.default_rng(9).permutation(COUNT)):
+        same_bits(call(cloud()[order]), whole[order])
+    same_bits(call(np.repeat(cloud()[:3], 50, axis=0)), np.repeat(whole[:3], 50, axis=0))
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_after_running_out_of_memory(kind, precision, backend, monkeypatch):
+    """Pieces are halved until they fit; a piece of 256 particles must."""
+    owner, call = shared(kind, precision, backend)
+    poses = cloud(3000)
+    whole, device, asked = call(poses), get_backend(backend), []
+    empty, most = type(device).empty, 256 * len(BEARINGS) + 1
+
+    def short_of_memory(self, count, dtype, *, zero=False):
+        asked.append(count)
+        if count > most:
+            raise MemoryError("the device is full")
+        return empty(self, count, dtype, zero=zero)
+
+    owner._workspace.release()
+    with monkeypatch.context() as patch:
+        patch.setattr(type(device), "empty", short_of_memory)
+        same_bits(call(poses), whole)
+    assert max(asked) > most
+    same_bits(call(poses), whole)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_several_scans_or_one_by_one(kind, precision, backend):
+    scored = shared(kind, precision, backend)[0]
+    clouds = cloud(500).reshape(len(scans()), 100, 3)
+    log_p, parts = scored.log_likelihood(clouds, scans(), per_beam=True)
+    same_bits(scored.log_likelihood(clouds, scans()), log_p)
+    for s, z in enumerate(scans()):
+        alone, each = scored.log_likelihood(clouds[s], z, per_beam=True)
+        same_bits(alone, log_p[s])
+        same_bits(each, parts[s])
+
+
+def real_devices() -> list[str]:
+    """Return every processor and GPU: PoCL's and Intel's OpenCL for the same processor are two."""
+    return [device.selection for device in gs.devices() if device.available and device.kind != "simulator"]
+
+
+def test_float32_ranges_of_every_device_have_the_same_bits():
+    rays = {name: shared("ranges", "float32", name)[1](cloud(3000)) for name in real_devices()}
+    exact, (truth, *others) = TOLERANCES["float32 ranges"], rays.values()
+    assert [exact.difference(ranges, truth) for ranges in others] == [exact.value] * len(others)
+    assert len({hashlib.sha256(ranges.tobytes()).hexdigest() for ranges in rays.values()}) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_log_likelihoods_of_every_device_are_within_tolerance(kind):
+    """Functions such as exp differ, sums do not: both sides keep the tolerance against the truth."""
+    scores = {name: shared(kind, "float32", name)[1](cloud()) for name in real_devices()}
+    truth, total, each = scores["numpy"], scan_tolerance("float32", len(BEARINGS)), beam_tolerance("float32")
+    for name, found in scores.items():
+        for tolerance, columns in ((total.twice(), slice(0, 2)), (each.twice(), slice(2, None))):
+            assert tolerance.difference(found[:, columns], truth[:, columns]) <= tolerance.value, name
+
+
+if __name__ == "__main__":
+    sys.stdout.write(hashes(sys.argv[1]))

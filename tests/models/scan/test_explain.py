@@ -1,0 +1,161 @@
+"""``explain()`` names what a scene does not need, why, and what that saves; and nothing that it needs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from support.model_world import INF, KINDS, NAN, REPEATED, cloud, make, room, scan
+
+import gpusense as gs
+from gpusense.backends import Backend, get_backend
+from gpusense.models.scan import tiles
+from gpusense.world import windows
+
+
+def left_out(model: Any) -> dict[str, str]:
+    """Return the omissions that ``explain`` lists, by name."""
+    lines = [line[2:] for line in model.explain().splitlines() if line.startswith("- ")]
+    return dict(line.split("  ", 1) for line in lines)
+
+
+def test_explain_names_what_is_left_out(monkeypatch):
+    """Each omission with the number that decides it, and what it saves; nothing about a scan before there is one."""
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
+    grid = room((400, 500))
+    z = scan(REPEATED)
+    z[:4] = [NAN, INF, INF, -1.0]
+    poses = np.column_stack([grid.cell_centers([200] * 9, range(245, 254)), np.zeros(9)])
+    model = make("beam", grid, "numpy", REPEATED, weights=(0.9, 0.0, 0.1, 0.0), mount=(0.0, 0.0, 0.2), beams=12)
+    always = {"short component", "rand component", "mount", "unknown branch", "bounds tests", "float64"}
+    always.add("exponents in two parts")
+    assert set(left_out(model)) == always
+    model.log_likelihood(poses, z)
+    assert model.explain().startswith("beam model, float32, ")
+    found = left_out(model)
+    scene = {"missing readings", "max readings", "thinned beams", "repeated bearings", "entry from outside", "far map"}
+    scene.add("reduction of huge headings")
+    assert set(found) == always | scene
+    assert "z_short = 0" in found["short component"] and "z_rand = 0" in found["rand component"]
+    assert "2 of 24" in found["missing readings"] and "of 24" in found["max readings"]
+    assert "10" in found["thinned beams"] and "of 400 x 500 cells" in found["far map"]
+    assert all("; saves " in text for text in found.values())
+    model.log_likelihood(poses, scan(REPEATED))
+    assert not {"missing readings", "max readings"} & set(left_out(model))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_explain_of_a_model_that_leaves_nothing_out(kind):
+    grid = room()
+    model = make(kind, grid, "numpy", specialize=False)
+    model.log_likelihood(cloud(grid, 20), scan())
+    assert not left_out(model)
+    assert "nothing is left out" in model.explain() and "specialize=False" in model.explain()
+
+
+def test_explain_of_a_full_beam_model(backend):
+    """Needed parts are not called unnecessary; the other tests look at host code, the same everywhere."""
+    grid = room()
+    model = make("beam", grid, backend, precision="float64")
+    model.log_likelihood(cloud(grid, 100), scan())
+    needless = {"unknown branch", "bounds tests", "log-domain sum", "exponents in two parts"}
+    needless |= {"order of particles"} if model.device.kind == "gpu" else set()
+    assert set(left_out(model)) == needless | {"reduction of huge headings"}
+
+
+@pytest.mark.parametrize("kind", ["field", "bilinear"])
+def test_explain_of_a_field(kind):
+    grid = room()
+    model = make(kind, grid, "numpy", weights=(1.0, 0.0, 0.0), mount=(0.0, 0.0, 0.0))
+    z = scan()
+    z[:2] = [INF, NAN]
+    model.log_likelihood(cloud(grid, 10), z)
+    assert model.explain().startswith("likelihood field, float32, ")
+    found = left_out(model)
+    assert {"rand component", "max component", "mount", "missing readings", "float64"} <= set(found)
+    assert {"interpolation", "density per beam"} & set(found) == (
+        {"interpolation", "density per beam"} if kind == "field" else set()
+    )
+
+
+# ------------------------------------------------------------------------------------- what the last cloud left out
+
+
+@pytest.fixture
+def pretend(monkeypatch) -> Callable[[str], Backend]:
+    """Return the reference, which says that it is a processor or a GPU: the host decides what is listed."""
+
+    def as_kind(kind: str) -> Backend:
+        device = get_backend("numpy")
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind, lanes=1))
+        return device
+
+    return as_kind
+
+
+HUGE, GUARD, CLAMPS, ORDER = (
+    "reduction of huge headings", "guard of each end point", "clamps to the table", "order of particles"
+)  # fmt: skip
+
+
+def placed(grid: gs.OccupancyGrid, row: int, heading: float = 0.5) -> np.ndarray:
+    """Return eight poses in the middle of the columns."""
+    return np.column_stack([grid.cell_centers([row] * 8, range(36, 44)), np.full(8, heading)])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_huge_headings_are_left_out_where_there_are_none(kind):
+    grid = room()
+    model = make(kind, grid, "numpy")
+    assert HUGE not in left_out(model)
+    model.log_likelihood(placed(grid, 30, 2.0**20), scan())
+    assert "no heading is beyond 2^20 rad" in left_out(model)[HUGE] and "HUGE_HEADINGS" not in model.explain()
+    model.log_likelihood(placed(grid, 30, 2.0**20 + 1), scan())
+    assert HUGE not in left_out(model) and "HUGE_HEADINGS" in model.explain()
+
+
+def test_a_gpu_looks_for_doubtful_end_points_by_blocks(pretend):
+    """Cells are rounded to in float32 look-ups only."""
+    grid, inside = room((200, 80)), placed(room((200, 80)), 100)
+    for kind, device, options, listed in (
+        ("field", "gpu", {}, True),
+        ("field", "cpu", {}, False),
+        ("field", "gpu", {"precision": "float64"}, False),
+        ("bilinear", "gpu", {}, False),
+    ):
+        model = make(kind, grid, pretend(device), **options)
+        model.log_likelihood(inside, scan() * 0.4)
+        assert (GUARD in left_out(model)) == listed, (kind, device, options)
+    model = make("field", grid, pretend("gpu"))
+    model.log_likelihood(inside, scan(), per_beam=True)
+    assert GUARD not in left_out(model)
+
+
+def test_a_gpu_clamps_only_where_some_end_point_leaves_the_table(pretend):
+    grid = room((200, 80))
+    model = make("field", grid, pretend("gpu"))
+    model.log_likelihood(placed(grid, 100), scan() * 0.4)
+    assert "no end point of the cloud leaves the table" in left_out(model)[CLAMPS]
+    model.log_likelihood(placed(grid, 2), scan() * 0.4)
+    assert CLAMPS not in left_out(model) and GUARD in left_out(model)
+
+
+def test_a_gpu_orders_particles_where_they_are_many(pretend, monkeypatch):
+    grid = room()
+    model = make("beam", grid, pretend("gpu"))
+    assert ORDER not in left_out(model)
+    model.log_likelihood(placed(grid, 30), scan())
+    rays, particles = tiles.LEAST_ORDERED
+    assert f"a launch has fewer than {rays} rays or {particles} particles" in left_out(model)[ORDER]
+    model.log_likelihood(placed(grid, 30), scan(), per_beam=True)
+    assert "parts are wanted" in left_out(model)[ORDER]
+    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
+    model.log_likelihood(placed(grid, 30), scan())
+    assert ORDER not in left_out(model) and "ORDERED" in model.explain()
+    for kind, device in (("beam", "cpu"), ("field", "gpu")):
+        model = make(kind, grid, pretend(device))
+        model.log_likelihood(placed(grid, 30), scan())
+        assert ORDER not in left_out(model)

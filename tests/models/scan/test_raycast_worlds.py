@@ -1,0 +1,160 @@
+"""``RayCaster.cast`` in worlds of every kind against walks in rational arithmetic and against shapely."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import shapely
+from support.ray_oracles import Hit, Ray, backward_error_is_small, walk, world_ray
+from support.raycast_scenes import (
+    FLOAT32_CELLS,
+    FLOAT32_MOVE,
+    FLOAT32_TURN,
+    PRECISIONS,
+)
+
+import gpusense as gs
+
+WORLDS = {
+    "plain": (0.05, (0.0, 0.0, 0.0)),
+    "millimetres": (0.001, (0.3, -0.2, 0.0)),
+    "hundred metres": (100.0, (-500.0, 900.0, 0.4)),
+    "yaw": (0.05, (-3.0, 2.0, 2.5)),
+}
+CELLS_FAR = 30.5
+
+
+@dataclass(frozen=True)
+class World:
+    """Holds a grid with unknown cells, poses all around it, and the exact casts."""
+
+    grid: gs.OccupancyGrid
+    poses: np.ndarray
+    bearings: np.ndarray
+    cells: list[list[bool]]
+    rays: dict[tuple[int, int], Ray]
+    exact: dict[tuple[int, int], Hit]
+
+
+@functools.cache
+def world(name: str, unknown: str, outside: str) -> World:
+    resolution, origin = WORLDS[name]
+    rng = np.random.default_rng([7, *name.encode()])
+    grid = gs.OccupancyGrid(rng.choice([0, 100, -1, 40], (25, 36), p=[0.86, 0.06, 0.04, 0.04]), resolution, origin)
+    x, y = (n * rng.uniform(-0.2, 1.2, 200) for n in (grid.width, grid.height))
+    cos, sin = math.cos(origin[2]), math.sin(origin[2])
+    theta = rng.uniform(-10, 10, 200)
+    poses = np.stack([origin[0] + cos * x - sin * y, origin[1] + sin * x + cos * y, theta], axis=1)
+    bearings = rng.uniform(-np.pi, np.pi, 8)
+    stops = (grid.cells >= 65) | ((grid.cells < 0) & (unknown == "occupied"))
+    rays = {
+        (n, k): world_ray(poses[n], bearings[k], origin=origin, resolution=resolution, range_max=CELLS_FAR * resolution)
+        for n, k in np.ndindex(len(poses), len(bearings))
+    }
+    exact = {index: walk(stops.tolist(), ray, outside == "occupied") for index, ray in rays.items()}
+    return World(grid, poses, bearings, stops.tolist(), rays, exact)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize(("unknown", "outside"), [("free", "free"), ("occupied", "free"), ("free", "occupied")])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_casts_of_a_world(name, unknown, outside, precision, backend):
+    w = world(name, unknown, outside)
+    resolution = w.grid.resolution
+    caster = gs.RayCaster(
+        w.grid, CELLS_FAR * resolution, backend=backend, precision=precision, unknown=unknown, outside=outside
+    )
+    found = caster.cast(w.poses, w.bearings).astype(np.float64) / resolution
+    for index, ray in w.rays.items():
+        hit, r = w.exact[index], found[index]
+        tolerance, move, turn = FLOAT32_CELLS, FLOAT32_MOVE, FLOAT32_TURN
+        if precision == "float64":
+            tolerance, move, turn = forward_error(ray, hit), 1e-12, 1e-15
+        assert abs(r - hit.t) <= tolerance or backward_error_is_small(
+            w.cells, ray, r, move=move, turn=turn, tolerance=tolerance, outside_occupied=outside == "occupied"
+        ), (index, ray, r, hit)
+
+
+def forward_error(ray: Ray, exact: Hit) -> float:
+    """Return float64's bound: 1e-12 of the range, and the effect of rounded poses on a ray that meets a wall aslant."""
+    normal = {"x": ray.direction[0], "y": ray.direction[1]}.get(exact.face[2] if exact.face else "", 1)
+    size = 2e-15 * (1 + max(abs(ray.cell[0]), abs(ray.cell[1])))
+    return 1e-12 * exact.t + (size + 1e-15 * exact.t) / max(abs(float(normal)), 1e-12)
+
+
+@pytest.mark.parametrize("theta", [1e6, -1e6, 123456.789])
+def test_large_headings(backend, theta):
+    """The heading is reduced by its true value modulo 2 pi, not by a rounded one."""
+    rng = np.random.default_rng(3)
+    occupied = rng.random((30, 30)) < 0.05
+    poses = np.column_stack([rng.uniform(0, 30, (100, 2)), theta + rng.uniform(-3, 3, 100)])
+    grid = gs.OccupancyGrid(occupied * 100, 1.0)
+    found = gs.RayCaster(grid, 40.0, backend=backend, precision="float64").cast(poses, [0.0, 1.0])
+    for n, k in np.ndindex(found.shape):
+        ray = world_ray(poses[n], [0.0, 1.0][k], origin=(0, 0, 0), resolution=1.0, range_max=40.0)
+        exact = walk(occupied.tolist(), ray)
+        assert abs(found[n, k] - exact.t) <= forward_error(ray, exact)
+
+
+def test_range_max_is_returned_as_it_is(backend):
+    grid = gs.OccupancyGrid(np.zeros((4, 4), int), 0.3)
+    for range_max in (0.7, 30.1, 1e-3):
+        for precision in PRECISIONS:
+            caster = gs.RayCaster(grid, range_max, backend=backend, precision=precision)
+            found = caster.cast([[0.5, 0.5, 0.3], [-50.0, 3.0, 0.0]], np.linspace(-3, 3, 9))
+            assert (found == np.dtype(precision).type(range_max)).all()
+
+
+def test_all_unknown_map(backend):
+    grid = gs.OccupancyGrid(np.full((5, 5), -1), 1.0)
+    poses = [[2.5, 2.5, 0.0], [-1.5, 2.5, 0.0]]
+    assert gs.RayCaster(grid, 9.0, backend=backend).cast(poses, [0.0]).tolist() == [[9.0], [9.0]]
+    caster = gs.RayCaster(grid, 9.0, backend=backend, unknown="occupied")
+    assert caster.cast(poses, [0.0, math.pi]).tolist() == [[0.0, 0.0], [1.5, 9.0]]
+
+
+@pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi / 2, math.pi, 2 * math.pi])
+def test_a_ray_along_an_edge_stays_in_its_row(backend, heading):
+    """From the lower edge of a cell along that edge: the walls of the rows above and below are distinguished."""
+    cells = np.zeros((9, 9), int)
+    cells[4, 7] = cells[7, 4] = cells[4, 1] = cells[1, 4] = 100
+    grid = gs.OccupancyGrid(cells, 1.0)
+    for precision in PRECISIONS:
+        found = gs.RayCaster(grid, 20.0, backend=backend, precision=precision).cast([[4.5, 4.5, heading]], [0.0])
+        assert found[0, 0] == pytest.approx(2.5, abs=1e-6)
+        edge = {0.0: (4.5, 4.0), math.pi / 2: (4.0, 4.5), 2 * math.pi: None}.get(heading)
+        if edge is not None:
+            found = gs.RayCaster(grid, 20.0, backend=backend, precision=precision).cast([[*edge, heading]], [0.0])
+            assert found[0, 0] == 2.5
+
+
+@functools.cache
+def shapely_casts() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a map, 20 000 poses, and the distances to the union of the occupied squares."""
+    rng = np.random.default_rng(11)
+    occupied = rng.random((40, 40)) < 0.04
+    rows, cols = np.nonzero(occupied)
+    walls = shapely.union_all(shapely.box(cols, rows, cols + 1, rows + 1))
+    shapely.prepare(walls)
+    starts = rng.uniform(-3, 43, (20_000, 2))
+    angles = rng.uniform(-np.pi, np.pi, 20_000)
+    ends = starts + 50.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    cut = shapely.intersection(shapely.linestrings(np.stack([starts, ends], axis=1)), walls)
+    distance = np.nan_to_num(shapely.distance(shapely.points(starts), cut), nan=50.0)
+    return occupied, np.column_stack([starts, angles]), np.minimum(distance, 50.0)
+
+
+def test_against_shapely(backend):
+    occupied, poses, expected = shapely_casts()
+    caster = gs.RayCaster(gs.OccupancyGrid(occupied * 100, 1.0), 50.0, backend=backend, precision="float64")
+    found = caster.cast(poses, [0.0])[:, 0]
+    wrong = np.flatnonzero(np.abs(found - expected) > 1e-9)
+    for i in wrong:
+        ray = world_ray(poses[i], 0.0, origin=(0, 0, 0), resolution=1.0, range_max=50.0)
+        for r in (found[i], expected[i]):
+            assert backward_error_is_small(occupied.tolist(), ray, r, move=1e-9, turn=1e-12, tolerance=1e-9)
+    assert len(wrong) <= 2

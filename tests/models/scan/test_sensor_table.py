@@ -1,0 +1,165 @@
+"""The tabulated beam mixture: its values, its errors, and readings treated as the formula treats them."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+from support.oracles import Mixture
+
+import gpusense as gs
+
+RANGE = 4.0
+NAN, INF = math.nan, math.inf
+PRECISIONS = ("float32", "float64")
+WEIGHTS = {"all": (0.7, 0.1, 0.1, 0.1), "no short": (0.8, 0.0, 0.1, 0.1), "no rand": (0.7, 0.2, 0.1, 0.0)}
+
+
+@functools.cache
+def scene() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
+    """Return a corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max; four beams each way."""
+    cells = np.zeros((1, 400), int)
+    cells[0, -1] = 100
+    poses = np.zeros((80, 3))
+    poses[:, 0] = np.linspace(1e-3, 3.99, 80)
+    poses[:, 1] = 0.005
+    return gs.OccupancyGrid(cells, 0.01), gs.Scanner([0.0] * 4 + [math.pi] * 4, RANGE), poses
+
+
+def model(width: float | None, weights: str = "all", **options: object) -> gs.BeamModel:
+    grid, scanner, _ = scene()
+    p = gs.BeamParameters(*WEIGHTS[weights], sigma_hit=0.5, lambda_short=0.2)
+    return gs.BeamModel(grid, scanner, p, sensor_table=width, **{"backend": "numpy", **options})
+
+
+def readings(seed: int = 0, count: int = 8) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, RANGE, count)
+
+
+def bits(array: np.ndarray) -> np.ndarray:
+    return array.view(array.dtype.str.replace("f", "u"))
+
+
+def test_one_reading_by_hand(backend):
+    """1.3 m where 2 m are expected, in bins of 0.5 m: the mixture at 1.25 m and 2.25 m; range_max stays range_max."""
+    _, scanner, _ = scene()
+    for precision in PRECISIONS:
+        tabulated = model(0.5, backend=backend, precision=precision)
+        _, parts = tabulated.log_likelihood([[1.99, 0.005, 0.0]], [1.3] * scanner.count, per_beam=True)
+        exact = [-1.9408022282454782] * 4 + [-2.9320850272796114] * 4
+        np.testing.assert_allclose(parts[0], exact, rtol=4 * np.finfo(precision).eps)
+
+
+@pytest.mark.parametrize("width", [1.0, 0.3, 0.01])
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
+    """0.3 m do not divide 4 m: 13 bins of 4/13 m."""
+    _, _, poses = scene()
+    tabulated = model(width, precision=precision)
+    cells, mixture = round(RANGE / width), Mixture.of(tabulated.parameters, RANGE)
+    middle = (np.arange(cells) + 0.5) * RANGE / cells
+    expected = tabulated.expected_ranges(poses)
+    column = np.minimum((expected.astype(float) / RANGE * cells).astype(int), cells - 1)
+    centre = np.where(expected >= RANGE, RANGE, middle[column])
+    last = np.nextafter(np.dtype(precision).type(RANGE), np.dtype(precision).type(0))
+    for z in (*readings(1), 0.0, float(last), *(np.arange(1, 4) + 0.001)):
+        _, parts = tabulated.log_likelihood(poses, [z] * 8, per_beam=True)
+        wanted = mixture.log_densities(middle[min(int(z / RANGE * cells), cells - 1)], centre)
+        # Where a range is within rounding of a bin's edge either bin will do.
+        place = expected.astype(float) / RANGE * cells
+        sure = (np.abs(place - np.round(place)) > 1e-4) | (expected >= RANGE)
+        eps = np.finfo(precision).eps
+        assert (np.abs(parts - wanted) <= 8 * eps * (1 + np.abs(wanted)))[sure].all() and sure.mean() > 0.9
+
+
+@pytest.mark.parametrize("weights", WEIGHTS)
+def test_narrower_bins_are_more_exact(weights):
+    """Mean error over readings and poses at least of first order; the largest too where the mixture is continuous."""
+    (grid, _, poses), p = scene(), model(None, weights).parameters
+    z, parts = readings(count=200), []
+    for width in (None, 0.4, 0.2, 0.1, 0.05):
+        options = dict(backend="numpy", precision="float64", sensor_table=width)
+        tabulated = gs.BeamModel(grid, gs.Scanner([0.0] * 200, RANGE), p, **options)
+        parts.append(tabulated.log_likelihood(poses, z, per_beam=True)[1])
+    mean, largest = [], []
+    for approximate in parts[1:]:
+        error = np.abs(approximate - parts[0])
+        mean.append(error.mean())
+        largest.append(error.max())
+    # A halved width halves the error; 1.6 leaves room for chance.
+    assert (np.array(mean[:-1]) / mean[1:] > 1.6).all() and mean[0] / mean[-1] > 6
+    if weights == "no short":
+        assert (np.array(largest[:-1]) / largest[1:] > 1.6).all() and largest[0] / largest[-1] > 6
+
+
+@pytest.mark.parametrize("specialize", [True, False])
+def test_missing_and_max_readings_are_treated_as_the_formula_treats_them(specialize, backend):
+    _, _, poses = scene()
+    scan = [NAN, INF, 1.0, -1.0, RANGE, -INF, 2.5, RANGE + 1]
+    for weights in (WEIGHTS["all"], (0.8, 0.1, 0.0, 0.1)):
+        p = gs.BeamParameters(*weights, sigma_hit=0.5, lambda_short=0.2)
+        grid, scanner, _ = scene()
+        tabulated = gs.BeamModel(grid, scanner, p, backend=backend, sensor_table=0.1, specialize=specialize)
+        log_p, parts = tabulated.log_likelihood(poses, scan, per_beam=True)
+        assert (parts[:, [0, 3, 5]] == 0).all()
+        assert (parts[:, [1, 4, 7]] == np.float32(math.log(p.z_max) if p.z_max else 0)).all()
+        _, hits = tabulated.log_likelihood(poses, [1.0] * 4 + [2.5] * 4, per_beam=True)
+        assert (parts[:, 2] == hits[:, 2]).all() and (parts[:, 6] == hits[:, 6]).all()
+        np.testing.assert_allclose(log_p, parts.astype(float).sum(axis=1), rtol=1e-6)
+        assert (tabulated.log_likelihood(poses, [NAN] * 8) == 0).all()
+
+
+def test_impossible_scans_are_minus_infinity_and_no_others(backend):
+    """Unexpected obstacles only, so a reading in a bin beyond the expected range's is impossible."""
+    grid, scanner, poses = scene()
+    p = gs.BeamParameters(0.0, 0.9, 0.1, 0.0, lambda_short=0.2)
+    for precision in PRECISIONS:
+        tabulated = gs.BeamModel(grid, scanner, p, backend=backend, precision=precision, sensor_table=0.25)
+        expected = tabulated.expected_ranges(poses)
+        column = np.where(expected >= RANGE, 16, np.minimum((expected * np.float32(4)).astype(int), 15))
+        for seed in range(5):
+            z = readings(seed) * 0.7
+            log_p, parts = tabulated.log_likelihood(poses, z, per_beam=True)
+            impossible = (z * 4).astype(int) > column
+            np.testing.assert_array_equal(np.isneginf(parts), impossible)
+            np.testing.assert_array_equal(np.isneginf(log_p), impossible.any(axis=1))
+            assert not np.isnan(log_p).any() and 0 < np.count_nonzero(np.isneginf(log_p)) < len(poses)
+            assert (tabulated.log_likelihood(poses, z)[~impossible.any(axis=1)] == log_p[np.isfinite(log_p)]).all()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("weights", WEIGHTS)
+def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(weights, precision, backend):
+    """Expected ranges are the same bits everywhere, and the rest is look-ups and sums in a fixed order."""
+    _, _, poses = scene()
+    for seed, options in ((0, {}), (1, {"temperature": 0.3}), (2, {"beams": 3})):
+        z = readings(seed)
+        reference = model(0.05, weights, precision=precision, **options).log_likelihood(poses, z, per_beam=True)
+        for specialize in (True, False):
+            tabulated = model(0.05, weights, precision=precision, backend=backend, specialize=specialize, **options)
+            for found, wanted in zip(tabulated.log_likelihood(poses, z, per_beam=True), reference, strict=True):
+                np.testing.assert_array_equal(bits(found), bits(wanted))
+
+
+def test_any_caster_may_feed_the_table(backend):
+    _, _, poses = scene()
+    lines, alone = model(0.01, backend=backend, caster="bresenham"), model(0.01, backend=backend)
+    _, parts = lines.log_likelihood(poses, readings(), per_beam=True)
+    _, exact = alone.log_likelihood(poses, readings(), per_beam=True)
+    # Where the line's range is in the exact one's bin, so is the density.
+    bins = [(one.expected_ranges(poses) * np.float32(100)).astype(int) for one in (lines, alone)]
+    same = bins[0] == bins[1]
+    assert 0.5 < same.mean() < 1
+    assert (parts == exact)[same].all() and (parts != exact)[~same].any()
+
+
+def test_the_plan_says_that_the_mixture_is_tabulated():
+    _, _, poses = scene()
+    tabulated, formula = model(0.05), model(None)
+    for one in (tabulated, formula):
+        one.log_likelihood(poses[:3], readings())
+    assert "log p is tabulated over 80 x 81 bins of readings and expected ranges" in tabulated.explain()
+    assert "tabulated" not in formula.explain()
+    assert tabulated.sensor_table == 0.05 and formula.sensor_table is None

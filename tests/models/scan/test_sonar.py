@@ -1,0 +1,284 @@
+"""Sonar: cones of rays, and surfaces that return nothing beyond an angle of incidence, against plain rays."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+import pickle
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+from support.incidence_world import EDGES, INCIDENCE, KINDS, P, place
+from support.selection import on_every_backend
+
+import gpusense as gs
+from gpusense.evaluation.tolerances import differing, per_beam, per_scan
+from gpusense.evaluation.worlds import simulate_scan
+from gpusense.models.scan import tiles
+from gpusense.models.scan.densities import log_mixture
+from gpusense.tables.casters import Lookup
+
+RANGE = 5.0
+RING = np.arange(8) * math.pi / 4 + 0.1
+MOUNT = (0.2, 0.1, 0.3)
+SONAR = dict(cone=0.5, cone_rays=7, critical_incidence=0.6)
+
+
+def ring(**options) -> gs.Scanner:
+    return gs.Scanner(RING, RANGE, mount=MOUNT, **options)
+
+
+def rays_alone(scanner: gs.Scanner) -> gs.Scanner:
+    """Return a laser along every ray of a sonar."""
+    return gs.Scanner(scanner.ray_bearings.ravel(), scanner.range_max, mount=scanner.mount)
+
+
+def brute_force(scanner: gs.Scanner, backend, poses: np.ndarray, **options) -> tuple[np.ndarray, np.ndarray]:
+    """Return ranges of the nearest rays that return, and their angles of incidence, from rays one by one."""
+    model = gs.BeamModel(place()[0], rays_alone(scanner), backend=backend, **options)
+    shape = (len(poses), *scanner.ray_bearings.shape)
+    ranges = model.expected_ranges(poses).reshape(shape)
+    angles = np.full(shape, np.nan, ranges.dtype)
+    if "caster" not in options:
+        angles = model.incidence(poses).reshape(shape)
+    critical = scanner.critical_incidence
+    if critical is not None:
+        assert not np.isclose(angles, critical, rtol=0, atol=2e-6).any()
+        ranges = np.where(angles > critical, ranges.dtype.type(scanner.range_max), ranges)
+    which = ranges.argmin(axis=-1)[..., None]
+    nearest = np.take_along_axis(ranges, which, axis=-1)[..., 0]
+    return nearest, np.where(nearest < scanner.range_max, np.take_along_axis(angles, which, axis=-1)[..., 0], np.nan)
+
+
+SONARS = {
+    "cone": dict(cone=0.5, cone_rays=7),
+    "even cone": dict(cone=0.26, cone_rays=4),
+    "mirrors": SONAR,
+    "laser and mirrors": dict(critical_incidence=0.6),
+}
+
+
+@on_every_backend(on_warp=lambda name: name in ("cone", "mirrors"), name=SONARS)
+def test_a_sonar_hears_the_nearest_ray_that_returns(name, backend):
+    grid, poses, _ = place()
+    scanner = ring(**SONARS[name])
+    several = backend == "numpy" or name == "mirrors"
+    for outside, precision in itertools.product(("free", "occupied"), ("float32", "float64")):
+        if (outside, precision) != ("free", "float32") and (not several or backend.startswith("warp")):
+            continue
+        options = dict(outside=outside, precision=precision)
+        model = gs.BeamModel(grid, scanner, backend=backend, **options)
+        ranges, angles = brute_force(scanner, backend, poses, **options)
+        found = model.expected_ranges(poses)
+        assert differing(found, ranges) == 0
+        assert differing(model.incidence(poses), angles) == 0
+        assert differing(model.expected_ranges(poses[3:4]), ranges[3:4]) == 0
+        assert 0.001 < np.mean(found == RANGE) < 0.95
+
+
+@on_every_backend(
+    on_warp=lambda caster: caster in ("bresenham", "lookup"), caster=["dda", "march", "bresenham", "cddt", "lookup"]
+)
+def test_cones_of_every_caster(caster, backend):
+    if caster == "lookup":
+        caster = Lookup(24)
+    grid, poses, _ = place()
+    scanner = ring(cone=0.5, cone_rays=3)
+    found = gs.BeamModel(grid, scanner, caster=caster, backend=backend).expected_ranges(poses)
+    assert differing(found, brute_force(scanner, backend, poses, caster=caster)[0]) == 0
+
+
+def a_scan() -> np.ndarray:
+    return np.array([1.0, 2.5, np.nan, 0.3, np.inf, 4.0, 3.1, 1.7])
+
+
+@pytest.mark.parametrize("incidence", [None, INCIDENCE], ids=["plain", "by incidence"])
+def test_scores_are_the_mixture_at_what_a_sonar_hears(incidence, backend):
+    grid, poses, _ = place()
+    scanner = ring(**SONAR)
+    z, options = a_scan(), dict(backend=backend, **({} if incidence is None else {"incidence": incidence}))
+    model = gs.BeamModel(grid, scanner, **options)
+    ranges, angles = brute_force(scanner, backend, poses)
+    kinds = (P(),) if incidence is None else KINDS
+    which = np.searchsorted(EDGES[1:-1], np.nan_to_num(angles), side="right") if incidence else np.zeros(ranges.shape)
+    read, truth = np.broadcast_to(z.astype(np.float32).astype(float), ranges.shape), np.zeros(ranges.shape)
+    for i, p in enumerate(kinds):
+        each = log_mixture(np.nan_to_num(read, posinf=0.0), ranges.astype(float), range_max=RANGE, **p.to_dict())
+        each = np.where(np.isinf(read), math.log(p.z_max), np.where(np.isnan(read), 0.0, each))
+        truth = np.where(which == i, each, truth)
+    log_p, parts = model.log_likelihood(poses, z, per_beam=True)
+    assert (np.abs(parts - truth) <= 3 * per_beam(truth, "float32")).all()
+    assert (np.abs(log_p - truth.sum(axis=1)) <= 3 * per_scan(truth, "float32")).all()
+    whole = gs.BeamModel(grid, scanner, specialize=False, **options).log_likelihood(poses, z)
+    assert (np.abs(whole - truth.sum(axis=1)) <= 3 * per_scan(truth, "float32")).all()
+    title = model.explain().splitlines()[0]
+    assert "cones of 7 rays, no return beyond 0.6 rad of incidence" in title and "ECHO" in model.explain()
+
+
+def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
+    """Two sensors that look the same way share a cone."""
+    grid, poses, _ = place()
+    scanner = gs.Scanner(np.append(RING, RING[3]), RANGE, mount=MOUNT, **SONAR)
+    z = np.append(a_scan(), 2.0)
+    expected, parts = gs.BeamModel(grid, scanner, backend=as_gpu(False)).log_likelihood(poses, z, per_beam=True)
+    monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
+    model = gs.BeamModel(grid, scanner, backend=as_gpu())
+    assert differing(model.log_likelihood(poses, z), expected) == 0
+    assert {"SHARED_RAYS", "ECHO", "INCIDENCE"} <= model._last.flags
+    alone = gs.BeamModel(grid, ring(**SONAR), backend=as_gpu(False)).log_likelihood(poses, a_scan(), per_beam=True)[1]
+    assert differing(parts[:, :8], alone) == 0
+    assert differing(model.expected_ranges(poses)[:, 8], model.expected_ranges(poses)[:, 3]) == 0
+
+
+# ------------------------------------------------------------------------------------------------- laws of cones
+
+
+def expected(grid: gs.OccupancyGrid, poses: np.ndarray, **options) -> np.ndarray:
+    return gs.BeamModel(grid, ring(**options), backend="numpy", precision="float64").expected_ranges(poses)
+
+
+def test_a_cone_of_one_ray_is_a_laser(backend):
+    grid, poses, _ = place()
+    laser = gs.BeamModel(grid, ring(), backend=backend)
+    for options in (dict(cone=0.5, cone_rays=1), dict(cone=0.0, cone_rays=9), dict(critical_incidence=math.pi / 2)):
+        one = gs.BeamModel(grid, ring(**options), backend=backend)
+        assert differing(one.expected_ranges(poses), laser.expected_ranges(poses)) == 0
+        assert differing(one.log_likelihood(poses, a_scan()), laser.log_likelihood(poses, a_scan())) == 0
+        assert "ECHO" not in one._last.flags
+
+
+def test_more_rays_never_lengthen_the_nearest_of_all():
+    grid, poses, _ = place()
+    before = expected(grid, poses, cone=0.6, cone_rays=3)
+    for rays in (5, 9, 17, 33):
+        now = expected(grid, poses, cone=0.6, cone_rays=rays)
+        assert (now <= before).all() and (now < before).any()
+        before = now
+
+
+def test_more_surfaces_that_return_never_lengthen_it_either():
+    grid, poses, _ = place()
+    before = np.full((len(poses), len(RING)), RANGE)
+    for critical in (0.1, 0.4, 0.9, 1.3, None):
+        now = expected(grid, poses, cone=0.4, cone_rays=5, critical_incidence=critical)
+        assert (now <= before).all() and (now < before).any()
+        before = now
+
+
+def test_nothing_is_nearer_than_the_nearest_obstacle():
+    """Each end of a distance lies half a diagonal from its cell's centre at most."""
+    grid, _, _ = place()
+    rng = np.random.default_rng(2)
+    row, col = rng.integers(0, 90, 400), rng.integers(0, 120, 400)
+    xy = grid.cell_centers(row, col) + rng.uniform(-0.049, 0.049, (400, 2)) / math.sqrt(2)
+    poses = np.column_stack([xy, rng.uniform(-4, 4, 400)])
+    scanner = gs.Scanner(RING, 30.0, cone=2 * math.pi, cone_rays=90)
+    found = gs.BeamModel(grid, scanner, backend="numpy").expected_ranges(poses)
+    distance = distance_transform_edt(~grid.obstacles("free"))[row, col] * grid.resolution
+    diagonal = grid.resolution * math.sqrt(2)
+    assert (found >= distance[:, None] - diagonal).all()
+    # Rays all around find it, but for what slips between them.
+    assert np.median(found[:, 0] - distance) < diagonal
+
+
+def test_an_obstacle_more_never_lengthens_the_nearest_of_all():
+    grid, poses, _ = place()
+    before = expected(grid, poses, cone=0.5, cone_rays=5)
+    after = expected(grid.with_cells(np.full((8, 9), 100), (45, 60)), poses, cone=0.5, cone_rays=5)
+    assert (after <= before).all() and (after < before).any()
+
+
+def test_sensors_may_come_in_any_order():
+    grid, poses, _ = place()
+    order = np.array([5, 2, 7, 0, 1, 6, 3, 4])
+    turned = gs.Scanner(RING[order], RANGE, mount=MOUNT, **SONAR)
+    found = gs.BeamModel(grid, turned, backend="numpy").expected_ranges(poses)
+    assert differing(found, gs.BeamModel(grid, ring(**SONAR), backend="numpy").expected_ranges(poses)[:, order]) == 0
+
+
+def test_a_mirror_in_a_corner_and_a_wall_aslant():
+    """A sonar that looks at a wall aslant hears nothing from it once the angle is critical."""
+    cells = np.zeros((200, 200), int)
+    cells[150:153] = 100
+    grid = gs.OccupancyGrid(cells, 0.05)
+    turns = np.radians([0, 10, 20, 30, 40, 50])
+    poses = np.column_stack([np.full(6, 5.0), np.full(6, 5.5), math.pi / 2 - turns])
+    model = gs.BeamModel(grid, gs.Scanner([0.0], 5.0, critical_incidence=math.radians(25)), backend="numpy")
+    found = model.expected_ranges(poses)[:, 0]
+    np.testing.assert_allclose(found[:3], 2.0 / np.cos(turns[:3]), rtol=1e-6)
+    assert (found[3:] == 5.0).all() and np.isnan(model.incidence(poses)[3:]).all()
+    # A cone of 30 degrees still holds a ray that meets the wall at 15 degrees less.
+    wide = gs.Scanner([0.0], 5.0, cone=math.radians(30), cone_rays=31, critical_incidence=math.radians(25))
+    found = gs.BeamModel(grid, wide, backend="numpy").expected_ranges(poses)[:, 0]
+    nearest = np.maximum(np.degrees(turns) - 15, 0)
+    np.testing.assert_allclose(found[:4], 2.0 / np.cos(np.radians(nearest[:4])), rtol=1e-3)
+    assert found[5] == 5.0
+
+
+# ------------------------------------------------------------------------------------------------- the scanner
+
+
+def test_cones_of_a_scanner_in_attributes_and_repr():
+    scanner = gs.Scanner([0.0, 1.0], 5.0, cone=0.2, cone_rays=3, critical_incidence=0.4)
+    assert (scanner.cone, scanner.cone_rays, scanner.critical_incidence) == (0.2, 3, 0.4)
+    np.testing.assert_allclose(scanner.ray_bearings, [(-0.1, 0, 0.1), (0.9, 1, 1.1)])
+    assert (scanner.ray_bearings[:, 1] == scanner.bearings).all()
+    text = "Scanner(2 beams, range_max=5.0, range_min=0.0, mount=(0.0, 0.0, 0.0), "
+    assert repr(scanner) == text + "cone=0.2, cone_rays=3, critical_incidence=0.4)"
+    laser = gs.Scanner([0.0, 1.0], 5.0)
+    assert (laser.cone, laser.cone_rays, laser.critical_incidence) == (0.0, 1, None)
+    assert (laser.ray_bearings == [[0], [1]]).all()
+    assert gs.Scanner([], 5.0, cone=0.2).ray_bearings.shape == (0, 9)
+    four = gs.Scanner.uniform(
+        angle_min=0, angle_increment=math.pi / 2, count=4, range_max=5.0, cone=0.3, cone_rays=5, critical_incidence=0.5
+    )
+    assert four == gs.Scanner(np.arange(4) * (math.pi / 2), 5.0, cone=0.3, cone_rays=5, critical_incidence=0.5)
+
+
+def test_scanners_are_equal_by_their_cones_too():
+    scanner = ring(**SONAR)
+    for twin in (ring(**SONAR), copy.deepcopy(scanner), pickle.loads(pickle.dumps(scanner))):
+        assert twin == scanner and hash(twin) == hash(scanner) and repr(twin) == repr(scanner)
+    for change in (dict(cone=0.4), dict(cone_rays=8), dict(critical_incidence=None), dict(critical_incidence=0.5)):
+        assert ring(**(SONAR | change)) != scanner
+    assert ring(cone=0.0, cone_rays=4) == ring()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        (dict(cone=-0.1), ValueError, "cone: must be finite and >= 0 and <= 6.28"),
+        (dict(cone=math.nan), ValueError, "cone: must be finite"),
+        (dict(cone=7.0), ValueError, "cone: must be finite and >= 0 and <= 6.28"),
+        (dict(cone="wide"), TypeError, "cone: must be a real number, got 'wide'"),
+        (dict(cone=0.2, cone_rays=0), ValueError, "cone_rays: must be >= 1 and <= 1024, got 0"),
+        (dict(cone_rays=2.0), TypeError, "cone_rays: must be an integer, got 2.0"),
+        (dict(critical_incidence=0.0), ValueError, "critical_incidence: must be finite and > 0 and <= 1.57"),
+        (dict(critical_incidence=1.6), ValueError, "critical_incidence: must be finite and > 0 and <= 1.57"),
+        (dict(critical_incidence=True), TypeError, "critical_incidence: must be a real number, got True"),
+    ],
+)
+def test_cones_that_are_none(options, error, message):
+    with pytest.raises(error, match=message):
+        ring(**options)
+
+
+def test_mirrors_need_an_exact_caster():
+    with pytest.raises(ValueError, match=r"caster: must be an exact one for a scanner with critical_incidence = 0\.6"):
+        gs.BeamModel(place()[0], ring(**SONAR), caster="march", backend="numpy")
+
+
+def test_the_likelihood_field_takes_the_axes(backend):
+    grid, poses, _ = place()
+    sonar, laser = (gs.LikelihoodFieldModel(grid, ring(**o), backend=backend) for o in (SONAR, {}))
+    assert differing(sonar.log_likelihood(poses, a_scan()), laser.log_likelihood(poses, a_scan())) == 0
+
+
+def test_simulated_scans_come_from_cones():
+    grid, poses, _ = place()
+    scanner, pose = ring(**SONAR), poses[40]
+    sharp = P(1.0, 0.0, 0.0, 0.0, sigma_hit=1e-6)
+    z = simulate_scan(grid, scanner, pose, sharp, np.random.default_rng(0))
+    np.testing.assert_allclose(z, brute_force(scanner, "numpy", poses, precision="float64")[0][40], atol=1e-5)

@@ -1,0 +1,214 @@
+"""The second call compiles nothing, allocates nothing on the device, and copies only poses, the scan and the result."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.selection import on_every_backend
+
+import gpusense as gs
+from gpusense.evaluation.tolerances import differing
+from gpusense.models import run
+from gpusense.models.scan import tiles
+from gpusense.reference.error_free import BLOCK_TERMS
+
+BEAMS, COUNT, RANGE = 21, 300, 5.0
+BLOCKS = -(-BEAMS // BLOCK_TERMS)
+RNG = np.random.default_rng(12)
+GRID = gs.OccupancyGrid(np.where(RNG.random((60, 70)) < 0.04, 100, 0).astype(np.int8), 0.1)
+SCANNER = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, mount=(0.1, 0.0, 0.2))
+# A box that the clouds of all calls lie in.
+CORNERS = np.array([[0.5, 0.5, 0.0], [6.5, 5.5, 0.0], [0.5, 5.5, 0.0], [6.5, 0.5, 0.0]])
+
+WHATS = ("beam", "field", "smooth field", "caster")
+
+
+def poses(count: int, seed: int) -> np.ndarray:
+    inner = np.random.default_rng(seed).uniform((0.5, 0.5, -4), (6.5, 5.5, 4), (count - 4, 3))
+    return np.concatenate([CORNERS, inner])
+
+
+def scan(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, 4.99, BEAMS)
+
+
+class Watch:
+    """Counts what a backend allocates and compiles, and the bytes that it copies."""
+
+    def __init__(self, device, monkeypatch) -> None:
+        kind = type(device)
+        self.allocated: list[int] = []
+        self.compiled: list[str] = []
+        self.up: list[int] = []
+        self.down: list[int] = []
+        upload, download, empty = kind.upload, kind.download, kind.empty
+
+        def watched_upload(backend, array, out=None, *, wait=True):
+            self.up.append(array.nbytes)
+            return upload(backend, array, out, wait=wait)
+
+        def watched_download(backend, buffer, out, *, wait=True):
+            self.down.append(out.nbytes)
+            return download(backend, buffer, out, wait=wait)
+
+        def watched_empty(backend, count, dtype, *, zero=False):
+            self.allocated.append(count)
+            return empty(backend, count, dtype, zero=zero)
+
+        monkeypatch.setattr(kind, "upload", watched_upload)
+        monkeypatch.setattr(kind, "download", watched_download)
+        monkeypatch.setattr(kind, "empty", watched_empty)
+        if hasattr(kind, "_build"):
+            build = kind._build
+
+            def watched_build(backend, *arguments):
+                self.compiled.append(str(arguments))
+                return build(backend, *arguments)
+
+            monkeypatch.setattr(kind, "_build", watched_build)
+        self._count_buffers(device, monkeypatch)
+
+    def _count_buffers(self, device, monkeypatch) -> None:
+        """Count the buffers that the driver is asked for, from any place."""
+        if device.info.backend == "opencl":
+            from gpusense.backends.opencl import backend as _opencl
+
+            class Counted(_opencl.DeviceBuffer):
+                def __init__(own, context, flags, size, **options):
+                    self.allocated.append(size)
+                    super().__init__(context, flags, size, **options)
+
+            class CountedShared(_opencl.SharedBuffer):
+                def __init__(own, context, size, settle):
+                    self.allocated.append(size)
+                    super().__init__(context, size, settle)
+
+            monkeypatch.setattr(_opencl, "DeviceBuffer", Counted)
+            monkeypatch.setattr(_opencl, "SharedBuffer", CountedShared)
+        if device.info.backend == "warp":
+            import warp as wp
+
+            for name in ("empty", "zeros"):
+                make = getattr(wp, name)
+
+                def counted(*arguments, make=make, **options):
+                    self.allocated.append(arguments[0])
+                    return make(*arguments, **options)
+
+                monkeypatch.setattr(wp, name, counted)
+
+    def clear(self) -> None:
+        for each in (self.allocated, self.compiled, self.up, self.down):
+            each.clear()
+
+
+def scan_uploads(device, size: int, *counts: int) -> list[int]:
+    """Return the bytes of a scan's arrays: a gathered call copies them at once, each begins at a multiple of 64."""
+    if device.info.graphs:
+        return [sum(size * -(-count // 64) * 64 for count in counts)]
+    return [size * count for count in counts]
+
+
+def call_of(what: str, device, precision: str):
+    """Return the call that scores or casts poses, and the bytes that it copies there and back."""
+    size = np.dtype(precision).itemsize
+    if what == "caster":
+        caster = gs.RayCaster(GRID, RANGE, backend=device, precision=precision)
+        copied = (lambda n: [24 * n, 2 * size * BEAMS], lambda n: [size * n * BEAMS])
+        return lambda some, z: caster.cast(some, SCANNER.bearings), *copied
+    if what == "beam":
+        model = gs.BeamModel(GRID, SCANNER, backend=device, precision=precision)
+        copied = (lambda n: [24 * n, *scan_uploads(device, size, 2 * BEAMS, BEAMS)], lambda n: [size * n])
+    else:
+        how = gs.LikelihoodFieldParameters(interpolation="bilinear" if what == "smooth field" else "nearest")
+        model = gs.LikelihoodFieldModel(GRID, SCANNER, how, backend=device, precision=precision)
+        # On GPUs also how near to an edge an end point of each block of readings may be.
+        counts = (2 * BEAMS, 2 * BEAMS, *([BLOCKS] if device.info.kind == "gpu" else []))
+        copied = (lambda n: [24 * n, *scan_uploads(device, size, *counts)], lambda n: [size * n])
+    return model.log_likelihood, *copied
+
+
+@on_every_backend(
+    what=WHATS, precision=("float32", "float64"), path=("processor", "gpu", "gpu in order"),
+    on_warp=lambda what, precision, path: precision == "float32" or path == "gpu in order",
+)  # fmt: skip
+def test_the_second_call(what, precision, path, as_gpu, monkeypatch):
+    gpu, order = path != "processor", path == "gpu in order"
+    if order:
+        monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
+    device = as_gpu(gpu)
+    watch = Watch(device, monkeypatch)
+    call, up, down = call_of(what, device, precision)
+    first = call(poses(COUNT, 1), scan(1))
+    assert watch.allocated and watch.up
+    more = [28] if order and what in ("beam", "caster") else []
+    # Fewer particles need no more of anything.
+    for count, seed in ((COUNT, 2), (COUNT, 3), (COUNT - 100, 4), (COUNT, 1)):
+        watch.clear()
+        found = call(poses(count, seed), scan(seed))
+        assert watch.allocated == [] and watch.compiled == []
+        assert sorted(watch.up) == sorted(up(count) + more)
+        assert watch.down == down(count)
+    assert differing(found, first) == 0
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+def test_out_spares_the_host_an_array_but_changes_no_copy(gpu, as_gpu, monkeypatch):
+    device = as_gpu(gpu)
+    watch = Watch(device, monkeypatch)
+    _, up, down = call_of("beam", device, "float32")
+    model = gs.BeamModel(GRID, SCANNER, backend=device)
+    out = np.empty(COUNT, np.float32)
+    model.log_likelihood(poses(COUNT, 2), scan(2), out=out)
+    watch.clear()
+    model.log_likelihood(poses(COUNT, 3), scan(3), out=out)
+    assert watch.allocated == [] and watch.compiled == []
+    assert sorted(watch.up) == sorted(up(COUNT)) and watch.down == down(COUNT)
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
+    device = as_gpu(gpu)
+    monkeypatch.setattr(run, "CHUNK", 128)
+    watch = Watch(device, monkeypatch)
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
+    # Each piece has all corners of the box.
+    some = np.concatenate([poses(128, 1), poses(128, 2), poses(100, 3)])
+    model.log_likelihood(some, scan(1))
+    watch.clear()
+    model.log_likelihood(some, scan(2))
+    assert watch.allocated == [] and watch.compiled == []
+    readings = scan_uploads(device, 4, 2 * BEAMS, 2 * BEAMS, *([BLOCKS] if gpu else []))
+    assert sorted(watch.up) == sorted([24 * 128, 24 * 128, 24 * 100, *readings])
+    assert watch.down == [4 * 128, 4 * 128, 4 * 100]
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+@pytest.mark.parametrize("what", ["beam", "field"])
+def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):
+    device, scans = as_gpu(gpu), 4
+    watch = Watch(device, monkeypatch)
+    model = (gs.BeamModel if what == "beam" else gs.LikelihoodFieldModel)(GRID, SCANNER, backend=device)
+
+    def call(count: int, seed: int) -> np.ndarray:
+        # Each scan has as many readings as another of any call, but another time.
+        z = np.stack([scan(seed + s) for s in range(scans)])
+        for s in range(scans):
+            z[s, BEAMS - (seed + s) % scans :] = np.nan
+        found: np.ndarray = model.log_likelihood(np.stack([poses(count, seed + s) for s in range(scans)]), z)
+        assert model._last.together == scans
+        return found
+
+    first = call(COUNT, 1)
+    total = scans * BEAMS - sum(range(scans))
+    # Starts of the sums, and begins and numbers of readings of the scans.
+    counts = (2 * total, total, scans) if what == "beam" else (2 * total, 2 * total, scans)
+    counts = (*counts[:2], scans * BLOCKS, scans) if what == "field" and gpu else counts
+    readings = [*scan_uploads(device, 4, *counts), *scan_uploads(device, 4, scans + 1, scans)]
+    for count, seed in ((COUNT, 2), (COUNT, 3), (COUNT - 100, 4), (COUNT, 1)):
+        watch.clear()
+        found = call(count, seed)
+        assert watch.allocated == [] and watch.compiled == []
+        assert sorted(watch.up) == sorted([24 * count * scans, *readings])
+        assert watch.down == [4 * count * scans]
+    assert differing(found, first) == 0

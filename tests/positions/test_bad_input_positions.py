@@ -1,0 +1,19 @@
+"""Bad input to the functions that find positions is refused with the exact message."""
+
+from __future__ import annotations
+
+import pytest
+from support.bad_input_positions import CASES
+
+
+@pytest.mark.parametrize(("action", "kind", "message"), [case[1:] for case in CASES], ids=[c[0] for c in CASES])
+def test_bad_input(action, kind, message):
+    with pytest.raises(kind) as caught:
+        action()
+    assert type(caught.value) is kind
+    assert str(caught.value) == message
+
+
+def test_ids_are_unique():
+    names = [name for name, *_ in CASES]
+    assert len(names) == len(set(names)) >= 40

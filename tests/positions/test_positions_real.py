@@ -1,0 +1,128 @@
+"""Beacons that a real robot saw (a camera's fiducials, ENMT482), against its pose from SLAM."""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+
+# Errors of single sightings against the reference pose, the map's and the reference's own errors included.
+SIGMA_RANGE, SIGMA_BEARING = 0.06, 0.03
+
+
+@pytest.fixture(scope="module")
+def sightings(data_dir):
+    """Return the moments at which two or more mapped beacons were seen: reference pose, beacons, ranges, bearings."""
+    folder = data_dir / "beacons_enmt482"
+    rows = np.genfromtxt(folder / "beacon_map.csv", delimiter=",", skip_header=1)
+    places = {int(row[0]): row[1:3] for row in rows}
+    with gzip.open(folder / "data.csv.gz", "rt") as stream:
+        table = [line.rstrip("\n").split(",") for line in itertools.islice(stream, 1, None)]
+    seen = [row for row in table if row[9] and int(float(row[9])) in places]
+    moments = []
+    for _, group in itertools.groupby(seen, key=lambda row: row[0]):
+        rows = list(group)
+        if len(rows) < 2:
+            continue
+        pose = np.array(rows[0][3:6], float)
+        xy = np.array([places[int(float(row[9]))] for row in rows])
+        local = np.array([row[10:12] for row in rows], float)
+        moments.append((pose, xy, np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])))
+    return moments
+
+
+def errors(fixes, truths):
+    """Return the distance of the nearest solution of each fix from the truth [m]."""
+    return np.array([np.hypot(*(f.solutions[:, :2] - t[:2]).T).min() for f, t in zip(fixes, truths, strict=True)])
+
+
+def quantiles(values):
+    """Return the median and the 90 % quantile."""
+    return np.quantile(values, [0.5, 0.9])
+
+
+def test_two_fiducials(sightings):
+    """Fixes lie as near to the reference as single sightings do: some cm, and cm per 0.01 rad across a few metres.
+
+    The map's and the reference's errors are within the bounds: the sightings' ranges are off by 5 cm in the median and
+    13 cm at 90 %, their bearings by 0.008 and 0.03 rad.
+    """
+    truths = [pose for pose, *_ in sightings]
+    assert len(truths) > 200
+    deviations = {"sigma_range": SIGMA_RANGE, "sigma_bearing": SIGMA_BEARING}
+    circles = [gs.trilaterate(xy, r, sigma=SIGMA_RANGE) for _, xy, r, _ in sightings]
+    poses = [gs.locate(xy, r, b, **deviations) for _, xy, r, b in sightings]
+    rays = [gs.triangulate(xy, b, pose[2], sigma=SIGMA_BEARING) for pose, xy, _, b in sightings]
+    single = [gs.locate(xy[:1], r[:1], b[:1], pose[2], **deviations) for pose, xy, r, b in sightings]
+    assert all(fix.status in ("two", "contained") for fix in circles)
+    assert all(fix.status == "unique" for fix in [*poses, *rays, *single])
+    for fixes, median, most in ((circles, 0.15, 0.4), (poses, 0.15, 0.3), (rays, 0.04, 0.12), (single, 0.08, 0.2)):
+        found = quantiles(errors(fixes, truths))
+        assert found[0] < median and found[1] < most, (found, median, most)
+    turns = np.array([np.angle(np.exp(1j * (f.best[2] - t[2]))) for f, t in zip(poses, truths, strict=True)])
+    assert quantiles(np.abs(turns))[0] < 0.08 and quantiles(np.abs(turns))[1] < 0.12
+    # The covariance says how far off a pose is: chi-squared's median is 2.4 for three degrees of freedom.
+    away = [f.best - t for f, t in zip(poses, truths, strict=True)]
+    for error, turn in zip(away, turns, strict=True):
+        error[2] = turn
+    scaled = [e @ np.linalg.solve(f.covariance[0], e) for e, f in zip(away, poses, strict=True)]
+    assert 1.0 < np.median(scaled) < 4.0
+
+
+def cylinders(ranges):
+    """Return bearings and ranges of cylinders in a scan of the LEGO robot: between a jump nearer and one farther."""
+    bearings = (np.arange(ranges.size) - 330) * 0.006135923 - 0.0698
+    seen = ranges > 0.02
+    found, inside = [], []
+    active = False
+    for k in range(1, ranges.size - 1):
+        jump = (ranges[k + 1] - ranges[k - 1]) / 2 if seen[k - 1] and seen[k + 1] else 0.0
+        if jump < -0.1:
+            active, inside = True, []
+        elif jump > 0.1 and active:
+            if inside:
+                found.append((bearings[inside].mean(), ranges[inside].mean()))
+            active = False
+        elif active and seen[k]:
+            inside.append(k)
+    return np.array(found).reshape(-1, 2).T
+
+
+def test_cylinders_of_the_lego_robot(data_dir):
+    """Three and more cylinders in a lidar's scan, against the overhead camera's position.
+
+    Which cylinder is which is taken from the camera: ranges within 12 cm and bearings, at the one heading that explains
+    most of them, within 0.06 rad. The axis lies 9 cm behind the mean of the points that are found.
+    """
+    folder = data_dir / "brenner_lego"
+    landmarks = np.loadtxt(folder / "robot_arena_landmarks.txt", usecols=(2, 3)) / 1000
+    positions = np.loadtxt(folder / "robot4_reference.txt", usecols=(2, 3)) / 1000
+    with gzip.open(folder / "robot4_scan.txt.gz", "rt") as stream:
+        scans = np.array([line.split()[3:] for line in stream], float) / 1000
+    headings = np.linspace(-np.pi, np.pi, 721)[:, None, None]
+    fixes, truths, statuses = {"ranges": [], "bearings": [], "both": []}, [], []
+    for ranges, truth in zip(scans, positions, strict=True):
+        b, r = cylinders(ranges)
+        r = r + 0.09
+        offset = landmarks - truth
+        turn = b[:, None] - np.arctan2(offset[:, 1], offset[:, 0]) + headings
+        match = (np.abs(r[:, None] - np.hypot(*offset.T)) < 0.12) & (np.abs(np.angle(np.exp(1j * turn))) < 0.06)
+        i, j = np.nonzero(match[np.argmax(match.any(axis=2).sum(axis=1))])
+        if len(i) < 3 or len(set(i)) < len(i) or len(set(j)) < len(j):
+            continue
+        xy, r, b = landmarks[j], r[i], b[i]
+        by_angle = gs.triangulate(xy, b, sigma=0.02)
+        statuses.append(by_angle.status)
+        if len(by_angle):
+            fixes["bearings"].append(by_angle)
+            fixes["ranges"].append(gs.trilaterate(xy, r, sigma=0.05))
+            fixes["both"].append(gs.locate(xy, r, b, sigma_range=0.05, sigma_bearing=0.02))
+            truths.append(truth)
+    assert len(truths) > 130 and statuses.count("unique") > 0.95 * len(statuses)
+    for name, median, most in (("ranges", 0.09, 0.11), ("bearings", 0.09, 0.25), ("both", 0.08, 0.1)):
+        found = quantiles(errors(fixes[name], truths))
+        assert found[0] < median and found[1] < most, (name, found)

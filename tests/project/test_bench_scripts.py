@@ -1,0 +1,354 @@
+"""The benchmark scripts run on tiny sizes and write their reports; bench/ is no part of the wheel."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from support.paths import ROOT
+
+from gpusense.backends import get_backend
+
+BENCH = ROOT / "bench"
+
+
+def run_script(name: str, *arguments: str, output: Path) -> dict:
+    """Run a script and return its report; its Markdown must be there, too."""
+    command = [sys.executable, str(BENCH / name), *arguments, "--output", str(output)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert output.with_suffix(".md").read_text() == done.stdout.removesuffix("\n")
+
+    def refuse(word: str) -> float:
+        raise ValueError(f"{word} is no JSON")
+
+    report = json.loads(output.with_suffix(".json").read_text(), parse_constant=refuse)
+    assert report["command"].startswith(f"python bench/{name} ")
+    assert str(output.parent) not in json.dumps(report)
+    return report
+
+
+@pytest.fixture
+def scaling(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Import the script as a module."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    return importlib.import_module("speed.scaling")
+
+
+SMALL = [
+    "--quick", "--particles", "100,300", "--beams", "1,12", "--sides", "100,220", "--particle-beams", "12",
+    "--beam-particles", "60", "--map-particles", "60", "--map-beams", "12", "--side", "220", "--seconds", "0.02",
+    "--repeats", "2", "--total", "200",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_scaling_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    report = run_script("speed/scaling.py", "--backend", needs(selection), *SMALL, output=tmp_path / "small")
+    (device,) = report["devices"]
+    rows = device["rows"]
+    assert {(row["axis"], row["value"]) for row in rows} == {
+        ("particles", 100), ("particles", 300), ("beams", 1), ("beams", 12), ("side", 100), ("side", 220),
+    }  # fmt: skip
+    assert len(rows) == 18 and device["left_out"] == []
+    for row in rows:
+        for name in ("floor_call_s", "floor_launch_s", "scattered_s", "call_s", "launch_s", "median_s"):
+            assert 0 < row[name] < math.inf, (name, row)
+        assert row["floor_launch_s"] <= row["floor_call_s"] and row["floor_launch_s"] <= row["scattered_s"]
+        # No cleverness makes up for a factor: a floor so far above a time would be a mistake of the floor.
+        assert row["floor_launch_s"] < 20 * row["launch_s"], row
+        assert row["launches"] >= 1 and row["table_bytes"] > 0 and row["steps"] > 0.5 and row["reads"] >= row["steps"]
+        assert row["error"] < 1e-2, row
+    (drawn,) = tmp_path.glob("*.png")
+    assert drawn.stat().st_size > 10_000
+
+
+def test_sizes_that_do_not_fit_are_listed(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = [*SMALL, "--particles", "100,100000000", "--longest", "1e-9"]
+    report = run_script("speed/scaling.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "none")
+    (device,) = report["devices"]
+    assert len(device["rows"]) + len(device["left_out"]) == 18
+    assert any("more than the" in line for line in device["left_out"])
+    text = (tmp_path / "none.md").read_text()
+    assert all(f"- {line}" in text for line in device["left_out"])
+
+
+def test_floors_are_the_largest_term(scaling: ModuleType) -> None:
+    figures = scaling.Figures(
+        source="", launch_s=2.0, round_trip_s=5.0, issue=100.0, scattered={4: 8.0, 400: 4.0}, together=10.0,
+        copy={4: 50.0}, upload=1e3, download=1e3,
+    )  # fmt: skip
+
+    def floor(kind: str, **changes: float) -> tuple[float, str]:
+        made = scaling.floor_of(kind, 1, 100, 2, 400, (4.0, 3.0), scaling.dataclasses.replace(figures, **changes))
+        return made.launches, made.cause
+
+    assert floor("field") == (17.6, "operations")
+    assert floor("field", issue=1e9) == (10.0, "look-ups")
+    assert floor("field", issue=1e9, together=1e9) == (5.0, "launches")
+    assert floor("field", issue=1e9, together=1e9, round_trip_s=1.0) == (4.0, "launches")
+    assert floor("rays", issue=1e9) == (40.0, "look-ups")
+    assert floor("rays", issue=1e9, together=1e9) == ((24 + 400) / 50, "bytes")
+    assert floor("rays") == ((60 + 100 * (46 + 3 * 41)) / 100, "operations")
+    assert floor("beam model") == ((60 + 100 * (46 + 3 * 41 + 42)) / 100, "operations")
+    assert floor("rays", upload=0.1) == ((60 + 100 * (46 + 3 * 41)) / 100, "transfer")
+    made = scaling.floor_of("field", 1, 100, 2, 400, (4.0, 3.0), figures)
+    assert made.scattered == 100 / 4
+
+
+def test_rates_are_never_too_low(scaling: ModuleType) -> None:
+    rates = {16: 9.0, 64: 5.0, 256: 6.0}
+    assert [scaling.rate(rates, size) for size in (1, 16, 63, 64, 255, 256, 10**9)] == [
+        9.0,
+        9.0,
+        9.0,
+        6.0,
+        6.0,
+        6.0,
+        6.0,
+    ]
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "120", "--beams", "8", "--repeats", "1", "--seconds", "0.01", "--size", "20"]
+    arguments += ["--backend", needs(selection)]
+    report = run_script("speed/limits.py", *arguments, output=tmp_path / "limits")
+    names = [row["what"] for row in report["rows"]]
+    assert {"rays, global, 120 x 8", "field, tracking, 120 x 8", "preparation, beam model"} <= set(names)
+    assert {"field, tracking, 2000 x 60", "beam model, tracking, 4000 x 60"} <= set(names)
+    noisy = ["--rows", "clouds", "bilinear", "--scan", "noisy", "--range-max", "8"]
+    report["rows"] += run_script("speed/limits.py", *arguments, *noisy, output=tmp_path / "noisy")["rows"]
+    assert sum(row["what"].startswith("field, bilinear") for row in report["rows"]) == 2
+    assert all(row["call_s"] > 0 and row["launch_s"] > 0 and row["first_s"] > 0 for row in report["rows"])
+    checked = [row for row in report["rows"] if row["checked"]]
+    assert len(checked) == 14 and all(row["median_error"] < 1e-4 and row["error"] < 1e-2 for row in checked)
+    assert not any(row["differing_bits"] for row in checked if row["what"].startswith("rays"))
+
+
+def test_launches_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "64", "--beams", "8", "--repeats", "2", "--size", "20", "--power", "3", "--power", "9"]
+    report = run_script("speed/launches.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "launches")
+    whats = [f"{what}, {cloud}" for cloud in ("global", "tracking") for what in ("rays", "beam model", "field")]
+    rows = [(row["what"], row["power"]) for row in report["rows"]]
+    assert rows == [(f"{what}, 64 x 8", power) for what in whats for power in (None, 3, 9)]
+    names = [[name for name, _ in row["launches"]] for row in report["rows"] if row["power"] is None]
+    mains: Any = [[main] for main in ("cast_ranges", "score_beams", "score_field")]
+    if get_backend(needs("opencl")).info.kind == "gpu":
+        mains = [["cast_tiles"], ["beam_tiles", "sum_parts"], ["field_blocks", "sum_parts"]]
+    assert names == 2 * [["place_poses", *main] for main in mains]
+    for row in report["rows"]:
+        assert all(seconds > 0 for _, seconds in row["launches"])
+        assert row["together_s"] > 0 and row["row_s"] > 0 and row["main_s"] > 0
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_point_models_run(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--beacons", "3", "--repeats", "1"]
+    arguments += ["--seconds", "0.01", "--backend", needs(selection)]
+    rows = run_script("speed/point_models.py", *arguments, output=tmp_path / "points")["rows"]
+    landmarks = [row for row in rows if "landmarks" in row["what"]]
+    assert {row["what"] for row in landmarks} == {
+        f"{kind}, 30 landmarks, {cloud}" for kind in ("known", "nearest") for cloud in ("tracking", "global")
+    }
+    others = {row["what"].split(",")[0] for row in rows if row not in landmarks}
+    assert others == {"position fix", "heading", "beacons", "bumper"}
+    assert {row["readings"] for row in rows if row not in landmarks} == {1, 3, 4}
+    assert all(row["rate"] > 0 and row["launch_rate"] > 0 and row["error"] < 16 for row in rows)
+
+
+def test_all_kinds_of_landmark_calls_run(tmp_path: Path) -> None:
+    arguments = ["--landmarks", "30", "--particles", "40", "--features", "4", "--repeats", "1", "--seconds", "0.01"]
+    arguments += ["--what", "landmarks", "--cloud", "tracking", "--backend", "numpy"]
+    rows = run_script("speed/point_models.py", *arguments, output=tmp_path / "all")["rows"]
+    assert len({row["what"] for row in rows}) == len(rows) == 10
+    assert all(row["what"].endswith("30 landmarks, tracking") and row["readings"] > 0 for row in rows)
+
+
+def test_sonar_field_runs(tmp_path: Path) -> None:
+    """Every method is tuned and scored, and the drawings are made; an absent recorded run is left out."""
+    report = run_script(
+        "studies/sonar_field.py", "--quick", "--places", "building", "--backend", "numpy", "--scans", "4",
+        "--particles", "30", "--figures", str(tmp_path / "drawn"), output=tmp_path / "sonar",
+    )  # fmt: skip
+    rows = report["rows"]
+    assert len({row["model"] for row in rows}) == 4 and {row["window"] for row in rows} == {1, 8}
+    for row in rows:
+        assert len(row["rank"]) == (4 if row["window"] == 1 else 2)
+        assert all(0 <= rank <= 1 for rank in row["rank"] + row["global rank"])
+        assert all(-50 < value <= math.log(31) + 1e-9 for value in row["information"])
+        assert all(0 <= error < 5 for error in row["error"])
+        # Tuned ways know more than nothing about a pose, one frame at a time.
+        assert row["window"] == 8 or sum(row["information"]) > 0
+    assert sorted(file.name for file in (tmp_path / "drawn").glob("*.png")) == ["sonar-scene.png", "sonar-scores.png"]
+
+
+@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--particles", "50", "--particles", "90", "--beams", "12", "--scans", "3", "--calls", "4"]
+    arguments += ["--models", "2", "--seconds", "0.01", "--size", "20", "--backend", needs(selection)]
+    report = run_script("speed/small_calls.py", *arguments, output=tmp_path / "small_calls")
+    names = [row["what"] for row in report["rows"]]
+    assert {"field, 50 x 12, NumPy in and out", "beam model, 90 x 12, NumPy in and out"} <= set(names)
+    assert {"field, 50 x 12, bound, a wait each", "beam model, 90 x 12, bound, 20 calls a wait"} <= set(names)
+    # GPUs have arrays of their own: both clouds, both models, four ordinary calls and two bound ones.
+    count = 16 if get_backend(needs(selection)).info.kind == "cpu" else 16 + 2 * 2 * (4 + 2)
+    assert len(names) == count and all(row["differing_bits"] == 0 for row in report["rows"])
+    assert all(0 < row["least_s"] <= row["median_s"] <= row["most_s"] and row["plain_s"] > 0 for row in report["rows"])
+    names = [row["what"] for row in report["several"]]
+    assert {"field, 3 scans of 50 x 12", "beam model, 2 models, 90 x 12"} <= set(names) and len(names) >= 8
+    for row in report["several"]:
+        assert row["differing_bits"] == 0 and row["queued_s"] > 0 and row["calls_s"] > 0
+        assert row["shared"] == ("together_s" in row) == ("scans" in row["what"])
+
+
+def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """A tree has the bits of itself, and rows of both its processes."""
+    arguments = ["--old", str(BENCH.parent), "--new", str(BENCH.parent), "--backend", needs("opencl"), "--limit", "50"]
+    arguments += ["--particles", "1000", "--beams", "8", "--size", "20", "--blocks", "2", "--turns", "2", "--bits"]
+    words = ["--rows", "field, tracking", "rays, global", "preparation", "scans"]
+    report = run_script("speed/compare_trees.py", *arguments, "--seconds", "0.001", *words, output=tmp_path / "trees")
+    names = {row["what"] for row in report["rows"]}
+    assert {"rays, global, 1000 x 8", "field, tracking, 1000 x 8", "preparation, field"} <= names
+    assert {"field, tracking, 1000 x 60", "field, tracking, 1000 x 60, bound", "field, 20 scans of 500 x 60"} <= names
+    for row in report["rows"]:
+        assert row["same_bits"] and not row["slower"] and len(row["blocks"]) == 2
+        assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1] and row["old_s"] > 0 and row["new_s"] > 0
+
+
+def test_preparation_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--backend", needs("opencl"), "--cells", "220", "--repeats", "1"]
+    report = run_script("speed/preparation.py", *arguments, output=tmp_path / "preparation")
+    assert report["exact"] and {row["map"] for row in report["rows"]} > {"building", "sparse"}
+    assert {"distances", "rectangles, 4 sectors", "field, a new model"} <= {row["step"] for row in report["rows"]}
+
+
+def test_fuzz_rays_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--backend", needs("opencl"), "--rays", "30000"]
+    report = run_script("accuracy/fuzz_rays.py", *arguments, output=tmp_path / "fuzz")
+    assert report["rays"] >= 30000 and [row["differing_rays"] for row in report["rows"]] == [0]
+
+
+def test_extreme_runs(tmp_path: Path) -> None:
+    arguments = ["--backend", "numpy", "--part", "levels", "--precision", "float64"]
+    report = run_script("accuracy/extreme.py", *arguments, output=tmp_path / "extreme")
+    assert len(report["rows"]["levels"]) == 4 and all(row["ok"] for row in report["rows"]["levels"])
+
+
+def test_stiff_density_runs(tmp_path: Path) -> None:
+    arguments = ["--backend", "numpy", "--step", "8", "--figures", str(tmp_path / "drawn")]
+    report = run_script("accuracy/stiff_density.py", *arguments, output=tmp_path / "stiff")
+    assert [row["precision"] for row in report["rows"]] == ["float32", "float64"]
+    assert all(row["worst"] < row["bound"] and row["kept"] == row["rows"] for row in report["rows"])
+    assert {file.name for file in (tmp_path / "drawn").iterdir()} == {"stiff_hit.png", "stiff_short.png"}
+
+
+def test_first_call_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--backend", needs("opencl"), "--repeats", "1"]
+    report = run_script("speed/first_call.py", *arguments, output=tmp_path / "first")
+    assert [row["cache"] for row in report["rows"]] == ["cold", "warm"]
+    cold, warm = report["rows"]
+    assert cold["open"] > warm["open"] > 0 and warm["field"] > 0 and warm["all"] > warm["open and field"]
+
+
+def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    words = (
+        "--pairs 4000 --numpy-pairs 2000 --scenes 2 --count 400 --starts 1 --repeats 2 --seconds 1 --precision float64"
+    )
+    arguments = ["--backend", "numpy", "--backend", needs("opencl"), *words.split()]
+    report = run_script("speed/learning.py", *arguments, output=tmp_path / "small")
+    assert [row["backend"].split(":")[0] for row in report["rows"]] == ["numpy", "opencl"]
+    for row in report["rows"]:
+        assert row["error"] < 1e-6 and row["converged"] and 0 < row["iteration_s"] < math.inf
+    assert len(report["scenes"]) == 2 and report["fall"] <= 1e-9
+    assert 0 < report["within"] <= report["identified"] <= 12
+
+
+def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--scans", "20", "--block", "2"]
+    sets = ["sonar1", "sonar2", "lidar_wall", "intel", "s3000"]
+    chosen = [word for name in sets for word in ("--set", name)]
+    report = run_script("studies/fit_real.py", *arguments, *chosen, "--discrete", "0.3", output=tmp_path / "fits")
+    assert [row["set"] for row in report["sets"]] == sets and str(data_dir) not in json.dumps(report)
+    for row in report["sets"]:
+        assert row["fit"]["converged"] and row["discrete"]["converged"] and row["held_out"][0]["name"] == "fitted"
+    arguments += ["--set", "intel", "--scans", "60", "--block", "5", "--incidence", "3"]
+    logs = run_script("studies/fit_real.py", *arguments, output=tmp_path / "logs")
+    own = logs["sets"][0]["incidence"]
+    assert len(own["fit"]["fits"]) == 3 and 0 < own["gain"] < 1 and own["gain_error"] < 0.2
+    # Both sonars sit a little off the reference; the laser's is a set-up error of millimetres.
+    bias = {row["set"]: row["fit"]["range_bias"] for row in report["sets"]}
+    assert abs(bias["sonar1"] + 0.027) < 0.01 and abs(bias["sonar2"]) < 0.01 and 0 < bias["lidar_wall"] < 0.01
+
+
+def test_localisation_with_fitted_parameters_runs(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--log", "intel", "--scans", "2"]
+    report = run_script("studies/fit_localisation.py", *arguments, "--particles", "500", output=tmp_path / "fits")
+    (log,) = report["logs"]
+    assert [row["parameters_of"] for row in log["rows"]][:2] == ["fitted", "nav2_amcl's defaults"] and len(
+        log["rows"]
+    ) == 5
+    assert log["scored_scans"] == 2 and all(1 <= row["rank"]["median"] < 20 for row in log["rows"])
+
+
+def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
+    chosen = [word for name in ("mrclam_2", "beacons", "lego", "freiburg") for word in ("--set", name)]
+    arguments = ["--data", str(data_dir), "--backend", needs("opencl"), *chosen, "--scans", "600", "--particles", "300"]
+    report = run_script("studies/landmarks_real.py", *arguments, output=tmp_path / "landmarks_real")
+    assert str(data_dir) not in json.dumps(report)
+    mrclam, beacons, lego, freiburg = report["sets"]
+    assert [each["landmarks"] for each in mrclam["exchanged"]] == [[11, 17]]
+    assert not any(one["exchanged"] or one["misplaced"] for one in (beacons, lego, freiburg))
+    assert freiburg["left_out"] == {"ranges below 0": 1}
+    for one in report["sets"]:
+        assert all(row["fit"]["converged"] for row in one["rows"])
+        assert all(row["association"][0]["right"] > 0.75 for row in one["rows"] if "association" in row)
+    for row in [*mrclam["rows"], *lego["rows"], *freiburg["rows"]]:
+        assert row["filter"]["error_median"] < 0.2
+
+
+def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
+    arguments = ["--figures", str(tmp_path / "drawn"), "--most", "64"]
+    report = run_script("accuracy/discrete_convergence.py", *arguments, output=tmp_path / "discrete")
+    drawn = {path.name for path in (tmp_path / "drawn").iterdir()}
+    assert drawn == {"discrete_convergence.png", "discrete_rows.png"}
+    first, second = report["rows"]
+    assert all(1.3 < wide / narrow < 3 for wide, narrow in zip(first, second, strict=True))
+
+
+def test_stretches_of_machine_code_end_at_labels_and_branches(
+    needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs("warp")
+    monkeypatch.syspath_prepend(str(BENCH))
+    code = """
+.text.kernel:
+        /*0000*/                   LDC R1, c[0x0][0x28] ;
+        /*0010*/              @!P0 BRA `(.L_x_1) ;
+        /*0020*/                   FADD R2, R2, -12582912 ;
+        /*0030*/              @!UP1 FMUL R2.reuse, R2, R3 ;
+.L_x_1:
+        /*0040*/                   EXIT ;
+"""
+    found = importlib.import_module("speed.cuda_code").stretches(code)
+    assert [names for names in found if names] == [["LDC", "BRA"], ["FADD", "FMUL"], ["EXIT"]]
+
+
+def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
+    """A recorded map, on every device that is present."""
+    arguments = ["--data", str(data_dir), "--map", "columbia", "--log", "none"]
+    report = run_script("accuracy/real_scores.py", *arguments, output=tmp_path / "real")
+    rows = report["maps"]
+    count = len({row["left"] for row in rows if row["right"] == "truth"})
+    assert count >= 2 and len(rows) == count + count * (count - 1) // 2
+    for row in rows:
+        assert row["breaches"] == 0 and "float32 beam model, scans" in row["differences"]
+    assert str(data_dir) not in str(report)

@@ -1,0 +1,287 @@
+"""The package finds its kernels however it was installed, and importing it stays cheap."""
+
+import importlib.metadata
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import zipfile
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from support.paths import ROOT
+
+import gpusense
+from gpusense.interface.kernel_files import opencl_source
+
+COPIED = ("bench", "docs", "examples", "gpusense", "kernels", "tests")
+
+# Layouts that are built or installed from a copy of the checkout.
+BUILT = ("wheel", "sdist", "editable")
+
+needs_warp = pytest.mark.skipif(find_spec("warp") is None, reason="Warp has no wheel for this platform")
+
+# Reports where the package and the kernels were found, and every OpenCL source as it was read.
+FIND = """
+import json
+import sys
+import gpusense
+from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source
+
+root = kernel_root()
+sources = {name: opencl_source(name) for name in opencl_names()}
+print(json.dumps({"package": gpusense.__file__, "root": str(root), "path": sys.path, "opencl": sources}))
+"""
+
+# Imports every Warp kernel file and reports the name and the file of each module.
+IMPORT = """
+import json
+import warp
+from gpusense.interface.kernel_files import kernel_root, warp_module
+
+names = [path.stem for path in kernel_root().glob("warp/*.py") if path.stem != "__init__"]
+modules = {name: warp_module(name) for name in names}
+report = {name: [module.__name__, module.__file__] for name, module in modules.items()}
+print(json.dumps({"modules": report, "library": warp.__file__}))
+"""
+
+# A Warp kernel whose parts lie in two files, so that Warp must find the source of both.
+PROBE_PART = """
+import warp as wp
+
+
+@wp.func
+def twice(value: wp.float32) -> wp.float32:
+    return wp.float32(2.0) * value
+"""
+PROBE_KERNEL = """
+import warp as wp
+
+from .probe_part import twice
+
+
+@wp.kernel
+def double(values: wp.array(dtype=wp.float32)):
+    i = wp.tid()
+    values[i] = twice(values[i])
+"""
+LAUNCH = """
+import warp as wp
+from gpusense.interface.kernel_files import warp_module
+
+wp.config.quiet = True
+module = warp_module("probe_kernel")
+assert module is warp_module("probe_kernel")
+values = wp.array([1.0, 2.5], dtype=wp.float32, device="cpu")
+wp.launch(module.double, dim=2, inputs=[values], device="cpu")
+print(module.double.func.__module__, values.numpy().tolist())
+"""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Says where the package lies on a disk, and starts Python so that it is the one imported."""
+
+    package: Path
+    kernels: Path
+    search_path: Path | None
+    python: Path
+
+    def run(self, script: str, *, cwd: Path) -> str:
+        """Run a script and return the last line that it prints."""
+        environment = {"WARP_CACHE_PATH": str(cwd / "warp-cache")}
+        if self.search_path is not None:
+            environment["PYTHONPATH"] = str(self.search_path)
+        return run([self.python, "-c", script], cwd=cwd, environment=environment).splitlines()[-1]
+
+
+def run(arguments: list[str | Path], *, cwd: Path, environment: dict[str, str] | None = None) -> str:
+    """Run a command with a clean Python environment and return its standard output."""
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    done = subprocess.run(
+        [os.fspath(argument) for argument in arguments],
+        cwd=cwd,
+        env=variables | {"PYTHONSAFEPATH": "1"} | (environment or {}),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, f"{arguments} failed:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the contents of the files under a folder by their relative names, caches left out."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix != ".pyc"
+    }
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Copy the checkout to a folder with a space in its name; builds write nothing into the real one."""
+    copy = tmp_path_factory.mktemp("check out") / "gpu sense"
+    copy.mkdir()
+    for path in ROOT.iterdir():
+        if path.is_file():
+            shutil.copy(path, copy)
+        elif path.name in COPIED:
+            shutil.copytree(path, copy / path.name, ignore=shutil.ignore_patterns("__pycache__"))
+    return copy
+
+
+@pytest.fixture(scope="module")
+def sdist(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the source distribution without a network and unpack it."""
+    folder = tmp_path_factory.mktemp("sdist")
+    run([sys.executable, "-m", "build", "--no-isolation", "--sdist", "--outdir", folder, checkout], cwd=folder)
+    with tarfile.open(next(folder.glob("*.tar.gz"))) as archive:
+        archive.extractall(folder, filter="data")
+    return next(path for path in folder.iterdir() if path.is_dir())
+
+
+def unpacked_wheel(source: Path, folder: Path) -> Path:
+    """Build the wheel of a source folder, without a network, and return the folder that it unpacks to."""
+    run([sys.executable, "-m", "build", "--no-isolation", "--wheel", "--outdir", folder, source], cwd=folder)
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
+        archive.extractall(folder / "unpacked")
+    return folder / "unpacked"
+
+
+@pytest.fixture(scope="module")
+def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel from the checkout and unpack it."""
+    return unpacked_wheel(checkout, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def wheel_of_sdist(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel from the source distribution and unpack it."""
+    return unpacked_wheel(sdist, tmp_path_factory.mktemp("wheel-of-sdist"))
+
+
+@pytest.fixture(scope="module")
+def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the interpreter of a new virtual environment into which pip -e installs the copied checkout."""
+    environment = tmp_path_factory.mktemp("editable") / "venv"
+    run([sys.executable, "-m", "venv", "--without-pip", environment], cwd=environment.parent)
+    scripts = environment / ("Scripts" if os.name == "nt" else "bin")
+    python = scripts / ("python.exe" if os.name == "nt" else "python")
+    where = "import sysconfig; print(sysconfig.get_path('purelib'))"
+    site = run([python, "-c", where], cwd=environment).strip()
+    # Borrow this environment's libraries; by its name the file is read after that of the editable install.
+    paths = dict.fromkeys([sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
+    Path(site, "zz_borrowed.pth").write_text("\n".join(paths), encoding="utf-8")
+    pip = [sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps"]
+    options = ["--ignore-installed", "--no-build-isolation", "--editable", checkout]
+    run([*pip, *options], cwd=environment)
+    return python
+
+
+@pytest.fixture(params=[*(pytest.param(name, marks=pytest.mark.slow) for name in BUILT), "checkout"])
+def layout(request: pytest.FixtureRequest, checkout: Path) -> Layout:
+    """Return each layout of the package on a disk in turn."""
+    if request.param == "editable":
+        python: Path = request.getfixturevalue("editable_python")
+        return Layout(checkout / "gpusense", checkout / "kernels", search_path=None, python=python)
+    folder: Path = request.getfixturevalue(request.param)
+    package = folder / "gpusense"
+    kernels = package / "kernels" if request.param == "wheel" else folder / "kernels"
+    return Layout(package, kernels, search_path=folder, python=Path(sys.executable))
+
+
+def test_checkout_has_kernels() -> None:
+    names = contents(ROOT / "kernels")
+    assert any(name.startswith("opencl/") and name.endswith(".cl") for name in names)
+    assert any(name.startswith("warp/") and name != "warp/__init__.py" for name in names)
+
+
+@pytest.mark.slow
+def test_wheel_holds_the_package_with_the_kernels_and_nothing_else(wheel: Path, checkout: Path) -> None:
+    kernels = {f"kernels/{name}": data for name, data in contents(checkout / "kernels").items()}
+    assert contents(wheel / "gpusense") == contents(checkout / "gpusense") | kernels
+    assert [path.suffix for path in sorted(wheel.iterdir())] == ["", ".dist-info"]
+
+
+@pytest.mark.slow
+def test_sdist_holds_the_sources_and_the_tests(sdist: Path, checkout: Path) -> None:
+    for folder in ("gpusense", "kernels", "tests"):
+        assert contents(sdist / folder) == contents(checkout / folder), folder
+
+
+@pytest.mark.slow
+def test_wheel_of_the_sdist_is_the_wheel_of_the_checkout(wheel: Path, wheel_of_sdist: Path) -> None:
+    assert contents(wheel_of_sdist) == contents(wheel)
+
+
+def test_kernels_are_found(layout: Layout, checkout: Path, tmp_path: Path) -> None:
+    report = json.loads(layout.run(FIND, cwd=tmp_path))
+    assert Path(report["package"]).parent == layout.package
+    assert Path(report["root"]) == layout.kernels
+    assert str(layout.kernels) not in report["path"]
+    sources = contents(checkout / "kernels" / "opencl")
+    assert report["opencl"] == {name.removesuffix(".cl"): text.decode() for name, text in sources.items()}
+    assert any(name.startswith("lanes/") for name in sources)
+
+
+@needs_warp
+def test_warp_kernels_are_imported_under_one_name(layout: Layout, checkout: Path, tmp_path: Path) -> None:
+    report = json.loads(layout.run(IMPORT, cwd=tmp_path))
+    names = [path.stem for path in (checkout / "kernels" / "warp").glob("*.py") if path.stem != "__init__"]
+    folder = layout.kernels / "warp"
+    assert report["modules"] == {name: [f"gpusense.kernels.warp.{name}", str(folder / f"{name}.py")] for name in names}
+    assert Path(report["library"]).parent != folder
+
+
+@needs_warp
+def test_warp_compiles_kernels(layout: Layout, tmp_path: Path) -> None:
+    parts = {"probe_part.py": PROBE_PART, "probe_kernel.py": PROBE_KERNEL}
+    for name, text in parts.items():
+        (layout.kernels / "warp" / name).write_text(text, encoding="utf-8")
+    try:
+        line = layout.run(LAUNCH, cwd=tmp_path)
+    finally:
+        for name in parts:
+            (layout.kernels / "warp" / name).unlink()
+    assert line == "gpusense.kernels.warp.probe_kernel [2.0, 5.0]"
+
+
+def test_an_unknown_kernel_is_named() -> None:
+    with pytest.raises(FileNotFoundError, match=r"name must be an OpenCL kernel file \(.+\), got 'no_such'"):
+        opencl_source("no_such")
+
+
+def test_importing_gpusense_loads_no_backend(layout: Layout, tmp_path: Path) -> None:
+    heavy = ("PIL", "matplotlib", "pyopencl", "rich", "scipy", "warp", "yaml")
+    script = f"import sys, gpusense; print([name for name in {heavy!r} if name in sys.modules])"
+    assert layout.run(script, cwd=tmp_path) == "[]"
+
+
+@pytest.mark.skipif(not sys.flags.safe_path, reason="without python -P the checkout may be what is imported")
+def test_the_installed_package_is_under_test() -> None:
+    distribution = importlib.metadata.distribution("gpusense")
+    origin = json.loads(distribution.read_text("direct_url.json") or "{}")
+    if origin.get("dir_info", {}).get("editable"):
+        pytest.skip("an editable install is the checkout")
+    installed = Path(str(distribution.locate_file("gpusense/__init__.py")))
+    assert Path(gpusense.__file__).resolve() == installed.resolve()
+
+
+@pytest.mark.slow
+def test_dependencies_on_linux_x86_64(wheel: Path) -> None:
+    metadata = next(wheel.glob("*.dist-info/METADATA")).read_text(encoding="utf-8")
+    lines = [line.split(":", 1)[1] for line in metadata.splitlines() if line.startswith("Requires-Dist:")]
+    machine = {"sys_platform": "linux", "platform_machine": "x86_64", "extra": ""}
+    needed = [
+        item.name.lower() for item in map(Requirement, lines) if item.marker is None or item.marker.evaluate(machine)
+    ]
+    expected = "matplotlib numpy pillow pocl-binary-distribution pyopencl pyyaml rich scipy warp-lang"
+    assert sorted(needed) == expected.split()

@@ -1,0 +1,1 @@
+"""Oracles, scenes, stand-ins and lists of bad input that tests share; fixtures are in the files ``conftest.py``."""

@@ -1,0 +1,136 @@
+"""Bad logs, with the exact message of each."""
+
+from __future__ import annotations
+
+import gzip
+from typing import Any
+
+from support.bad_input_files import Action, put
+
+from gpusense.logs import read_log
+
+GOOD_LINE = "FLASER 3 1.0 2.0 3.0 1 2 3 4 5 6 12.5 robot 0.5"
+
+
+def log_with(*lines: str, name: str = "run.log", **options: Any) -> Action:
+    """Read a whole log of these lines."""
+    return lambda tmp: list(read_log(put(tmp, name, "\n".join(lines)), **options))
+
+
+LOG = "{tmp}/input/run.log"
+LOG_CASES = [
+    (
+        "log-missing",
+        lambda tmp: read_log(tmp / "absent.log"),
+        FileNotFoundError,
+        "{tmp}/absent.log: must exist, got no such file",
+    ),
+    *[
+        (
+            f"log-{suffix}",
+            log_with("data", name=f"run.{suffix}"),
+            ValueError,
+            f"{{tmp}}/input/run.{suffix}: must be a CARMEN log, which is all that this version reads, got {what}",
+        )
+        for suffix, what in [("bag", "a ROS 1 bag"), ("db3", "a ROS 2 bag"), ("mcap", "an MCAP file")]
+    ],
+    (
+        "log-rosbag2",
+        lambda tmp: read_log(put(tmp, "metadata.yaml", "").parent),
+        ValueError,
+        "{tmp}/input: must be a CARMEN log, which is all that this version reads, got a ROS 2 bag",
+    ),
+    (
+        "log-range-max",
+        log_with(GOOD_LINE, range_max=-1),
+        ValueError,
+        "range_max: must be finite and > 0, got -1",
+    ),
+    ("log-odometry", log_with(GOOD_LINE, odometry=1), TypeError, "odometry: must be True or False, got 1"),
+    (
+        "log-other-text",
+        log_with("hello", "world"),
+        ValueError,
+        f"{LOG}: must hold laser or ODOM messages of CARMEN, got none in 2 lines",
+    ),
+    (
+        "log-truncated",
+        log_with("# a log", GOOD_LINE, GOOD_LINE[:30]),
+        ValueError,
+        f"{LOG}:3: FLASER: must have 14 fields, got 10",
+    ),
+    ("log-no-count", log_with("FLASER"), ValueError, f"{LOG}:1: FLASER: field 1 must be a count, got ''"),
+    (
+        "log-negative-count",
+        log_with(GOOD_LINE.replace("FLASER 3", "FLASER -3")),
+        ValueError,
+        f"{LOG}:1: FLASER: field 1 must be a count, got '-3'",
+    ),
+    (
+        "log-count-of-a-billion",
+        log_with(GOOD_LINE.replace("FLASER 3", "FLASER 1000000000")),
+        ValueError,
+        f"{LOG}:1: FLASER: field 1 must count at most 12 values, got 1000000000",
+    ),
+    (
+        "log-count-too-small",
+        log_with(GOOD_LINE.replace("FLASER 3", "FLASER 2")),
+        ValueError,
+        f"{LOG}:1: FLASER: must have 13 fields, got 14",
+    ),
+    (
+        "log-range-is-no-number",
+        log_with(GOOD_LINE, GOOD_LINE.replace("2.0", "2.O")),
+        ValueError,
+        f"{LOG}:2: FLASER: field 3 must be a number, got '2.O'",
+    ),
+    (
+        "log-range-with-underscore",
+        log_with(GOOD_LINE.replace("2.0", "2_0")),
+        ValueError,
+        f"{LOG}:1: FLASER: field 3 must be a number, got '2_0'",
+    ),
+    (
+        "log-time-is-no-number",
+        log_with(GOOD_LINE.replace("12.5", "noon")),
+        ValueError,
+        f"{LOG}:1: FLASER: field 11 must be a number, got 'noon'",
+    ),
+    (
+        "log-pose-nan",
+        log_with(GOOD_LINE.replace("1 2 3 4", "1 2 nan 4")),
+        ValueError,
+        f"{LOG}:1: a pose must be finite, got (1.0, 2.0, nan)",
+    ),
+    (
+        "log-odom-short",
+        log_with("ODOM 1 2 3 0 0 0 1.0 robot"),
+        ValueError,
+        f"{LOG}:1: ODOM: must have 10 fields, got 9",
+    ),
+    (
+        "log-no-range-at-all",
+        log_with("FLASER 1 0.0 1 2 3 4 5 6 1.0 robot 1.0"),
+        ValueError,
+        f"{LOG}: must have a reading > 0 unless range_max is given, got none",
+    ),
+    (
+        "log-robotlaser-remissions",
+        log_with("ROBOTLASER1 0 -1.57 3.14 0.1 80 0.01 0 1 2.5 999999999 1 2 3 4 5 6 0 0 0 0 0 1.0 robot 1.0"),
+        ValueError,
+        f"{LOG}:1: ROBOTLASER1: field 10 must count at most 14 values, got 999999999",
+    ),
+    (
+        "log-robotlaser-range-max",
+        log_with("ROBOTLASER1 0 -1.57 3.14 0.1 0 0.01 0 1 2.5 0 1 2 3 4 5 6 0 0 0 0 0 1.0 robot 1.0"),
+        ValueError,
+        f"{LOG}:1: range_max: must be finite and > 0, got 0.0",
+    ),
+    (
+        "log-gzip-truncated",
+        lambda tmp: list(read_log(put(tmp, "run.log", gzip.compress(GOOD_LINE.encode())[:-9]), range_max=5)),
+        ValueError,
+        f"{LOG}:1: must be a whole gzip file, got a broken one: "
+        "Compressed file ended before the end-of-stream marker was reached",
+    ),
+]

@@ -1,0 +1,275 @@
+"""Bad map files, and maps that cannot be written, with the exact message of each."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+from support.bad_input_files import Action, put
+from support.bad_input_grid import GRID
+
+from gpusense.world.map_files import read_map, write_map
+
+GOOD_YAML = {
+    "image": "map.pgm",
+    "resolution": "0.05",
+    "origin": "[0, 0, 0]",
+    "negate": "0",
+    "occupied_thresh": "0.65",
+    "free_thresh": "0.196",
+}
+GOOD_PGM = b"P5 2 1 255\n\x00\xfe"
+
+
+def map_with(content: bytes = GOOD_PGM, name: str = "map.pgm", drop: str = "", **changes: str) -> Action:
+    """Read a map of which the image or some YAML entries differ from a good one."""
+
+    def action(tmp: Path) -> object:
+        put(tmp, name, content)
+        meta = {**GOOD_YAML, "image": name, **changes}
+        return read_map(put(tmp, "map.yaml", "".join(f"{k}: {v}\n" for k, v in meta.items() if k != drop)))
+
+    return action
+
+
+def yaml_with(text: str | bytes) -> Action:
+    """Read a map whose YAML file has this text."""
+    return lambda tmp: read_map(put(tmp, "map.yaml", text))
+
+
+def png(cols: int, rows: int, raster: bytes) -> bytes:
+    """Return a grey PNG file that claims a size, with image data of any length."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = struct.pack(">IIBBBBB", cols, rows, 8, 0, 0, 0, 0)
+    body = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(raster)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def bmp(cols: int, rows: int, compression: int = 0, raster: bytes = b"") -> bytes:
+    """Return a BMP file of 24 bits that claims a size."""
+    info = struct.pack("<IiiHHIIiiII", 40, cols, rows, 1, 24, compression, 0, 0, 0, 0, 0)
+    return b"BM" + struct.pack("<IHHI", 54 + len(raster), 0, 0, 54) + info + raster
+
+
+YAML = "{tmp}/input/map.yaml"
+PGM = "{tmp}/input/map.pgm"
+MAP_CASES = [
+    (
+        "map-missing-yaml",
+        lambda tmp: read_map(tmp / "absent.yaml"),
+        FileNotFoundError,
+        "{tmp}/absent.yaml: must exist, got no such file",
+    ),
+    ("map-folder", lambda tmp: read_map(tmp), ValueError, "{tmp}: must be a regular file, got another kind"),
+    ("map-path-number", lambda tmp: read_map(3), TypeError, "path: must be a path, got 3"),
+    (
+        "map-missing-image",
+        map_with(image="absent.pgm"),
+        FileNotFoundError,
+        "{tmp}/input/absent.pgm: must exist, got no such file",
+    ),
+    (
+        "map-impossible-image-name",
+        map_with(image="a" * 300),
+        FileNotFoundError,
+        "{tmp}/input/" + "a" * 300 + ": must exist, got no such file",
+    ),
+    ("map-image-number", map_with(image="3"), ValueError, f"{YAML}: image: must be a file name, got 3"),
+    *[
+        (
+            f"map-without-{key}",
+            map_with(drop=key),
+            ValueError,
+            f"{YAML}: must have the key {key!r}, got {[k for k in GOOD_YAML if k != key]}",
+        )
+        for key in GOOD_YAML
+    ],
+    ("map-empty-yaml", yaml_with(""), ValueError, f"{YAML}: must hold a YAML mapping, got None"),
+    ("map-yaml-list", yaml_with("[1, 2]"), ValueError, f"{YAML}: must hold a YAML mapping, got [1, 2]"),
+    (
+        "map-yaml-tag",
+        yaml_with("image: !!python/object/apply:os.getcwd []\n"),
+        ValueError,
+        f"{YAML}: must be plain YAML, got an error in line 1: could not determine a constructor for the tag "
+        "'tag:yaml.org,2002:python/object/apply:os.getcwd'",
+    ),
+    (
+        "map-yaml-binary",
+        yaml_with(b"\x00\x01\x02"),
+        ValueError,
+        f"{YAML}: must be plain YAML, got an error: ReaderError",
+    ),
+    (
+        "map-yaml-deep",
+        yaml_with("[" * 5_000),
+        ValueError,
+        f"{YAML}: must be plain YAML, got an error: RecursionError",
+    ),
+    (
+        "map-yaml-huge",
+        yaml_with(b"#" * (1 << 20) + b"\n"),
+        ValueError,
+        f"{YAML}: must be a YAML file of at most 1048576 bytes, got a larger file",
+    ),
+    *[
+        (f"map-resolution-{name}", map_with(resolution=text), ValueError, f"{YAML}: resolution: {message}")
+        for name, text, message in [
+            ("0", "0", "must be finite and > 0, got 0"),
+            ("negative", "-0.05", "must be finite and > 0, got -0.05"),
+            ("nan", ".nan", "must be finite and > 0, got nan"),
+            ("bool", "true", "must be a real number, got True"),
+            ("string", "'0.05'", "must be a real number, got '0.05'"),
+            ("empty", "", "must be a real number, got None"),
+        ]
+    ],
+    (
+        "map-origin-of-two",
+        map_with(origin="[0, 0]"),
+        ValueError,
+        f"{YAML}: origin: must be a list of x, y and yaw, got [0, 0]",
+    ),
+    (
+        "map-origin-inf",
+        map_with(origin="[0, 0, .inf]"),
+        ValueError,
+        f"{YAML}: origin[2]: must be finite, got inf",
+    ),
+    ("map-negate-2", map_with(negate="2"), ValueError, f"{YAML}: negate: must be 0 or 1, got 2"),
+    (
+        "map-thresholds-out-of-order",
+        map_with(occupied_thresh="0.1"),
+        ValueError,
+        f"{YAML}: occupied_thresh: must be > free_thresh = 0.196, got 0.1",
+    ),
+    (
+        "map-threshold-above-1",
+        map_with(occupied_thresh="65"),
+        ValueError,
+        f"{YAML}: occupied_thresh: must be finite and >= 0 and <= 1, got 65",
+    ),
+    (
+        "map-mode-unknown",
+        map_with(mode="binary"),
+        ValueError,
+        f"{YAML}: mode: must be 'trinary', 'scale' or 'raw', got 'binary'",
+    ),
+    (
+        "map-jpeg",
+        map_with(b"\xff\xd8\xff\xe0JFIF"),
+        ValueError,
+        f"{PGM}: must be a PGM, PPM, PNG or BMP image, got a file that begins with b'\\xff\\xd8\\xff\\xe0JFIF'",
+    ),
+    (
+        "map-empty-image",
+        map_with(b""),
+        ValueError,
+        f"{PGM}: must be a PGM, PPM, PNG or BMP image, got a file that begins with b''",
+    ),
+    (
+        "map-pgm-header",
+        map_with(b"P5 2 x 255\n"),
+        ValueError,
+        f"{PGM}: must have a header of width, height and maximum value, got [2]",
+    ),
+    (
+        "map-pgm-no-rows",
+        map_with(b"P5 2 0 255\n"),
+        ValueError,
+        f"{PGM}: must have 1 to 2147483648 pixels, got 0 rows of 2",
+    ),
+    (
+        "map-pgm-maximum-0",
+        map_with(b"P5 2 1 0\n\0\0"),
+        ValueError,
+        f"{PGM}: must have a maximum value of 1 to 65535, got 0",
+    ),
+    (
+        "map-pgm-truncated",
+        map_with(b"P5 2 2 255\n\0\0\0"),
+        ValueError,
+        f"{PGM}: must have a raster of at least 4 bytes, got 3",
+    ),
+    (
+        "map-pgm-claims-terabytes",
+        map_with(b"P5 999999 999999 255\n\0"),
+        ValueError,
+        f"{PGM}: must have 1 to 2147483648 pixels, got 999999 rows of 999999",
+    ),
+    (
+        "map-pgm-claims-gigabytes",
+        map_with(b"P5 40000 40000 65535\n\0"),
+        ValueError,
+        f"{PGM}: must have a raster of at least 3200000000 bytes, got 1",
+    ),
+    (
+        "map-pgm-above-maximum",
+        map_with(b"P5 2 1 100\n\x64\x65"),
+        ValueError,
+        f"{PGM}: every value must be at most 100, got 101",
+    ),
+    (
+        "map-plain-pgm-short",
+        map_with(b"P2 2 2 255\n100 100 100"),
+        ValueError,
+        f"{PGM}: must have 4 values, got 3",
+    ),
+    (
+        "map-plain-pgm-letters",
+        map_with(b"P2 2 2 255\n0 zero 0 0"),
+        ValueError,
+        f"{PGM}: must have a raster of decimal numbers, got something else",
+    ),
+    (
+        "map-png-claims-gigabytes",
+        map_with(png(40_000, 40_000, b"\0" * 100), "map.png"),
+        ValueError,
+        "{tmp}/input/map.png: must be a whole PNG image, got a broken one: "
+        "its data inflates to 100 of 1600040000 bytes",
+    ),
+    (
+        "map-png-one-byte-short",
+        map_with(png(2, 2, b"\0" * 5), "map.png"),
+        ValueError,
+        "{tmp}/input/map.png: must be a whole PNG image, got a broken one: its data inflates to 5 of 6 bytes",
+    ),
+    (
+        "map-bmp-claims-gigabytes",
+        map_with(bmp(20_000, 20_000), "map.bmp"),
+        ValueError,
+        "{tmp}/input/map.bmp: must have at least 1200000054 bytes, got 54",
+    ),
+    (
+        "map-write-no-grid",
+        lambda tmp: write_map([[0]], tmp / "copy.yaml"),
+        TypeError,
+        "grid: must be an OccupancyGrid, got [[0]]",
+    ),
+    (
+        "map-write-suffix",
+        lambda tmp: write_map(GRID, tmp / "copy.pgm"),
+        ValueError,
+        "path: must end in .yaml or .yml, got {tmp}/copy.pgm",
+    ),
+    (
+        "map-write-format",
+        lambda tmp: write_map(GRID, tmp / "copy.yaml", image_format="jpg"),
+        ValueError,
+        "image_format: must be one of 'pgm', 'png', got 'jpg'",
+    ),
+    (
+        "map-write-no-folder",
+        lambda tmp: write_map(GRID, tmp / "absent" / "copy.yaml"),
+        FileNotFoundError,
+        "path: must lie in a folder that exists, got {tmp}/absent/copy.yaml",
+    ),
+    (
+        "map-write-onto-folder",
+        lambda tmp: write_map(GRID, put(tmp, "copy.yaml/file", "").parent),
+        ValueError,
+        "path: must not name a folder, got {tmp}/input/copy.yaml",
+    ),
+]

@@ -1,0 +1,46 @@
+"""Which backends tests run on, and what happens where one is absent."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from gpusense.backends import get_backend
+
+# Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
+BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
+
+
+def required(feature: str) -> bool:
+    """Return whether GPUSENSE_REQUIRE, a comma-separated list, says that a feature must not be skipped."""
+    return feature in [word.strip() for word in os.environ.get("GPUSENSE_REQUIRE", "").split(",")]
+
+
+def skip_or_fail(feature: str, reason: str) -> None:
+    """Skip the test, or fail it where the feature is required."""
+    if required(feature):
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def present(selection: str) -> str:
+    """Return the tested selection string of a backend's name or selection; skip the test where it is absent."""
+    chosen = next((name for name in BACKENDS if name.split(":")[0] == selection), selection)
+    try:
+        get_backend(chosen)
+    except ValueError as error:
+        skip_or_fail(chosen.split(":")[0], str(error))
+    return chosen
+
+
+def on_every_backend(*, on_warp: Callable[..., bool], **cases: Iterable[object]) -> pytest.MarkDecorator:
+    """Parametrize a test over backends and cases, on Warp only over some: it compiles each set of flags anew."""
+    chosen = [
+        (selection, *case)
+        for selection, case in itertools.product(BACKENDS, itertools.product(*cases.values()))
+        if not selection.startswith("warp") or on_warp(**dict(zip(cases, case, strict=True)))
+    ]
+    return pytest.mark.parametrize(("backend", *cases), chosen, indirect=["backend"])

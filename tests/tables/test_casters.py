@@ -1,0 +1,184 @@
+"""All casters: the bits of NumPy on every backend, origins off the map, models, tables' sizes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+from support.caster_world import RANGE, by_name, cast, lists_of, numpy_cast, place, same_bits
+from support.paths import ROOT
+from support.raycast_scenes import FAMILIES, Scene, scenes_of
+from support.raycast_scenes import cast as scene_cast
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.models.scan.densities import log_mixture
+from gpusense.tables import casters
+from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March, Window
+from gpusense.tables.directional import directional_table
+from gpusense.tables.distances import sectors_of
+from gpusense.world import windows
+
+DOCS = ROOT / "docs" / "casters.md"
+KINDS = [
+    *(Exact(), Dda(), Bresenham(), March(), March(0.02), March(1.5, "centre")),
+    *(Cddt(), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),
+]
+CROPPED = [kind for kind in KINDS if not kind.whole]
+POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=by_name)
+def test_every_backend_has_the_bits_of_numpy(kind, backend):
+    for precision, policies in (("float32", POLICIES), ("float64", POLICIES[::3])):
+        for unknown, outside in policies:
+            case = dict(precision=precision, unknown=unknown, outside=outside)
+            same_bits(cast(kind, backend, **case), numpy_cast(kind, **case))
+
+
+@pytest.mark.parametrize("kind", CROPPED, ids=by_name)
+@pytest.mark.parametrize("outside", ["free", "occupied"])
+def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, monkeypatch):
+    """The window is the least that these poses need, since an earlier cloud chose it; obstacles beyond it are near."""
+    rng = np.random.default_rng(1)
+    grid = gs.OccupancyGrid(rng.choice([0, 100], (300, 400), p=[0.998, 0.002]), 1.0)
+    poses = np.column_stack([rng.uniform(208, 209.5, 150), rng.uniform(158, 159.5, 150), rng.uniform(-3, 3, 150)])
+    bearings = np.linspace(-3, 3, 9)
+    caster = functools.partial(gs.RayCaster, grid, 20.0, method=kind, outside=outside)
+    whole = caster(backend="numpy").cast(poses, bearings)
+    monkeypatch.setattr(windows, "SMALLEST_CELLS", 100)
+    cropped = caster(backend=backend)
+    cropped.prepare([[200.5, 150.5, 0.0]])
+    before = cropped._caster.map.region
+    same_bits(cropped.cast(poses, bearings), whole)
+    assert cropped._caster.map.region == before and before.cells < grid.cells.size / 4
+
+
+@pytest.mark.parametrize("kind", [Exact(), Dda(), Bresenham(), March(), Cddt(36), Lookup(8)], ids=by_name)
+def test_origins_far_off_the_map(kind, backend):
+    """Up to what a place can be; rays that lead away, or end before the map, are exactly range_max."""
+    cells = np.zeros((20, 30), int)
+    cells[5:15, 25] = 100
+    grid, limit = gs.OccupancyGrid(cells, 1.0), 1e6
+    caster = gs.RayCaster(grid, limit, method=kind, backend=backend)
+    for far in (1e3, 5e5, 9.99e5, 1e6, 2.2e6, 1e9, 1e12):
+        away = [(far, 8.5, 0.0), (-far, 8.5, np.pi), (15.5, far, np.pi / 2), (far, far, np.pi / 4)]
+        assert (caster.cast(away, [0.0]) == limit).all(), far
+        towards = caster.cast([(far, 8.5, np.pi), (-far, 8.5, 0.0)], [0.0])[:, 0]
+        wanted = np.minimum([far - 26, far + 25], limit)
+        rounded = limit / 65535 if isinstance(kind, Lookup) else 0
+        assert (np.abs(towards - wanted) <= 2 + far * 2.0**-22 + rounded).all(), (far, towards)
+
+
+def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.ndarray:
+    """Return ranges in cells of rays that are given to the last bit."""
+    device, real = get_backend(backend), np.dtype(precision)
+    rows, cols = scene.occupied.shape
+    flags = {kind.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
+    flags |= {"OUTSIDE_OCCUPIED"} if scene.outside_occupied else set()
+    flags |= {"ORIGINS_OUTSIDE"} if not ((scene.cell >= 0) & (scene.cell < (cols, rows))).all() else set()
+    table = kind.prepare(device, Window(scene.occupied, scene.limit, "occupied" if scene.outside_occupied else "free"))
+    flags |= table.flags
+    pose, count = np.concatenate([scene.frac, scene.direction], axis=1), len(scene.cell)
+    result = device.empty(count, real)
+    device.compile("cast_ranges", frozenset(flags))(
+        (1, count), table.buffer, device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real)),
+        device.upload(np.array([[1.0, 0.0]], real)), result, rows, cols, count, 1, *kind.scalars(), scene.limit, 1.0,
+        scene.limit,
+    )  # fmt: skip
+    return device.download(result, np.empty(count, real))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_dda_is_the_exact_caster_to_the_bit(family, backend):
+    """Rays through corners, on edges and along axes, walls that touch at corners, tiny maps, walls at the limit."""
+    for scene in scenes_of(family)[:4]:
+        for precision in ("float32", "float64"):
+            ranges = kernel_cast(scene, Dda(), backend, precision)
+            same_bits(ranges, kernel_cast(scene, Exact(), backend, precision))
+            for sectors in (1, 2, 4):
+                same_bits(ranges, scene_cast(scene, backend, precision, sectors))
+
+
+# ------------------------------------------------------------------------------------------- models, memory, words
+
+
+@pytest.mark.parametrize("kind", [Exact(), Dda(), Bresenham(), March(), Cddt(36), Lookup(24)], ids=by_name)
+def test_beam_model_is_the_mixture_at_the_casters_ranges(kind, backend):
+    grid, poses, bearings = place()
+    z = np.random.default_rng(5).uniform(0, RANGE, len(bearings))
+    z[1], z[2] = np.nan, np.inf
+    p = gs.BeamParameters(0.6, 0.2, 0.1, 0.1, 0.15, 0.7)
+    for precision in ("float32", "float64") if backend == "numpy" else ("float32",):
+        options = dict(backend=backend, precision=precision)
+        model = gs.BeamModel(grid, gs.Scanner(bearings, RANGE), p, caster=kind, **options)
+        ranges = gs.RayCaster(grid, RANGE, method=kind, **options).cast(poses[:100], bearings)
+        same_bits(model.expected_ranges(poses[:100]), ranges)
+        log_p, parts = model.log_likelihood(poses[:100], z, per_beam=True)
+        read = z.astype(precision).astype(float)
+        expected = log_mixture(read, ranges.astype(float), range_max=RANGE, **p.to_dict())
+        expected[:, 1], expected[:, 2] = 0, math.log(p.z_max)
+        eps = np.finfo(precision).eps
+        assert (np.abs(parts - expected) <= 16 * eps * (1 + np.abs(expected))).all()
+        np.testing.assert_allclose(log_p, expected.sum(axis=1), rtol=32 * eps, atol=32 * eps * len(z))
+
+
+def test_table_bytes_are_those_of_the_documentation(backend):
+    grid, poses, bearings = place()
+    rows, cols = grid.shape
+    table = directional_table(grid.obstacles(), 36, pruned=True, outside=False)
+    begins, lines = sum(map(len, lists_of(table, 36).values())), int(table[0])
+    documented = {
+        Exact(): 8 * sectors_of(get_backend(backend), rows, cols) * (rows + 2) * (cols + 2),
+        Dda(): (rows + 2) * (cols + 2),
+        Bresenham(): (rows + 2) * (cols + 2),
+        March(): 4 * rows * cols,
+        Cddt(36, pruned=True): 4 * (2 + 36 * (3 + lines) + rows * cols // 32 + begins),
+        Lookup(12): 2 * 12 * rows * cols,
+    }
+    assert {kind.name for kind in documented} == set(casters.CASTERS)
+    for kind, size in documented.items():
+        caster = gs.RayCaster(grid, RANGE, method=kind, backend=backend)
+        assert caster.table_bytes == 0
+        caster.cast(poses[:2], bearings)
+        assert caster.table_bytes == size, kind
+
+
+@pytest.mark.parametrize("name", ["opencl", "warp"])
+def test_a_table_too_large_for_the_device_is_an_error_that_names_sizes(name, needs, monkeypatch):
+    grid, poses, bearings = place()
+    device, case = get_backend(needs(name)), dict(precision="float32", unknown="free", outside="free")
+    with monkeypatch.context() as patch:
+        patch.setattr(device, "info", dataclasses.replace(device.info, max_buffer=100_000))
+        caster = gs.RayCaster(grid, RANGE, method=Lookup(108), backend=device)
+        model = gs.BeamModel(grid, gs.Scanner(bearings, RANGE), caster=Lookup(108), backend=device)
+        for call in (lambda: caster.cast(poses, bearings), lambda: model.log_likelihood(poses, bearings)):
+            with pytest.raises(MemoryError, match="cannot hold a buffer of 483840 bytes: its largest is 100000"):
+                call()
+        small = gs.RayCaster(grid, RANGE, method=Cddt(8), backend=device).cast(poses, bearings)
+    same_bits(small, cast(Cddt(8), "numpy", **case))
+    # Both recover once there is room.
+    same_bits(caster.cast(poses, bearings), cast(Lookup(108), "numpy", **case))
+    assert np.isfinite(model.log_likelihood(poses, bearings)).all()
+
+
+def test_methods_list_every_caster():
+    methods = {method.name: method for method in gs.RayCaster.methods()}
+    assert list(methods) == ["exact", "dda", "march", "bresenham", "cddt", "lookup"] == list(casters.CASTERS)
+    for name, method in methods.items():
+        assert all(dataclasses.astuple(method)) and method.backends == ("numpy", "opencl", "warp")
+        assert method.error.startswith("exact") == casters.CASTERS[name].exact
+        assert gs.RayCaster(place()[0], RANGE, method=name, backend="numpy").method == casters.CASTERS[name]()
+
+
+def test_the_page_of_casters_mentions_every_method_and_knob():
+    page = DOCS.read_text(encoding="utf-8")
+    rows = {line.split("|")[1].strip(): line for line in page.splitlines() if line.startswith("| `")}
+    for name, kind in casters.CASTERS.items():
+        assert f'`"{name}"`' in rows, name
+        for knob in dataclasses.fields(kind):
+            assert f"`{knob.name}`" in rows[f'`"{name}"`'], (name, knob.name)
+    assert "sensor_table=" in page and "save_table(" in page

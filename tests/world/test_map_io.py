@@ -1,0 +1,96 @@
+"""ROS maps: nav2's rules for grey levels and thresholds, and the maps that robots recorded."""
+
+from __future__ import annotations
+
+import pytest
+from support.map_files import CELLS, GREYS, pgm, yaml_text
+
+from gpusense.world.map_files import read_map
+
+
+def test_trinary_by_nav2(place):
+    grid = read_map(place(pgm(GREYS), resolution=0.1, origin=[1.5, -2.5, 0.25]))
+    assert grid.cells.tolist() == CELLS
+    assert grid.resolution == 0.1
+    assert grid.origin == (1.5, -2.5, 0.25)
+    assert grid.occupied_threshold == 65
+
+
+def test_the_occupied_threshold_is_passed_on(place):
+    assert read_map(place(pgm(GREYS)), occupied_threshold=40).occupied_threshold == 40
+
+
+@pytest.mark.parametrize(("free_thresh", "cell"), [(0.196, -1), (0.25, 0)])
+def test_grey_205_depends_on_the_threshold(place, free_thresh, cell):
+    assert read_map(place(pgm([[205]]), free_thresh=free_thresh)).cells.tolist() == [[cell]]
+
+
+def test_thresholds_are_inclusive(place):
+    # p = 153/255 = 0.6 and p = 51/255 = 0.2 in float64.
+    file = place(pgm([[102, 103, 203, 204]]), occupied_thresh=0.6, free_thresh=0.2)
+    assert read_map(file).cells.tolist() == [[100, -1, -1, 0]]
+
+
+def test_negate(place):
+    assert read_map(place(pgm([[0, 255, 100]]), negate=1)).cells.tolist() == [[0, 100, -1]]
+    assert read_map(place(pgm([[0, 255, 100]]), negate=True)).cells.tolist() == [[0, 100, -1]]
+
+
+def test_scale_rounds_half_up(place):
+    # With thresholds 0 and 1 the cell is round(100 p); 0.1 of 20 levels gives halves: p = 0.005 k.
+    grid = read_map(place(pgm([[200, 199, 198, 100, 1, 0]], 200), mode="scale", free_thresh=0, occupied_thresh=1))
+    assert grid.cells.tolist() == [[0, 1, 1, 50, 100, 100]]
+    grid = read_map(place(pgm([[255, 128, 0]]), mode="SCALE", free_thresh=0.25, occupied_thresh=0.75))
+    assert grid.cells.tolist() == [[0, round(100 * (127 / 255 - 0.25) / 0.5), 100]]
+
+
+def test_raw_ignores_thresholds_and_negate(place):
+    grid = read_map(place(pgm([[0, 1, 65, 100, 101, 128, 255]]), mode="raw", negate=1))
+    assert grid.cells.tolist() == [[0, 1, 65, 100, -1, -1, -1]]
+
+
+def test_numbers_as_yaml_1_2_writes_them(place):
+    file = place(pgm(GREYS))
+    file.write_text(file.read_text().replace("resolution: 0.05", "resolution: 5e-2"))
+    assert read_map(file).resolution == 0.05
+
+
+def test_an_image_elsewhere(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "map.pgm").write_bytes(pgm(GREYS))
+    for image in ("images/map.pgm", str(tmp_path / "images" / "map.pgm")):
+        (tmp_path / "map.yaml").write_text(yaml_text(image))
+        assert read_map(str(tmp_path / "map.yaml")).cells.tolist() == CELLS
+
+
+def recorded_maps(folder):
+    files = sorted([*folder.glob("*/*.yaml"), *folder.glob("*/derived_maps/*.yaml")])
+    return [file for file in files if "image:" in file.read_text()]
+
+
+def test_every_recorded_map_opens(data_dir):
+    files = recorded_maps(data_dir)
+    assert len(files) >= 24
+    for file in files:
+        grid = read_map(file)
+        assert 0.001 < grid.occupied.mean() < 0.9, file
+        assert grid.free.any(), file
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "resolution", "origin"),
+    [
+        ("stata_basement", (1300, 1730), 0.0504, (25.9, 48.5, 3.14)),
+        ("ac109_1", (1088, 1088), 0.02, (-12.883875762271897, -4.716959961924749, 0.0)),
+        ("synthetic.map", (1024, 1024), 0.05, (0.0, 0.0, 0.0)),
+        ("columbia", (350, 435), 0.05, (-5.70654, -2.020793, 0.0)),
+    ],
+)
+def test_recorded_maps(data_dir, name, shape, resolution, origin):
+    grid = read_map(data_dir / "ros_maps" / f"{name}.yaml")
+    assert (grid.shape, grid.resolution, grid.origin) == (shape, resolution, origin)
+
+
+def test_recorded_unknown_depends_on_the_threshold(data_dir):
+    assert not read_map(data_dir / "ros_maps" / "depot.yaml").unknown.any()
+    assert read_map(data_dir / "ros_maps" / "tb3_sandbox.yaml").unknown.any()

@@ -1,6 +1,6 @@
 """Prove a device: compute a small scene with each family of kernels and compare with NumPy.
 
-The scene is an ordinary one, so that the kernels compiled here are those of a first call with a scan, and serve it.
+The scene is an ordinary one, so the kernels that the proof compiles are those of the first call with a scan.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _TIMED_SECONDS = 0.05
 
 
 class Scene:
-    """A room with pillars and an unknown corner, a scan, and poses of which some lie in walls."""
+    """A room with pillars and an unknown corner, a scan, and poses, some of them in walls."""
 
     def __init__(self) -> None:
         random = np.random.default_rng(0)
@@ -48,11 +48,11 @@ class Scene:
 
 
 def prove(job: dict[str, Any], report: Report) -> None:
-    """Try each family of kernels that a device has; stop at the first that computes wrong numbers.
+    """Run each family of kernels that a device has; stop at the first that computes wrong numbers.
 
     Args:
-        job: ``info`` describes the device, with the lanes to try; ``drivers`` are those that OpenCL is to load.
-        report: Gets the family that begins, what was wrong, and the end.
+        job: ``info`` describes the device, with the lanes to try; ``drivers`` names the drivers that OpenCL loads.
+        report: Called with the family that begins, with the first difference above its tolerance, and at the end.
     """
     info = info_of(job)
     if info.backend == "opencl" and "drivers" in job:
@@ -61,7 +61,7 @@ def prove(job: dict[str, Any], report: Report) -> None:
     report({"begin": SCALAR})
     device = open_device(info)
     models = VECTORS if info.lanes > 1 else SCALAR
-    # In float32 too poses are placed in float64 where a device has it.
+    # Poses are placed in float64 where a device has it, for float32 models too.
     checks = [(SCALAR, _tables), *([(FLOAT64, _float64)] if info.float64 else []), (models, _models)]
     for family, check in checks:
         report({"begin": family})
@@ -73,13 +73,13 @@ def prove(job: dict[str, Any], report: Report) -> None:
 
 
 def _tables(scene: Scene, device: Backend, numpy: Backend) -> str:
-    """Compare what is made of a map: kernels that have no bodies in vectors."""
-    mine, theirs = (distance_transform(scene.obstacles, backend=backend) for backend in (device, numpy))
-    return _difference(TOLERANCES["distance transform"], mine, theirs)
+    """Compare distance transforms, whose kernels have no bodies in vectors."""
+    computed, expected = (distance_transform(scene.obstacles, backend=backend) for backend in (device, numpy))
+    return _difference(TOLERANCES["distance transform"], computed, expected)
 
 
 def _models(scene: Scene, device: Backend, numpy: Backend) -> str:
-    """Compare both models of a scan in float32; the beam model casts its rays itself."""
+    """Compare the scores of both scan models in float32; the beam model's scores include its ray casting."""
     tolerance = scan_tolerance("float32", _BEAMS).twice()
     for kind in (LikelihoodFieldModel, BeamModel):
         models = [kind(scene.grid, scene.scanner, backend=backend) for backend in (device, numpy)]
@@ -90,7 +90,7 @@ def _models(scene: Scene, device: Backend, numpy: Backend) -> str:
 
 
 def _rate(scene: Scene, device: Backend) -> float:
-    """Return how many scans per second the device scores: the geometric mean of both models' best calls."""
+    """Return the scans per second that the device scores: the geometric mean over both models of their best call."""
     poses = np.resize(scene.poses, (_TIMED_POSES, 3))
     best = []
     for kind in (LikelihoodFieldModel, BeamModel):
@@ -116,9 +116,9 @@ def _float64(scene: Scene, device: Backend, numpy: Backend) -> str:
     return _difference(TOLERANCES["float64 ranges"].twice(), *ranges)
 
 
-def _difference(tolerance: Tolerance, mine: np.ndarray, theirs: np.ndarray) -> str:
-    """Return how far results lie apart; empty where the tolerance allows it."""
-    found = tolerance.difference(mine, theirs)
-    if found <= tolerance.value:
+def _difference(tolerance: Tolerance, computed: np.ndarray, expected: np.ndarray) -> str:
+    """Describe the difference of results; return an empty text where the tolerance allows it."""
+    difference = tolerance.difference(computed, expected)
+    if difference <= tolerance.value:
         return ""
-    return f"{tolerance.name}: {found:.4g} {tolerance.unit}, allowed {tolerance.value:.3g}"
+    return f"{tolerance.name}: {difference:.4g} {tolerance.unit}, allowed {tolerance.value:.3g}"

@@ -16,6 +16,7 @@ import gpusense as gs
 from gpusense.evaluation.tolerances import TOLERANCES, differing
 from gpusense.interface.launches import flags_of
 from gpusense.models import run
+from gpusense.models.scan import tiles
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -48,7 +49,7 @@ def test_bound_calls_that_add_up_strands(gathering, monkeypatch):
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     found = []
     for enough in (1 << 21, 1):
-        monkeypatch.setattr(places, "_ENOUGH", enough)
+        monkeypatch.setattr(tiles, "ENOUGH", enough)
         call = BEAM(GRID, NEAR, backend=gathering[0]).bind(poses, ranges)
         assert ("STRANDED" in flags_of(call._program())) == (enough == 1)
         found.append(call().numpy().copy())

@@ -1,14 +1,12 @@
-"""Where am I, if I see beacons? Ranges, bearings and both, without uncertainty and with it; writes a picture."""
+"""Where am I, if I see beacons? Locate a robot from ranges, bearings and both, and draw the solutions."""
 
 import sys
 
 import numpy as np
 
 import gpusense as gs
-from gpusense.plots import drawing as plots
-from gpusense.plots import positions as position_plots
 
-# Made-up beacons, and what a robot at a pose that we pretend not to know measures of them.
+# Beacons, and a robot's measurements of them at a pose that the functions below do not know.
 beacons = np.array([(1.0, 1.0), (8.0, 2.0), (4.5, 7.0)])
 truth = np.array([4.0, 3.5, 0.6])
 offset = beacons - truth[:2]
@@ -38,25 +36,25 @@ scenes = {
 }
 
 extent = (-1.0, 10.0, -3.0, 8.0)
-points = position_plots.tile_centers(extent, 300)
-figure = plots.new_figure(12.6, 7.8)
+points = gs.plots.tile_centers(extent, 300)
+figure = gs.plots.new_figure(12.6, 7.8)
 axes = figure.subplots(2, 3)
 for (certain, uncertain), (title, (count, fix, measured, noise)) in zip(axes.T, scenes.items(), strict=True):
     measured = {name: values[:count] for name, values in measured.items()}
-    position_plots.set_view(certain, extent, f"{title}, no uncertainty")
-    position_plots.draw_solution_set(certain, beacons[:count], **measured)
-    log_p = position_plots.position_log_density(points, beacons[:count], **measured, **noise)
-    position_plots.set_view(uncertain, extent, f"{title}, with uncertainty")
-    image = position_plots.draw_position_density(uncertain, log_p, extent)
-    plots.add_colour_bar(uncertain, image, "log p(z | x, y) below its maximum [nats]")
+    gs.plots.set_view(certain, extent, f"{title}, no uncertainty")
+    gs.plots.draw_solution_set(certain, beacons[:count], **measured)
+    log_p = gs.plots.position_log_density(points, beacons[:count], **measured, **noise)
+    gs.plots.set_view(uncertain, extent, f"{title}, with uncertainty")
+    image = gs.plots.draw_position_density(uncertain, log_p, extent)
+    gs.plots.add_colour_bar(uncertain, image, "log p(z | x, y) below its maximum [nats]")
     for ax in (certain, uncertain):
-        position_plots.draw_beacons(ax, beacons[:count])
-    position_plots.draw_fix(certain, fix, length=1.2, ellipses=False)
-    position_plots.draw_fix(uncertain, fix)
+        gs.plots.draw_beacons(ax, beacons[:count])
+    gs.plots.draw_fix(certain, fix, length=1.2, ellipses=False)
+    gs.plots.draw_fix(uncertain, fix)
     print(f"{title}: {fix.explain()}")
     for solution, covariance in zip(fix.solutions, fix.covariance, strict=True):
         print("   ", solution.round(3), "+-", np.sqrt(np.diag(covariance)).round(3))
 
 path = sys.argv[1] if len(sys.argv) > 1 else "beacons.png"
-plots.save(figure, path)
+gs.plots.save(figure, path)
 print("written:", path)

@@ -1,12 +1,11 @@
-"""Where is the robot? A laser, a compass, a position fix and a bumper, each of them vague, and all together."""
+"""Where is the robot? Combine a laser, a compass, a position fix and a bumper, each of them vague."""
 
 import numpy as np
 
 import gpusense as gs
-from gpusense.evaluation import worlds
 
 rng = np.random.default_rng(7)
-grid = worlds.building()
+grid = gs.worlds.building()
 
 # A small laser, and models of four sensors. Sensors are independent given the pose, so their log-likelihoods add up.
 scanner = gs.Scanner(np.linspace(-np.pi, np.pi, 12, endpoint=False), range_max=4.0)
@@ -17,29 +16,29 @@ compass = gs.HeadingModel(gs.HeadingParameters(sigma=0.2, z_hit=0.9, z_rand=0.1)
 fix = gs.PositionModel(gs.PositionParameters(sigma=2.0, z_hit=0.9, z_rand=0.1, region=(0.0, 0.0, 30.0, 20.0)))
 bumper = gs.BumperModel(grid, 0.25, gs.BumperParameters(p_contact=0.95, p_false=0.001, sigma=0.02))
 
-# A pose that we pretend not to know, where the robot touches something, and what it measures there.
-poses = worlds.cloud_uniform(grid, 200_000, rng)
+# A true pose at which the robot touches an obstacle, and its measurements there.
+poses = gs.worlds.cloud_uniform(grid, 200_000, rng)
 touching = poses[np.argmax(bumper.log_likelihood(poses, True) > np.log(0.9))]
 truth = np.array([touching[0], touching[1], 0.7])
 measured = {
     "bumper": (bumper, True),
     "compass": (compass, truth[2] + rng.normal(0, 0.2)),
     "position fix": (fix, truth[:2] + rng.normal(0, 2.0, 2)),
-    "laser": (laser, worlds.simulate_scan(grid, scanner, truth, noise, rng)),
+    "laser": (laser, gs.worlds.simulate_scan(grid, scanner, truth, noise, rng)),
 }
 
 
 def spread(log_p: np.ndarray) -> str:
-    """Median distance and turn from the truth by weight, and how many particles carry the weight."""
+    """Return the weighted medians of the errors of position and heading, and the effective number of particles."""
     weights = np.exp(log_p - log_p.max())
     weights /= weights.sum()
-    away = np.hypot(*(poses[:, :2] - truth[:2]).T)
-    turn = np.abs(np.angle(np.exp(1j * (poses[:, 2] - truth[2]))))
-    error, turned = (
-        each[order[np.searchsorted(np.cumsum(weights[order]), 0.5)]]
-        for each, order in ((away, np.argsort(away)), (turn, np.argsort(turn)))
+    distances = np.hypot(*(poses[:, :2] - truth[:2]).T)
+    turns = np.abs(np.angle(np.exp(1j * (poses[:, 2] - truth[2]))))
+    position, heading = (
+        errors[order[np.searchsorted(np.cumsum(weights[order]), 0.5)]]
+        for errors, order in ((distances, np.argsort(distances)), (turns, np.argsort(turns)))
     )
-    return f"{error:6.2f} m {np.degrees(turned):7.1f} deg {1 / (weights @ weights):10.0f}"
+    return f"{position:6.2f} m {np.degrees(heading):7.1f} deg {1 / (weights @ weights):10.0f}"
 
 
 print(f"{'':24}{'position':>8} {'heading':>11} {'effective particles':>20}")

@@ -1,4 +1,4 @@
-"""A made-up building, scans simulated in it, and clouds of particles."""
+"""Generate a building, simulate scans in it, and draw poses and clouds of particles."""
 
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, sample_readings, simulate_scan
 

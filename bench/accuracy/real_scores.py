@@ -20,9 +20,8 @@ from typing import Any
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.commands.score import summary
 from gpusense.evaluation import selftest
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, Cloud, score_log
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, ParticleSampler, score_log, summary
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -83,7 +82,7 @@ def scores(data: Path, name: str, kind: str, arguments: argparse.Namespace) -> d
     }[kind]  # fmt: skip
     names = present()
     fast = [backend for backend in names if backend != "numpy"]
-    cloud = Cloud(arguments.particles)
+    cloud = ParticleSampler(arguments.particles)
 
     def score(backends: list[str], scans: list) -> tuple[list, list]:
         models = [make(grid, scanner, parameters, backend=b, temperature=arguments.temperature) for b in backends]

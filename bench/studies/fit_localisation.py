@@ -23,7 +23,7 @@ import numpy as np
 import gpusense as gs
 from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, Cloud, score_log
+from gpusense.evaluation.scoring import BEAM_PARAMETERS, ParticleSampler, score_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -45,7 +45,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
         "fitted": held_out.softened(fit.parameters, fit.hits + fit.max_readings), **held_out.peer_parameters(),
         "gpusense's defaults": gs.BeamParameters(), "gpusense score's": BEAM_PARAMETERS,
     }  # fmt: skip
-    cloud, rows = Cloud(arguments.particles), []
+    cloud, rows = ParticleSampler(arguments.particles), []
     for origin, parameters in candidates.items():
         row: dict[str, Any] = {"parameters_of": origin, "parameters": parameters.to_dict()}
         for temperature in TEMPERATURES:

@@ -1,4 +1,4 @@
-"""``gpusense bench``: error against run time of every caster and model, on every device, in one report."""
+"""Run ``gpusense bench``: measure error against run time of every caster and model, on every device."""
 
 from __future__ import annotations
 
@@ -9,17 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.common import (
-    BACKEND_HELP,
-    add_json,
-    machine,
-    machine_line,
-    open_backends,
-    positive_number,
-    print_json,
-    print_table,
-    whole_number,
-)
+from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
+from gpusense.commands.output import print_json, print_table
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.benchmark.candidates import Candidate
@@ -33,22 +25,23 @@ PROBLEMS = ("ranges", "beam", "field")
 PRECISIONS = ("float32", "float64")
 DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
 QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 20, "seed": 0}
-# Seconds of measuring after which a quick run begins nothing more, and the longest that it builds a table.
+# Measuring time after which a quick run begins no further point, and its longest time to build a table [s].
 _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
 
 _EPILOG = """\
-Every method with every value of its knob computes the same ranges and scores the same scan, for particles all over the
-map ('global') and around the true pose ('tracking'). Errors are against the exact caster and the models in float64.
+Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
+whole map ('global') and around the true pose ('tracking'). Errors are against the exact caster and the float64 models.
 
-Scenes: 'building' and 'clutter' are generated. With GPUSENSE_DATA naming the folder of recorded data there are also
-'basement', 'spielberg', 'willow' and 'intel'; --map adds others. Outside candidates, such as numba's, come from
-bench/speed/baselines.py of a checkout or from the file that --peers names, which is then executed.
+Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folder of recorded data, 'basement',
+'spielberg', 'willow' and 'intel' are added; --map adds others. Outside candidates, such as numba's, come from
+bench/speed/baselines.py of a checkout or from the file that --peers names; the file is executed.
 
---output DIR gets report.json, report.md and the diagrams: time over error, a curve for each method traced by its knob,
-exact ones in the strip on the left, failed ones in that on the right. Failures are listed with their reasons.
+--output DIR receives report.json, report.md and the diagrams: time over error, with a curve for each method traced by
+its knob, exact points in the strip on the left, failed points in the strip on the right. Failures are listed with
+their reasons.
 
---compare OLD measures what the old report measured, with its numbers of particles and beams and its seed unless others
-are given, and says what got slower or less exact; --compare OLD NEW compares two reports and measures nothing.
+--compare OLD repeats the measurements of the old report, with its particles, beams and seed unless options change
+them, and lists points that became slower or less exact; --compare OLD NEW compares two reports without measuring.
 
 Exit codes: 0 success, 1 something is less exact than in the old report, 2 bad input.
 
@@ -63,31 +56,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.epilog = _EPILOG
     add = parser.add_argument
-    add("--output", type=Path, metavar="DIR", help="write report and diagrams there; the folder is made if absent")
+    add("--output", type=Path, metavar="DIR", help="folder for report and diagrams, created if absent")
     add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
     add("--slower", type=positive_number, default=1.3, metavar="F",
-        help="with --compare, slower is more than F times the old times (default: %(default)s)")  # fmt: skip
-    add("--quick", action="store_true", help="small maps, few values of the knobs, float32: a minute, and compiling")
-    add("--scene", action="append", metavar="NAME", help="a scene; may be given several times (default: all)")
+        help="with --compare, factor of the times above which a point is slower (default: %(default)s)")  # fmt: skip
+    add("--quick", action="store_true", help="small maps, few values of the knobs, float32: a minute plus compiling")
+    add("--scene", action="append", metavar="NAME", help="a scene; may be repeated (default: all)")
     add("--map", action="append", default=[], type=Path, metavar="YAML",
-        help="a map_server map as a further scene; may be given several times")  # fmt: skip
+        help="a map_server map as a further scene; may be repeated")  # fmt: skip
     add("--backend", action="append", metavar="DEVICE",
-        help=f"{BACKEND_HELP}; may be given several times (default: all present except simulators)")  # fmt: skip
-    add("--problem", action="append", choices=PROBLEMS, help="what is computed (default: all)")
+        help=f"{BACKEND_HELP}; may be repeated (default: all present except simulators)")  # fmt: skip
+    add("--problem", action="append", choices=PROBLEMS, help="a problem; may be repeated (default: all)")
     add("--method", action="append", metavar="NAME",
-        help="a method, such as exact, march or field; may be given several times (default: all)")  # fmt: skip
-    add("--precision", action="append", choices=PRECISIONS, help="(default: both; with --quick float32)")
+        help="a method, such as exact, march or field; may be repeated (default: all)")  # fmt: skip
+    add("--precision", action="append", choices=PRECISIONS,
+        help="a precision; may be repeated (default: both; with --quick float32)")  # fmt: skip
     add("--particles", type=whole_number(low=1), metavar="N",
-        help="of a timed call; NumPy gets an eighth (default: 4096 on a GPU, 1024 on a processor)")  # fmt: skip
-    add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are taken (default: 512)")
-    add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="of the scanner (default: 360)")
-    add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls of a point (default: 20)")
+        help="particles of a timed call; NumPy gets an eighth (default: GPU 4096, processor 1024)")  # fmt: skip
+    add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are computed (default: 512)")
+    add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
+    add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20)")
     add("--build-limit", type=positive_number, metavar="S",
         help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
     add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
     add("--no-peers", action="store_true", help="no outside candidates")
-    add("--time", choices=("call", "launch"), default="call", help="the time of diagrams (default: %(default)s)")
-    add("--seed", type=whole_number(low=0), metavar="N", help="of maps, scans and particles (default: 0)")
+    add("--time", choices=("call", "launch"), default="call", help="time axis of the diagrams (default: %(default)s)")
+    add("--seed", type=whole_number(low=0), metavar="N", help="seed of maps, scans and particles (default: 0)")
     add_json(parser)
 
 
@@ -109,19 +103,19 @@ def run(args: argparse.Namespace) -> int:
         new = document(plan, outcome, _arguments(args, plan), machine(), absent)
         if args.output is not None:
             write_report(args.output, new, to_json(new), args.time)
-    found = None if old is None else comparing.compare(old, new, args.slower)
+    comparison = None if old is None else comparing.compare(old, new, args.slower)
     if args.json:
-        print_json(new if found is None else {"comparison": vars(found), "report": new if measured else None})
+        print_json(new if comparison is None else {"comparison": vars(comparison), "report": new if measured else None})
     else:
         if measured:
             _print(new, args.output)
-        if found is not None:
-            print("\n".join(["", *comparing.lines_of(found, args.slower)]))
-    return LESS_EXACT if found is not None and found.less_exact else 0
+        if comparison is not None:
+            print("\n".join(["", *comparing.lines_of(comparison, args.slower)]))
+    return LESS_EXACT if comparison is not None and comparison.less_exact else 0
 
 
 def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
-    """The old report, and the new one where two are given."""
+    """Read the reports of ``--compare``: the old one and the new one, or None."""
     from gpusense.evaluation.benchmark.compare import read_report
 
     if not args.compare:
@@ -135,10 +129,14 @@ def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str,
 
 
 def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[Plan, list[str]]:
-    """What is run, and what is absent.
+    """Make the plan of a run, and list absent devices and candidates with their reasons.
+
+    Args:
+        args: Arguments of the command.
+        old: The report of ``--compare``, whose arguments are defaults, or None.
 
     Raises:
-        ValueError: an option names what is not here.
+        ValueError: an option names a scene, method or device that is not present.
     """
     from gpusense.evaluation.benchmark.candidates import candidates
     from gpusense.evaluation.benchmark.runner import Plan
@@ -151,9 +149,8 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
         for name, default in (QUICK if quick else DEFAULTS).items()
     }
     problems = args.problem or PROBLEMS
-    own = candidates(problems, quick=quick)
     outside, absent = _outside(args, problems)
-    chosen = own + outside
+    chosen = candidates(problems, quick=quick) + outside
     if args.method:
         names = list(dict.fromkeys(candidate.method for candidate in chosen))
         for method in args.method:
@@ -173,35 +170,35 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
 
 
 def _names(old: Mapping[str, Any] | None, args: argparse.Namespace) -> list[str] | None:
-    """The scenes of an old report that this run can make too."""
+    """Return the scenes of an old report that are available here."""
     from gpusense.evaluation.benchmark.scenes import sources
 
     if old is None or args.map:
         return None
-    here = [source.name for source in sources(quick=bool(old["arguments"].get("quick")))]
-    return [scene["name"] for scene in old["scenes"] if scene["name"] in here] or None
+    available = [source.name for source in sources(quick=bool(old["arguments"].get("quick")))]
+    return [scene["name"] for scene in old["scenes"] if scene["name"] in available] or None
 
 
 def _outside(args: argparse.Namespace, problems: Sequence[str]) -> tuple[list[Candidate], list[str]]:
-    """Outside candidates that can run, and why others cannot."""
+    """Return the outside candidates that can run, and the reasons of those that cannot."""
     from gpusense.evaluation.benchmark import peers
 
     if args.no_peers and args.peers is not None:
         raise ValueError("--no-peers: must not be given together with --peers")
     file = None if args.no_peers else args.peers or peers.default_file()
-    found = [] if file is None else peers.load(file, problems)
-    reasons = dict.fromkeys(f"{candidate.outside}: {candidate.missing}" for candidate in found if candidate.missing)
-    return [candidate for candidate in found if not candidate.missing], list(reasons)
+    listed = [] if file is None else peers.load(file, problems)
+    reasons = dict.fromkeys(f"{candidate.outside}: {candidate.missing}" for candidate in listed if candidate.missing)
+    return [candidate for candidate in listed if not candidate.missing], list(reasons)
 
 
-def _absent_devices(asked: Sequence[str] | None) -> list[str]:
+def _absent_devices(selections: Sequence[str] | None) -> list[str]:
     from gpusense.backends import devices
 
-    return [] if asked else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
+    return [] if selections else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
 
 
 def _arguments(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
-    """The arguments that shape the figures; of files only their names."""
+    """Return the arguments that affect the measurements; of files only their names."""
     return {
         "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],
         "particles": plan.particles, "checked": plan.checked, "beams": plan.beams, "repeats": plan.repeats,
@@ -212,14 +209,21 @@ def _arguments(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
 
 
 def _check_folder(folder: Path) -> None:
-    """See that the report can be written, leaving no trace."""
+    """Check that the report can be written, without creating a file."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--output: must be a folder, got a file: {folder}")
     check_writable((folder if folder.exists() else folder.parent) / "report.json")
 
 
 def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str) -> None:
-    """Write the diagrams, then the report as Markdown and as JSON, each file whole or not at all."""
+    """Write the diagrams, then the report as Markdown and as JSON, each file atomically.
+
+    Args:
+        folder: The folder, created if absent.
+        report: The report.
+        text: The report as JSON.
+        timing: Time of the diagrams, ``"call"`` or ``"launch"``.
+    """
     from gpusense.evaluation.benchmark.profiles import profiles_of
     from gpusense.evaluation.benchmark.report import markdown
     from gpusense.plots.benchmark import MEASURES, Style, profile_figure, work_precision
@@ -229,10 +233,10 @@ def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str
     points, images = report["points"], []
     style = Style.of(points)
     for problem, cloud in dict.fromkeys((point["problem"], point["cloud"]) for point in points):
-        own = [point for point in points if (point["problem"], point["cloud"]) == (problem, cloud)]
+        group = [point for point in points if (point["problem"], point["cloud"]) == (problem, cloud)]
         for measure in MEASURES[problem]:
             name = f"{problem}-{measure[0]}-{cloud}.png"
-            save(work_precision(own, style, measure, timing), folder / name)
+            save(work_precision(group, style, measure, timing), folder / name)
             images.append((f"{problem}, {cloud} cloud: time over {measure[3]}", name))
     profiles = profiles_of(points, timing)
     if profiles:

@@ -1,4 +1,4 @@
-"""The command line: ``gpusense devices``, ``gpusense demo`` and the others."""
+"""Run the command line: ``gpusense devices``, ``gpusense demo`` and the other commands."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import NoReturn
 
 from gpusense._version import __version__
 
-# In the order of the help: each is a module of gpusense.commands.
+# Modules of gpusense.commands, in the order of the help.
 COMMANDS = ("devices", "selftest", "demo", "score", "fit", "landmarks", "bench")
 
 BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-# Set in the environment, it lets an exception through: for developers.
+# Environment variable that lets exceptions through with their traceback, for developers.
 TRACEBACK = "GPUSENSE_TRACEBACK"
 
 _DESCRIPTION = """\
@@ -28,23 +28,23 @@ How likely is this scan, if the robot stands here? For thousands of poses at onc
 
 _EPILOG = """\
 start here:
-  gpusense demo               localise a robot in a made-up building, and draw it
-  gpusense devices            what gpusense can run on, and what is missing for more
-  gpusense COMMAND --help     what a command does, its options and an example
+  gpusense demo               localise a robot in a generated building, and draw the result
+  gpusense devices            list the devices, and the remedy for each that is absent
+  gpusense COMMAND --help     describe a command and its options, with an example
 
-Exit codes: 0 success, 2 bad input (one line on standard error says what), 130 interrupted."""
+Exit codes: 0 success, 2 bad input (described in one line on standard error), 130 interrupted."""
 
 
 class Parser(argparse.ArgumentParser):
     """A parser that reports an error as one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the message without the usage and exit."""
+        """Print the message without the usage, and exit."""
         self.exit(BAD_INPUT, _error_line(message))
 
 
 class Layout(argparse.RawDescriptionHelpFormatter):
-    """Text as it is written, and room for the longest command's name, whose indentation argparse forgets."""
+    """Help with verbatim texts, and a column wide enough for indented command names, which argparse miscounts."""
 
     def add_argument(self, action: argparse.Action) -> None:
         """Add an argument to the help."""
@@ -58,14 +58,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        argv: What follows the program's name; ``sys.argv[1:]`` by default.
+        argv: Arguments after the program's name; ``sys.argv[1:]`` by default.
 
     Returns:
-        The exit code: 0 success, 2 bad input, 130 interrupted, 141 when the reader of standard output went away, or
-        what the command says.
+        The exit code: 0 success, 2 bad input, 130 interrupted, 141 when the reader of standard output is gone, or the
+        command's own.
     """
     for stream in (sys.stdout, sys.stderr):
-        # A device's name may hold what the terminal's encoding does not.
+        # A device's name may have characters outside the terminal's encoding.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _settle() -> None:
-    """See that standard output, which Python flushes at its end, does not fail there once more."""
+    """Flush standard output, and redirect it if that fails, so that Python's flush at exit succeeds."""
     try:
         print(end="", flush=True)
     except OSError:
@@ -96,7 +96,7 @@ def _settle() -> None:
 
 
 def _dispatch(argv: list[str]) -> int:
-    # A command that does not import must not take the others along.
+    # Import only the chosen command, so that an import error in another one does not affect it.
     names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
     parser = _build(names)
     try:
@@ -111,7 +111,7 @@ def _dispatch(argv: list[str]) -> int:
 
 
 def _build(names: Sequence[str]) -> Parser:
-    """The parser of these commands."""
+    """Build the parser of these commands."""
     layout = Layout
     parser = Parser(
         prog="gpusense", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=layout, allow_abbrev=False
@@ -120,16 +120,16 @@ def _build(names: Sequence[str]) -> Parser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name in names:
         module = importlib.import_module(f"gpusense.commands.{name}")
-        own = commands.add_parser(
+        command = commands.add_parser(
             module.NAME, help=module.HELP, description=module.HELP, formatter_class=layout, allow_abbrev=False
         )
-        module.add_arguments(own)
-        own.set_defaults(run=module.run)
+        module.add_arguments(command)
+        command.set_defaults(run=module.run)
     return parser
 
 
 def _message(error: Exception) -> str:
-    """What an exception says, without the error numbers of the operating system."""
+    """Return an exception's message, without the error numbers of the operating system."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     if isinstance(error, MemoryError) and not str(error):

@@ -1,37 +1,40 @@
-"""``gpusense demo``: a noisy scan in a made-up building, scored at many poses on everything that is here, and drawn."""
+"""Run ``gpusense demo``: score a noisy scan in a generated building at many poses, on every device, and draw it."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gpusense import plots
+from gpusense._util.files import check_writable
 from gpusense._util.progress import progress
 from gpusense.backends import Backend, Selection
-from gpusense.commands import common
-from gpusense.commands.common import grouped
+from gpusense.commands import arguments, output
+from gpusense.commands.output import grouped
 from gpusense.evaluation import worlds
+from gpusense.evaluation.machine import machine
 from gpusense.evaluation.scoring import evaluated_beams
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.plots import drawing as plots
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Scanner
 
 NAME = "demo"
-HELP = "Localise a robot in a made-up building with every backend, compare them, and draw the result."
+HELP = "Localise a robot in a generated building with every backend, compare them, and draw the result."
 
 _DESCRIPTION = """\
-Makes a building and a noisy laser scan in it, and asks for many poses how likely the scan would be there:
-log P(z | x, m) by the beam model and by the likelihood field. Every backend found here does the same work; a table
-compares their times, their distance from the float64 NumPy reference and where they rank the true pose. A picture
-shows the building, the scan at the best pose, the particles and the likelihood all over the map."""
+Generates a building and a noisy laser scan in it, and computes for many poses how likely the scan is:
+log P(z | x, m) by the beam model and by the likelihood field. Every backend present does the same work; a table
+compares their times, their errors against the float64 NumPy reference and their ranks of the true pose. A picture
+shows the building, the scan at the best pose, the particles and the likelihood over the whole map."""
 
 _EPILOG = """\
 examples:
@@ -39,14 +42,14 @@ examples:
   gpusense demo --particles 1000000 --backend opencl --backend warp:cuda:0
   gpusense demo --no-plot --json > demo.json
 
-Exit codes: 0 success, 1 a device that was found failed (the report says how), 2 bad input."""
+Exit codes: 0 success, 1 a device failed (the report has its error), 2 bad input."""
 
 SIZE, BEAMS, FIELD_OF_VIEW, RANGE_MAX, SIGMA_XY, SIGMA_THETA = (30.0, 20.0), 180, 270.0, 15.0, 0.5, 0.3
 BEAM, FIELD = "beam model", "likelihood field"
 PRECISION, LATTICE = "float32", 0.1
-# The reference scores so many particles at most; repeated calls share so many seconds.
+# Largest number of particles of the reference; total time of repeated calls [s]; largest number of repeated calls.
 REFERENCE_PARTICLES, PATIENCE, REPETITIONS = 10_000, 4.0, 3
-NOTE = "Made-up building; scan drawn from the beam model's own mixture. Colour scales end at the median of the values."
+NOTE = "Generated building; scan drawn from the beam model's mixture. Colour scales end at the median of the values."
 
 
 Model = BeamModel | LikelihoodFieldModel
@@ -54,7 +57,7 @@ Model = BeamModel | LikelihoodFieldModel
 
 @dataclass(frozen=True)
 class Scene:
-    """What is asked: the world, a scan in it, and the poses to score; the last pose is the true one."""
+    """A map, a scan in it, the poses to score with the true pose last, and the number of beams that models use."""
 
     grid: OccupancyGrid
     scanner: Scanner
@@ -64,18 +67,18 @@ class Scene:
 
     @property
     def truth(self) -> np.ndarray:
-        """(3,) where the robot is."""
+        """Return (3,) the true pose [m, m, rad]."""
         return self.poses[-1]
 
     @property
     def checked(self) -> slice:
-        """The poses that the float64 reference scores as well."""
+        """Return the slice of the poses that the float64 reference scores too."""
         return slice(None, None, -(-len(self.poses) // REFERENCE_PARTICLES))
 
 
 @dataclass(frozen=True)
 class Score:
-    """What one model on one device made of a scene."""
+    """Scores and times of one model on one device."""
 
     name: str
     model: Model
@@ -88,12 +91,12 @@ class Score:
 
     @property
     def rate(self) -> float:
-        """Particle-beams per second of the steady call."""
+        """Return the particle-beams per second of the steady call."""
         return len(self.log_p) * self.evaluated / self.steady_s
 
     @property
     def rank(self) -> int:
-        """The rank of the true pose: 1 if no particle scores better."""
+        """Return the rank of the true pose: 1 if no particle scores better."""
         return 1 + int((self.log_p[:-1] > self.log_p[-1]).sum())
 
 
@@ -101,62 +104,71 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     parser.add_argument(
-        "--particles", type=common.whole_number(low=1, high=100_000_000), default=100_000, metavar="N",
-        help="poses to score: half around the true one, half all over the building (default: %(default)s)",
+        "--particles", type=arguments.whole_number(low=1, high=100_000_000), default=100_000, metavar="N",
+        help="poses to score: half around the true one, half over the whole building (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--beams", type=common.whole_number(low=1, high=BEAMS), default=60, metavar="K",
-        help=f"how many of the scan's {BEAMS} beams the models use (default: %(default)s)",
+        "--beams", type=arguments.whole_number(low=1, high=BEAMS), default=60, metavar="K",
+        help=f"number of the scan's {BEAMS} beams that the models use (default: %(default)s)",
     )  # fmt: skip
-    common.add_seed(parser)
+    arguments.add_seed(parser)
     parser.add_argument(
         "--backend", action="append", metavar="DEVICE",
-        help=f"{common.BACKEND_HELP}; give it again to compare several (default: every device found here)",
+        help=f"{arguments.BACKEND_HELP}; may be repeated to compare devices (default: every device present)",
     )  # fmt: skip
     parser.add_argument(
-        "--output", type=common.output_path(".png", ".pdf", ".svg"), default=Path("gpusense-demo.png"),
-        metavar="FILE", help="the picture (default: %(default)s)",
+        "--output", type=arguments.output_path(".png", ".pdf", ".svg"), default=Path("gpusense-demo.png"),
+        metavar="FILE", help="file of the picture (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    common.add_json(parser)
+    arguments.add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the scene, score it everywhere, report and draw."""
+    """Make the scene, score it on every device, report and draw."""
     if not args.no_plot:
-        common.check_writable(args.output)
-    backends, failures = common.open_backends(args.backend)
+        check_writable(args.output)
+    backends, failures = arguments.open_backends(args.backend)
     scene = make_scene(args.seed, args.particles, args.beams)
     if not args.json:
         _introduce(scene, args.seed, backends)
-    scores: list[Score] = []
     with progress(2 * len(backends) + 3) as step:
-        for name in (BEAM, FIELD):
-            step(f"{name}, float64 reference")
-            truth = make_model(scene, name, "numpy", "float64")
-            reference = np.asarray(truth.log_likelihood(scene.poses[scene.checked], scene.ranges))
-            for backend in backends:
-                step(f"{name} on {backend.info.selection}")
-                try:
-                    scores.append(score(scene, name, backend, reference))
-                except Exception as error:
-                    if args.backend is not None:
-                        raise
-                    failures.append(f"{backend.info.selection}: {name}: {type(error).__name__}: {error}")
+        scores, errors = _score_all(scene, backends, selected=args.backend is not None, step=step)
         step("picture")
-        drawn = not args.no_plot and {one.name for one in scores} == {BEAM, FIELD}
+        drawn = not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}
         if drawn:
             draw(scene, scores, args.output)
+    failures += errors
     written = args.output if drawn else None
     if args.json:
-        common.print_json(_document(scene, args.seed, scores, failures, written))
+        output.print_json(_document(scene, args.seed, scores, failures, written))
     else:
         _report(scene, scores, failures, written)
     return 1 if failures else 0
 
 
+def _score_all(
+    scene: Scene, backends: list[Backend], *, selected: bool, step: Callable[[str], None]
+) -> tuple[list[Score], list[str]]:
+    """Score the scene with both models on all backends; return the scores and the errors of unselected backends."""
+    scores, failures = [], []
+    for name in (BEAM, FIELD):
+        step(f"{name}, float64 reference")
+        truth = make_model(scene, name, "numpy", "float64")
+        reference = np.asarray(truth.log_likelihood(scene.poses[scene.checked], scene.ranges))
+        for backend in backends:
+            step(f"{name} on {backend.info.selection}")
+            try:
+                scores.append(score_scene(scene, name, backend, reference))
+            except Exception as error:
+                if selected:
+                    raise
+                failures.append(f"{backend.info.selection}: {name}: {type(error).__name__}: {error}")
+    return scores, failures
+
+
 def make_scene(seed: int, particles: int, beams: int) -> Scene:
-    """A building, a scan drawn from the beam model at a free pose, and a cloud of particles."""
+    """Make a building, a scan drawn from the beam model at a free pose, and a cloud of particles."""
     rng = np.random.default_rng(seed)
     grid = worlds.building(seed, SIZE)
     first, step = -math.radians(FIELD_OF_VIEW) / 2, math.radians(FIELD_OF_VIEW) / (BEAMS - 1)
@@ -169,13 +181,20 @@ def make_scene(seed: int, particles: int, beams: int) -> Scene:
 
 
 def make_model(scene: Scene, name: str, backend: Selection, precision: str = PRECISION) -> Model:
-    """The model of that name with its default parameters."""
+    """Make a model with its default parameters; ``name`` is ``BEAM`` or ``FIELD``."""
     kind: Any = BeamModel if name == BEAM else LikelihoodFieldModel
     return kind(scene.grid, scene.scanner, backend=backend, precision=precision, beams=scene.beams)
 
 
-def score(scene: Scene, name: str, backend: Backend, reference: np.ndarray) -> Score:
-    """Score the scene once from nothing, and then again as often as patience allows."""
+def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray) -> Score:
+    """Time the first call, model included, and up to ``REPETITIONS`` steady calls within ``PATIENCE`` seconds.
+
+    Args:
+        scene: The scene.
+        name: ``BEAM`` or ``FIELD``.
+        backend: The backend.
+        reference: float64 log-likelihoods of the poses ``scene.checked``.
+    """
     begin = time.perf_counter()
     model = make_model(scene, name, backend)
     log_p = np.asarray(model.log_likelihood(scene.poses, scene.ranges))
@@ -186,14 +205,14 @@ def score(scene: Scene, name: str, backend: Backend, reference: np.ndarray) -> S
         begin = time.perf_counter()
         log_p = np.asarray(model.log_likelihood(scene.poses, scene.ranges))
         calls.append(time.perf_counter() - begin)
-    # A reading without return has the same probability at every pose, and nothing is evaluated for it.
+    # A reading without return has the same probability at every pose, and is not evaluated.
     evaluated = evaluated_beams(model, scene.ranges)
     errors = np.abs(log_p[scene.checked] - reference)
     return Score(name, model, log_p, first, min(calls, default=first), len(calls), evaluated, errors)
 
 
 def draw(scene: Scene, scores: list[Score], path: Path) -> None:
-    """The picture: the scan at the best pose, the particles, and P(z | x, m) at the best heading by both models."""
+    """Draw the scan at the best pose, the particles, and P(z | x, m) at the best heading by both models."""
     beam = _fastest(scores, BEAM)
     best = scene.poses[beam.log_p[:-1].argmax()]
     poses, free, extent = plots.pose_lattice(scene.grid, LATTICE, float(best[2]))
@@ -232,54 +251,57 @@ def _introduce(scene: Scene, seed: int, backends: list[Backend]) -> None:
 def _report(scene: Scene, scores: list[Score], failures: list[str], written: Path | None) -> None:
     columns = ["backend", "model", "first [s]", "steady [s]", "rate [M/s]", "error", "rank"]
     rows = []
-    for one in scores:
-        steady = f"{one.steady_s:.3f}" if one.repetitions else "-"
-        figures = [f"{one.first_s:.3f}", steady, f"{one.rate / 1e6:.1f}", f"{one.errors.max():.0e}", grouped(one.rank)]
-        rows.append([one.model.device.selection, one.name, *figures])
-    common.print_table(columns, rows, right=columns[2:])
+    for score in scores:
+        steady = f"{score.steady_s:.3f}" if score.repetitions else "-"
+        rate, error = f"{score.rate / 1e6:.1f}", f"{score.errors.max():.0e}"
+        rows.append([
+            score.model.device.selection, score.name, f"{score.first_s:.3f}", steady, rate, error, grouped(score.rank)
+        ])  # fmt: skip
+    output.print_table(columns, rows, right=columns[2:])
     every = f"{scene.checked.step}th pose".removeprefix("1th ")
     print(f"""
-first   the first call: constructor, compilation (or its cache on disk), map preparation, scoring
-steady  best of up to {REPETITIONS} more, transfers included; NumPy gets none if its first took over {PATIENCE:g} s
-rate    millions of particle-beams per second of a steady call; a beam without return costs nothing and does not count
+first   first call: constructor, compilation (or its cache on disk), map preparation, scoring
+steady  best of up to {REPETITIONS} further calls, transfers included; none for NumPy above {PATIENCE:g} s a call
+rate    millions of particle-beams per second of a steady call; beams without return are not evaluated nor counted
 error   largest error of log p [nats] against the NumPy reference in float64, at every {every}
 rank    of the true pose: 1 if no particle scores better""")
-    for name in dict.fromkeys(one.name for one in scores):
+    for name in dict.fromkeys(score.name for score in scores):
         metres, degrees = _offset(scene, fastest := _fastest(scores, name))
         print(f"\nThe best particle by the {name} is {metres:.2f} m and {degrees:.1f} degrees off the true pose.")
         if name == FIELD and metres > SIGMA_XY:
-            print("It ignores what stands between the robot and an end point, so similar places can score alike.")
-        print(f"What was left out and why: {fastest.model.explain()}")
+            print("It ignores obstacles between the robot and an end point, so similar places can score alike.")
+        print(f"Specialisation of the kernels: {fastest.model.explain()}")
     print("".join(f"\nfailed: {failure}\n" for failure in failures), end="")
     if written is not None:
         print(f"\nPicture: {written}")
 
 
-def _offset(scene: Scene, one: Score) -> tuple[float, float]:
-    """How far the best particle is from the true pose [m, degrees]."""
-    dx, dy, turn = (scene.poses[one.log_p[:-1].argmax()] - scene.truth).tolist()
+def _offset(scene: Scene, score: Score) -> tuple[float, float]:
+    """Return the distance of the best particle from the true pose [m, degrees]."""
+    dx, dy, turn = (scene.poses[score.log_p[:-1].argmax()] - scene.truth).tolist()
     return math.hypot(dx, dy), abs(math.degrees(math.remainder(turn, math.tau)))
 
 
 def _document(
     scene: Scene, seed: int, scores: list[Score], failures: list[str], written: Path | None
 ) -> dict[str, Any]:
-    """The report for machines; times in seconds, errors in nats."""
+    """Build the report for ``--json``; times in seconds, errors in nats."""
     results = []
-    for one in scores:
-        device = one.model.device
-        metres, degrees = _offset(scene, one)
+    for score in scores:
+        device = score.model.device
+        metres, degrees = _offset(scene, score)
+        best = int(score.log_p[:-1].argmax())
         results.append({
             "backend": device.selection, "device": device.name, "kind": device.kind, "driver": device.driver,
-            "model": one.name, "precision": one.model.precision, "first_call_s": one.first_s,
-            "steady_s": one.steady_s, "repetitions": one.repetitions, "beams_evaluated": one.evaluated,
-            "particle_beams_per_s": one.rate, "largest_error": one.errors.max(), "error_poses": len(one.errors),
-            "rank_of_true_pose": one.rank, "log_p_of_true_pose": one.log_p[-1], "best_log_p": one.log_p[:-1].max(),
-            "best_pose": scene.poses[one.log_p[:-1].argmax()], "best_pose_off_m": metres,
-            "best_pose_off_degrees": degrees, "explain": one.model.explain(),
+            "model": score.name, "precision": score.model.precision, "first_call_s": score.first_s,
+            "steady_s": score.steady_s, "repetitions": score.repetitions, "beams_evaluated": score.evaluated,
+            "particle_beams_per_s": score.rate, "largest_error": score.errors.max(), "error_poses": len(score.errors),
+            "rank_of_true_pose": score.rank, "log_p_of_true_pose": score.log_p[-1], "best_log_p": score.log_p[best],
+            "best_pose": scene.poses[best], "best_pose_off_m": metres, "best_pose_off_degrees": degrees,
+            "explain": score.model.explain(),
         })  # fmt: skip
     return {
-        "machine": common.machine(),
+        "machine": machine(),
         "seed": seed,
         "world": {"size_m": SIZE, "shape": scene.grid.shape, "resolution_m": scene.grid.resolution},
         "scan": {"beams": BEAMS, "beams_used": scene.beams, "range_max_m": RANGE_MAX, "ranges_m": scene.ranges},

@@ -1,4 +1,4 @@
-"""``gpusense devices``: what models can run on, and what is missing for more."""
+"""Run ``gpusense devices``: list the devices, and the remedy for each that is absent or unusable."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ import argparse
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from gpusense.commands.common import add_json, driver_text, machine, machine_line, print_json, print_table
+from gpusense.commands.arguments import add_json
+from gpusense.commands.output import driver_text, print_json, print_table
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     from gpusense.backends import Device
 
 NAME = "devices"
-HELP = "List what gpusense can run on here, and what is missing for more."
+HELP = "List the devices that gpusense can use, and the remedy for each that is absent or unusable."
 
 _EPILOG = """\
-The column 'selection' is what the other commands take as --backend and what the library takes as backend=.
-The device marked with * is the one that 'auto' takes; the environment variable GPUSENSE_BACKEND changes it.
-The first time that a device is met, kernels of each family run on it in a process of their own and are compared with
-NumPy's results, which takes some seconds. What fails there is not used, and the reason stands here. 'lanes' are the
-particles or beams that one work-item computes at once, followed by the processor for which the driver compiles.
+The column 'selection' is the value for --backend of the other commands and for backend= of the library.
+'auto' selects the device marked with *; the environment variable GPUSENSE_BACKEND changes it.
+Before a device is used for the first time, a child process runs kernels of each family on it and compares them with
+NumPy's results, which takes some seconds. Families that fail are not used, and the reason is printed here. 'lanes' are
+the particles or beams per work-item, followed by the processor that the driver compiles for.
 
 example:
   gpusense devices
@@ -40,33 +42,33 @@ def run(args: argparse.Namespace) -> int:
     """Print the devices; absent ones come with the reason and the remedy."""
     from gpusense.backends import devices
 
-    found = devices(anew=args.prove)
-    auto, trouble = _auto()
+    listed = devices(anew=args.prove)
+    auto, auto_error = _auto()
     if args.json:
-        listed = [asdict(device) | {"auto": device.available and device.selection == auto} for device in found]
-        print_json({"auto": auto, "auto_error": trouble, "devices": listed, "machine": machine()})
+        documents = [asdict(device) | {"auto": device.available and device.selection == auto} for device in listed]
+        print_json({"auto": auto, "auto_error": auto_error, "devices": documents, "machine": machine()})
         return 0
     rows, notes = [], []
-    for device in found:
+    for device in listed:
         mark = "*" if device.available and device.selection == auto else ""
         rows.append((mark, device.selection or "-", device.kind, device.name, driver_text(device), _status(device)))
         if device.reason:
             notes.append(f"{device.selection or device.name}: {device.reason}")
     print_table(("", "selection", "kind", "name", "driver", "status"), rows)
     print("", *notes, sep="\n")
-    print(f"* is what 'auto' takes\n{machine_line()}" if auto else f"'auto' does not work: {trouble}")
+    print(f"* is the device of 'auto'\n{machine_line()}" if auto else f"'auto' does not work: {auto_error}")
     return 0
 
 
 def _status(device: Device) -> str:
-    """Return what can be done with a device, in a word."""
+    """Return a device's status in a word."""
     if device.available:
         return "limited" if device.reason else "available"
     return "unusable" if device.selection else "absent"
 
 
 def _auto() -> tuple[str | None, str | None]:
-    """The selection that 'auto' means, or why opening it failed: this command is for finding out."""
+    """Return the selection of 'auto', or the error of opening it; this command reports it instead of failing."""
     from gpusense.backends import get_backend
 
     try:

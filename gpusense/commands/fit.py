@@ -1,4 +1,4 @@
-"""``gpusense fit``: the beam model's parameters from a recorded log in a map, or from pairs of readings."""
+"""Run ``gpusense fit``: fit the beam model's parameters to a recorded log in a map, or to pairs of ranges."""
 
 from __future__ import annotations
 
@@ -8,20 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.common import (
-    add_backend,
-    add_json,
-    add_seed,
-    check_writable,
-    machine,
-    machine_line,
-    positive_number,
-    print_json,
-    print_table,
-    whole_number,
-    write_whole,
-)
+from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
+from gpusense.commands.output import print_json, print_table
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.held_out import HeldOut
@@ -30,28 +21,28 @@ if TYPE_CHECKING:
     from gpusense.learning.beam.result import BeamFit
 
 NAME = "fit"
-HELP = "Learn the beam model's parameters from a recorded log in a map, or from pairs of readings."
+HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
 
 _DESCRIPTION = """\
-How good is a range finder? gpusense fit learns the six parameters of the beam model from data of your own sensor: how
-often it is right (z_hit) and how exactly (sigma_hit), how often something stands in the way (z_short, lambda_short),
-how often it returns nothing (z_max), and the rest (z_rand). It needs readings and the ranges that were to be expected:
-either a map and a log with good poses, for which expected ranges are cast, or a file of pairs."""
+How good is a range finder? gpusense fit estimates the six parameters of the beam model from your sensor's data: weight
+and deviation of correct ranges (z_hit, sigma_hit), weight and rate of unexpected obstacles (z_short, lambda_short),
+weight of 'no return' (z_max) and of random readings (z_rand). It needs readings with expected ranges: either a map and
+a log with good poses, at which expected ranges are cast, or a file of pairs."""
 
 _EPILOG = """\
-A file of pairs has a line for each reading: the reading z, a comma, the expected range z*, and if you like another
-comma and the angle of incidence in radians. A first line without numbers is a header; .gz is read too. inf is 'no
+A file of pairs has a line for each reading: the reading z, a comma, the expected range z*, and optionally another comma
+and the angle of incidence in radians. A first line without numbers is a header; .gz files are read too. inf means 'no
 return', nan a missing reading.
 
-With --holdout every other block (one scan of a log, 100 pairs of a file; see --block) takes no part in the fit, and the
-others say how much likelier than the default parameters of nav2_amcl and Beluga the fitted ones make them. The standard
-error is that of blocks, because readings of a scan err together.
+--holdout leaves every other block (one scan of a log, 100 pairs of a file; see --block) out of the fit, and scores
+these blocks with the fitted parameters and with the defaults of nav2_amcl and Beluga. The standard error is over
+blocks, because errors within a scan are correlated.
 
-A map that was made of the same scans hides their errors: fit with scans that the map has not seen, as --every 2
---offset 1 chooses them where it was made of the even ones.
+A map made from the same scans hides their errors. Fit with other scans than the map's: for a map of the even scans,
+use --every 2 --offset 1.
 
---out writes parameters.yaml (ours and, ready to paste, those of nav2's amcl) and pictures: readings.png, density.png,
-trace.png, surface.png, and incidence.png where angles of incidence are fitted.
+--out writes parameters.yaml (for gpusense and for nav2's amcl) and pictures: readings.png, density.png, trace.png,
+surface.png, and incidence.png where angles of incidence are fitted.
 
 Exit codes: 0 success, 1 the fit did not converge, 2 bad input.
 
@@ -60,7 +51,7 @@ example:
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 
 UNFINISHED = 1
-# Only written to by --out.
+# Pictures that --out writes.
 _PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
 
@@ -74,36 +65,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--pairs", type=Path, metavar="CSV", help="readings and expected ranges instead; needs --range-max")
     add("--every", type=whole_number(low=1), default=1, metavar="E",
         help="every E-th scan or pair, from --offset on; '--every 2 --offset 1' are the odd ones")  # fmt: skip
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="number of the first one (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="at most so many scans or pairs")
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first one (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans or pairs (default: all)")
     add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: what the log gives for 'no return')")  # fmt: skip
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
     add("--range-min", type=positive_number, metavar="M", help="readings below this are missing [m] (default: none)")
     add("--method", choices=("em", "em-book", "gradient", "hill_climb", "genetic"), default="em",
-        help="how the likelihood is climbed; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
+        help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
     add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
     add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
-        help="also fit parameters for so many bins of the angle between beam and wall")  # fmt: skip
-    add("--restarts", type=whole_number(low=0), default=0, metavar="N", help="further starts at random (default: 0)")
-    add("--holdout", action="store_true", help="hold out every other block, and compare with others' defaults there")
+        help="also fit parameters for BINS bins of the angle of incidence")  # fmt: skip
+    add("--restarts", type=whole_number(low=0), default=0, metavar="N", help="further random starts (default: 0)")
+    add("--holdout", action="store_true", help="hold out every other block, and score it with other programs' defaults")
     add("--block", type=whole_number(low=1), metavar="B",
-        help=f"neighbouring scans or pairs of a block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip
+        help=f"neighbouring scans or pairs per block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip
     add_backend(parser)
     add_seed(parser)
     add_json(parser)
-    add("--out", type=_folder, metavar="DIR", help="folder for parameters.yaml and pictures; made if absent")
+    add("--out", type=_folder, metavar="DIR", help="folder for parameters.yaml and pictures, created if absent")
 
 
 @dataclass(frozen=True)
 class Result:
-    """All that was found.
+    """Result of the command.
 
     Attributes:
         data: The readings of the fit.
         fit: The fit.
-        incidence: That by angles of incidence, or None.
+        incidence: The fit by angles of incidence, or None.
         held_out: The comparison on held-out readings; empty without ``--holdout``.
-        held_out_readings: How many these are.
+        held_out_readings: Number of held-out readings.
     """
 
     data: RangeData
@@ -114,7 +105,7 @@ class Result:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit and print what came out."""
+    """Fit the parameters, print the result and write the files."""
     _check_sources(args)
     result = _fit(args, _read(args))
     files = _write(args.out, result) if args.out is not None else []
@@ -140,14 +131,14 @@ def _check_sources(args: argparse.Namespace) -> None:
 
 
 def _read(args: argparse.Namespace) -> RangeData:
-    from gpusense.evaluation import range_data as fitting
+    from gpusense.evaluation import range_data
     from gpusense.evaluation.scoring import logged_scans
     from gpusense.world.map_files import read_map
 
     chosen = {"every": args.every, "offset": args.offset, "limit": args.limit}
     range_min = args.range_min or 0.0
     if args.pairs is not None:
-        data = fitting.data_of_pairs(
+        data = range_data.data_of_pairs(
             args.pairs, args.range_max, range_min=range_min, block=args.block or _PAIRS_BLOCK, **chosen
         )
         if args.incidence and data.incidence is None:
@@ -158,8 +149,8 @@ def _read(args: argparse.Namespace) -> RangeData:
     top = scans[0][1].scanner.range_max
     if range_min >= top:
         raise ValueError(f"--range-min: must be < the log's range_max = {top}, got {range_min}")
-    with progress(-(-len(scans) // fitting.SCANS)) as step:
-        return fitting.data_of_log(
+    with progress(-(-len(scans) // range_data.SCANS)) as step:
+        return range_data.data_of_log(
             grid, scans, backend=args.backend, range_min=range_min, block=args.block or 1,
             incidence=bool(args.incidence), step=step,
         )  # fmt: skip
@@ -220,7 +211,7 @@ def _print(result: Result, files: list[Path]) -> None:
         for row in result.held_out:
             if row.impossible:
                 print(f"{row.name}: {row.impossible} held-out readings are impossible")
-                print("softened: as if each cause had been seen half a time more; others are compared with that")
+                print("softened: half a reading added to each cause; the other rows are compared with it")
     if files:
         print("\nwritten: " + ", ".join(map(str, files)))
     print(f"\n{machine_line()}")
@@ -231,15 +222,15 @@ def _error(value: float) -> str:
 
 
 def parameters_yaml(result: Result) -> str:
-    """The parameters for us and for nav2_amcl."""
+    """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
     import yaml
 
-    own = {name: float(value) for name, value in result.fit.parameters.to_dict().items()}
+    values = {name: float(value) for name, value in result.fit.parameters.to_dict().items()}
     lines = [
         f"# gpusense fit: {result.fit.hits} ranges and {result.fit.max_readings} readings without return; "
         f"{result.fit.status}",
-        "# For gpusense: gs.BeamParameters.from_dict(...) takes what stands under beam_model.",
-        yaml.safe_dump({"beam_model": own}, sort_keys=False).rstrip(),
+        "# For gpusense: gs.BeamParameters.from_dict(...) takes the mapping beam_model.",
+        yaml.safe_dump({"beam_model": values}, sort_keys=False).rstrip(),
     ]
     if result.fit.bias_fitted:
         lines.append(f"# Subtract this from every reading [m].\nrange_bias: {float(result.fit.range_bias)!r}")
@@ -248,18 +239,18 @@ def parameters_yaml(result: Result) -> str:
         lines.append(
             yaml.safe_dump({"incidence_model": result.incidence.parameters.to_dict()}, sort_keys=False).rstrip()
         )
-    nav2 = {"laser_model_type": "beam", **own, "laser_max_range": float(result.data.range_max)}
+    nav2 = {"laser_model_type": "beam", **values, "laser_max_range": float(result.data.range_max)}
     lines += [
-        "# For nav2_amcl: what to paste below amcl's ros__parameters. Its beam model sums cubes of densities that are",
-        "# not normalised: the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
-        "# to its likelihood field alone, of which this fit says nothing.",
+        "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
+        "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
+        "# to its likelihood field, which this fit does not cover.",
         yaml.safe_dump({"amcl": {"ros__parameters": nav2}}, sort_keys=False).rstrip(),
     ]
     return "\n".join(lines) + "\n"
 
 
 def _write(folder: Path, result: Result) -> list[Path]:
-    """The files of a fit, each whole."""
+    """Write the files of a fit, each atomically, and return their paths."""
     from gpusense.plots import fits as fit_plots
     from gpusense.plots.drawing import save
 
@@ -286,7 +277,7 @@ def _write(folder: Path, result: Result) -> list[Path]:
 
 
 def _folder(text: str) -> Path:
-    """A type for ``add_argument``: a folder that can be written to, made if it is absent."""
+    """Convert an argument to a folder that can be written to, created if absent."""
     folder = Path(text)
     try:
         folder.mkdir(parents=True, exist_ok=True)

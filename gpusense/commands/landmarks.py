@@ -1,4 +1,4 @@
-"""``gpusense landmarks``: noise, suspicious landmarks, association and localisation of a recorded run."""
+"""Run ``gpusense landmarks``: noise, suspicious landmarks, association and localisation of a recorded run."""
 
 from __future__ import annotations
 
@@ -9,18 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.progress import progress
-from gpusense.commands.common import (
-    add_backend,
-    add_json,
-    add_seed,
-    machine,
-    machine_line,
-    output_path,
-    positive_number,
-    print_json,
-    print_table,
-    whole_number,
-)
+from gpusense.commands.arguments import add_backend, add_json, add_seed, output_path, positive_number, whole_number
+from gpusense.commands.output import print_json, print_table
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.landmark_runs import Track
@@ -37,8 +28,8 @@ The folder holds files in the format of the UTIAS MRCLAM data, plain or with .gz
   RobotN_Odometry.dat       time v w                           RobotN_Measurement.dat time barcode range bearing
   RobotN_Groundtruth.dat    time x y heading
 Parameters are fitted at the logged poses. A particle filter then starts around the first logged pose (0.5 m, 0.3 rad)
-and sees odometry and readings only: with --known it is told the landmark of each, with --unknown it is not. The map
-is used as it is: landmarks that are reported as exchanged stay so, and count as false positives.
+and uses odometry and readings only: with --known also the recorded landmark of each reading, with --unknown not. The
+map is used unchanged: readings of exchanged landmarks count as false positives.
 
 Exit codes: 0 success, 2 bad input.
 
@@ -56,13 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--known", dest="known", action="store_true", default=True,
         help="the landmark of each reading is known by its barcode (default)")  # fmt: skip
-    kind.add_argument("--unknown", dest="known", action="store_false", help="the filter is not told the landmarks")
-    add("--particles", type=whole_number(low=2), default=2000, metavar="N", help="of the filter (default: %(default)s)")
-    add("--scans", type=whole_number(low=1), metavar="S", help="at most so many scans")
+    kind.add_argument("--unknown", dest="known", action="store_false", help="the landmark of each reading is unknown")
+    add("--particles", type=whole_number(low=2), default=2000, metavar="N",
+        help="number of the filter's particles (default: %(default)s)")  # fmt: skip
+    add("--scans", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
     add("--range-max", type=positive_number, metavar="M",
         help="the sensor's largest range [m] (default: the next metre above the largest reading)")  # fmt: skip
     add("--field-of-view", type=positive_number, metavar="RAD",
-        help="the angle in which it sees [rad] (default: a twentieth more than the readings')")  # fmt: skip
+        help="the sensor's field of view [rad] (default: 5 %% more than the readings' span)")  # fmt: skip
     add_backend(parser)
     add_seed(parser)
     add_json(parser)
@@ -71,50 +63,59 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, check, associate, localise, and print what came out."""
-    from gpusense.evaluation import landmark_runs as lr
+    """Fit the noise, check the map, associate, localise, and print the results."""
+    from gpusense.evaluation import landmark_runs
     from gpusense.logs.mrclam import read_mrclam
     from gpusense.models.landmark.model import LandmarkModel
 
     if args.field_of_view is not None and args.field_of_view > 2 * math.pi:
         raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
     recorded = read_mrclam(args.folder, args.robot, range_max=args.range_max, field_of_view=args.field_of_view)
-    own = lr.first_scans(recorded, args.scans)
-    # What is suspicious needs the barcodes, whatever the filter is told.
-    by_barcode = lr.fit_run(own)
-    found = lr.suspicions(own, by_barcode)
-    fit = by_barcode if args.known else lr.fit_run(own, known=False)
-    model = LandmarkModel(own.landmarks, lr.usable(fit.parameters), backend=args.backend)
-    agreement = lr.association(own, model, sigma_position=0.0, sigma_heading=0.0, seed=args.seed)
-    with progress((len(own.time) + 99) // 100) as step:
-        track = lr.localise(own, model, known=args.known, particles=args.particles, seed=args.seed, step=step)
+    recorded_run = landmark_runs.first_scans(recorded, args.scans)
+    # Suspicions need the recorded landmarks, with --unknown too.
+    known_fit = landmark_runs.fit_run(recorded_run)
+    suspicions = landmark_runs.suspicions(recorded_run, known_fit)
+    fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
+    model = LandmarkModel(recorded_run.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
+    agreement = landmark_runs.association(recorded_run, model, sigma_position=0.0, sigma_heading=0.0, seed=args.seed)
+    with progress((len(recorded_run.time) + 99) // 100) as step:
+        track = landmark_runs.localise(
+            recorded_run, model, known=args.known, particles=args.particles, seed=args.seed, step=step
+        )
     if args.json:
-        print_json(_document(args, own, fit, found, agreement, track, model.device.selection))
+        print_json(_document(args, recorded_run, fit, suspicions, agreement, track, model.device.selection))
     else:
-        _print(args, own, fit, found, agreement, track)
+        _print(args, recorded_run, fit, suspicions, agreement, track)
     if args.plot is not None:
-        draw(args.plot, own, track, found)
+        _draw(args.plot, recorded_run, track, suspicions)
         if not args.json:
             print(f"drawn: {args.plot}")
     return 0
 
 
+def _draw(path: Path, recorded_run: LandmarkRun, track: Track, suspicions: Suspicions) -> None:
+    from gpusense.plots.drawing import save
+    from gpusense.plots.landmark_runs import run_figure
+
+    save(run_figure(recorded_run, track, suspicions), path)
+
+
 def _document(
-    args: argparse.Namespace, own: LandmarkRun, fit: LandmarkFit, found: Suspicions, agreement: dict[str, float],
-    track: Track, device: str,
+    args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
+    agreement: dict[str, float], track: Track, device: str,
 ) -> dict[str, Any]:  # fmt: skip
     options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
-    label = own.labels.tolist()
+    label = recorded_run.labels.tolist()
     return {
         "options": options,
-        "scans": len(own.time),
-        "features": len(own.ids),
-        "left_out": own.left_out,
+        "scans": len(recorded_run.time),
+        "features": len(recorded_run.ids),
+        "left_out": recorded_run.left_out,
         "fit": fit.to_dict(),
         "exchanged": [
-            asdict(each) | {"first": label[each.first], "second": label[each.second]} for each in found.exchanged
+            asdict(pair) | {"first": label[pair.first], "second": label[pair.second]} for pair in suspicions.exchanged
         ],
-        "misplaced": [asdict(each) | {"landmark": label[each.landmark]} for each in found.misplaced],
+        "misplaced": [asdict(each) | {"landmark": label[each.landmark]} for each in suspicions.misplaced],
         "association": agreement,
         "filter": track.summary(),
         "device": device,
@@ -123,25 +124,18 @@ def _document(
 
 
 def _print(
-    args: argparse.Namespace, own: LandmarkRun, fit: LandmarkFit, found: Suspicions, agreement: dict[str, float],
-    track: Track,
+    args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
+    agreement: dict[str, float], track: Track,
 ) -> None:  # fmt: skip
-    out = ", ".join(f"{count} of {what}" if what == "other robots" else f"{count} {what}" for what, count in
-                    own.left_out.items())  # fmt: skip
-    print(f"robot {args.robot}: {len(own.time)} scans with {len(own.ids)} readings of {len(own.landmarks)} landmarks")
-    print(f"left out of the recording: {out}\n\n{fit}\n")
-    for each in found.exchanged:
-        a, b = own.labels[each.first], own.labels[each.second]
-        print(
-            f"SUSPICIOUS: landmarks {a} and {b} fit better exchanged: {each.before[0]:.0%} and {each.before[1]:.0%} of "
-            f"their readings agree, {each.after[0]:.0%} and {each.after[1]:.0%} the other way round"
-        )
-    for one in found.misplaced:
-        print(
-            f"SUSPICIOUS: {one.agree:.0%} of the readings of landmark {own.labels[one.landmark]} agree with its place"
-        )
-    if not (found.exchanged or found.misplaced):
-        print("no landmark is suspicious")
+    left_out = ", ".join(
+        f"{count} of {reason}" if reason == "other robots" else f"{count} {reason}"
+        for reason, count in recorded_run.left_out.items()
+    )
+    print(
+        f"robot {args.robot}: {len(recorded_run.time)} scans with {len(recorded_run.ids)} readings of "
+        f"{len(recorded_run.landmarks)} landmarks\nleft out of the recording: {left_out}\n\n{fit}\n"
+    )
+    _print_suspicions(recorded_run, suspicions)
     kind = "known" if args.known else "unknown"
     s = track.summary()
     print(
@@ -157,25 +151,15 @@ def _print(
     print(f"\n{args.particles} particles, {kind} landmarks\n{machine_line()}")
 
 
-def draw(path: Path, own: LandmarkRun, track: Track, found: Suspicions) -> None:
-    """Draw logged path, estimate and landmarks, and the error over time."""
-    from gpusense.plots.drawing import new_figure, save
-
-    figure = new_figure(11.0, 6.0)
-    axes = figure.subplot_mosaic([["map", "error"], ["map", "heading"]], width_ratios=(1.4, 1.0))
-    ax = axes["map"]
-    ax.plot(own.truth[:, 0], own.truth[:, 1], color="#8fa3b8", lw=1.0, label="logged path")
-    ax.plot(track.estimate[:, 0], track.estimate[:, 1], color="#e4572e", lw=0.7, label="estimate")
-    xy = own.landmarks.xy
-    ax.plot(xy[:, 0], xy[:, 1], "k^", ms=5, label="landmarks")
-    odd = sorted({i for e in found.exchanged for i in (e.first, e.second)} | {m.landmark for m in found.misplaced})
-    if odd:
-        ax.plot(xy[odd, 0], xy[odd, 1], "o", ms=13, mfc="none", mec="#b8860b", mew=1.8, label="suspicious")
-    for label, (x, y) in zip(own.labels, xy, strict=True):
-        ax.annotate(str(label), (x, y), xytext=(5, 4), textcoords="offset points", fontsize="small")
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    ax.legend(loc="best", fontsize="small")
-    for name, values, unit in (("error", track.error, "position [m]"), ("heading", track.error_heading, "[rad]")):
-        axes[name].plot(own.time, values, color="#e4572e", lw=0.6)
-        axes[name].set(xlabel="time [s]", ylabel="error of the " + (unit if name == "error" else f"heading {unit}"))
-    save(figure, path)
+def _print_suspicions(recorded_run: LandmarkRun, suspicions: Suspicions) -> None:
+    labels = recorded_run.labels
+    for pair in suspicions.exchanged:
+        a, b = labels[pair.first], labels[pair.second]
+        print(
+            f"SUSPICIOUS: landmarks {a} and {b} fit better exchanged: {pair.before[0]:.0%} and {pair.before[1]:.0%} of "
+            f"their readings agree with the map, {pair.after[0]:.0%} and {pair.after[1]:.0%} with both exchanged"
+        )
+    for each in suspicions.misplaced:
+        print(f"SUSPICIOUS: {each.agree:.0%} of the readings of landmark {labels[each.landmark]} agree with its place")
+    if not (suspicions.exchanged or suspicions.misplaced):
+        print("no landmark is suspicious")

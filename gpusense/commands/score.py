@@ -1,31 +1,29 @@
-"""``gpusense score``: how well a model ranks the logged poses of a recorded log, on one backend or several."""
+"""Run ``gpusense score``: rank the logged poses of a recorded log among particles, on one backend or several."""
 
 from __future__ import annotations
 
 import argparse
-import math
-import statistics
-from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.progress import progress
-from gpusense.commands.common import (
+from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
     add_seed,
-    machine,
-    machine_line,
+    not_negative_number,
+    number,
     output_path,
     positive_number,
-    print_json,
-    print_table,
     whole_number,
 )
+from gpusense.commands.output import print_json, print_table
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.scoring import Agreement, BackendScore, Model, ScanScore
+    from gpusense.evaluation.agreement import Agreement, Model
+    from gpusense.evaluation.scoring import BackendScore
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.parameters import BeamParameters
     from gpusense.world.scanner import Scanner
@@ -36,12 +34,12 @@ HELP = "Score particles with the scans of a recorded log, and rank the logged po
 DIFFERENT = 1
 
 _EPILOG = """\
-For each chosen scan, N particles: the logged pose, half of the rest spread around it, half uniform over the free cells.
-The percentile is the share of the other particles that the logged pose beats, ties counting half; the mean is theirs,
-weighted, without the logged pose. Parameters that are not given are those for a laser and a map of centimetres:
+Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
+The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
+weighted mean excludes the logged pose. The default parameters suit a laser and a map with cells of centimetres:
   beam   z_hit 0.75, z_short 0.1, z_max 0.05, z_rand 0.1, sigma_hit 0.1 m, lambda_short 0.2 1/m
   field  z_hit 0.9, z_max 0, z_rand 0.1, sigma_hit 0.1 m, max_distance 1 m, nearest
-A temperature of 0.1 makes up for beams that are not independent: more particles then share in the mean.
+A temperature of 0.1 compensates for beams that are not independent: more particles then share the weight.
 
 Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, 2 bad input.
 
@@ -51,14 +49,14 @@ example:
   gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 --backend opencl --backend numpy --limit 3"""
 
 _SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit")
-_OWN = {"beam": ("z_short", "lambda_short"), "field": ("max_distance", "interpolation")}
+_SPECIFIC = {"beam": ("z_short", "lambda_short"), "field": ("max_distance", "interpolation")}
 _MEANING = {
     "z_hit": "weight of a correct range with noise",
     "z_max": "weight of 'no return'",
     "z_rand": "weight of a random reading; the weights must sum to 1",
     "sigma_hit": "deviation of a correct range, or of an end point from a wall [m]",
-    "z_short": "weight of an unexpected, nearer object; beam model only",
-    "lambda_short": "rate of unexpected objects along a beam [1/m]; beam model only",
+    "z_short": "weight of an unexpected obstacle; beam model only",
+    "lambda_short": "rate of unexpected obstacles along a beam [1/m]; beam model only",
     "max_distance": "largest distance to an obstacle that counts [m]; field only",
 }
 
@@ -71,96 +69,103 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--log", required=True, type=Path, metavar="FILE", help="a CARMEN log with corrected poses, plain or .gz")
     add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
     add("--backend", action="append", metavar="DEVICE",
-        help=f"{BACKEND_HELP}; several may be given, and their rankings are compared (default: auto)")  # fmt: skip
+        help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip
     add("--precision", choices=("float32", "float64"), default="float32", help="precision (default: %(default)s)")
     add("--particles", type=whole_number(low=2), default=20_000, metavar="N", help="per scan (default: %(default)s)")
-    add("--sigma-position", type=_not_negative, default=0.5, metavar="M",
+    add("--sigma-position", type=not_negative_number, default=0.5, metavar="M",
         help="deviation of the particles around the logged pose, in x and in y [m] (default: %(default)s)")  # fmt: skip
-    add("--sigma-heading", type=_not_negative, default=0.25, metavar="RAD",
+    add("--sigma-heading", type=not_negative_number, default=0.25, metavar="RAD",
         help="deviation of their heading [rad] (default: %(default)s)")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E",
         help="every E-th scan, from --offset on; '--every 2 --offset 1' are the odd ones (default: 1)")  # fmt: skip
     add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="at most so many scans")
+    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
     add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: what the log gives for 'no return')")  # fmt: skip
-    add("--beams", type=whole_number(low=0), metavar="B", help="use so many beams of a scan, evenly chosen")
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add("--beams", type=whole_number(low=0), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add("--temperature", type=positive_number, default=1.0, metavar="T",
-        help="in (0, 1], multiplies log-likelihoods (default: %(default)s, the plain product over beams)")  # fmt: skip
+        help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
     group = parser.add_argument_group("parameters of the model")
     group.add_argument("--parameters", type=Path, metavar="YAML",
         help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
     for name, meaning in _MEANING.items():
-        group.add_argument(_option(name), type=_number, metavar="X", help=meaning)
-    group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="how the field is read; field only")
+        group.add_argument(_option(name), type=number, metavar="X", help=meaning)
+    group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="look-up of the field; field only")
     add_seed(parser)
     add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw map, logged and estimated poses and the errors")  # fmt: skip
+        help="draw map, logged and estimated poses, and errors")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score the scans and print what came out."""
-    from gpusense.evaluation.scoring import Cloud, logged_scans, score_log
+    """Score the scans and print the results."""
+    from gpusense.evaluation.scoring import ParticleSampler, logged_scans, score_log
     from gpusense.world.map_files import read_map
 
-    cloud = Cloud(args.particles, args.sigma_position, args.sigma_heading, args.seed)
+    sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
     models = make_models(args, grid, scans[0][1].scanner)
     with progress(len(scans)) as step:
-        scores, agreements = score_log(models, scans, cloud, step)
+        scores, agreements = score_log(models, scans, sampler, step)
     if args.json:
         print_json(_document(args, models, scores, agreements))
     else:
         _print(args, models, scores, agreements)
     if args.plot is not None:
-        draw(args.plot, grid, scores[0])
+        _draw(args.plot, grid, scores[0])
         if not args.json:
             print(f"drawn: {args.plot}")
     return 0 if all(agreement.same for agreement in agreements) else DIFFERENT
 
 
+def _draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
+    from gpusense.plots.drawing import save
+    from gpusense.plots.scores import scores_figure
+
+    save(scores_figure(grid, score), path)
+
+
 def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner) -> list[Model]:
-    """The model on each backend, each device once.
+    """Make the model on each backend, each device once.
 
     Raises:
-        ValueError: a backend is absent, or a parameter breaks its rule or is not the model's.
+        ValueError: a backend is absent, or a parameter breaks its rule or belongs to the other model.
     """
     from gpusense.evaluation import scoring
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
 
-    given = {name: getattr(args, name) for name in (*_SHARED, *_OWN["beam"], *_OWN["field"])}
-    given = {name: value for name, value in given.items() if value is not None}
-    for name in given:
-        if name not in (*_SHARED, *_OWN[args.model]):
+    options = {name: getattr(args, name) for name in (*_SHARED, *_SPECIFIC["beam"], *_SPECIFIC["field"])}
+    changes = {name: value for name, value in options.items() if value is not None}
+    for name in changes:
+        if name not in (*_SHARED, *_SPECIFIC[args.model]):
             raise ValueError(f"{_option(name)}: must be a parameter of the {args.model} model, got another model's")
     beam = scoring.BEAM_PARAMETERS
     if args.parameters is not None:
         if args.model != "beam":
             raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
         beam = read_beam_parameters(args.parameters)
-    made: dict[str, Model] = {}
+    models: dict[str, Model] = {}
     for backend in args.backend or ["auto"]:
         common = {
             "backend": backend, "precision": args.precision, "temperature": args.temperature, "beams": args.beams,
         }  # fmt: skip
         model: Model
         if args.model == "beam":
-            model = BeamModel(grid, scanner, beam.replace(**given), **common)
+            model = BeamModel(grid, scanner, beam.replace(**changes), **common)
         else:
-            model = LikelihoodFieldModel(grid, scanner, scoring.FIELD_PARAMETERS.replace(**given), **common)
-        made.setdefault(model.device.selection, model)
-    return list(made.values())
+            model = LikelihoodFieldModel(grid, scanner, scoring.FIELD_PARAMETERS.replace(**changes), **common)
+        models.setdefault(model.device.selection, model)
+    return list(models.values())
 
 
 def read_beam_parameters(path: Path) -> BeamParameters:
-    """The parameters below ``beam_model`` in a YAML file.
+    """Read the mapping ``beam_model`` of a YAML file.
 
     Raises:
-        FileNotFoundError: it is missing.
-        ValueError: it holds no such parameters, or one of them breaks its rule.
+        FileNotFoundError: the file is missing.
+        ValueError: the file lacks the mapping, or a parameter breaks its rule.
     """
     from gpusense._util import checks
     from gpusense._util.files import read_mapping
@@ -175,36 +180,11 @@ def read_beam_parameters(path: Path) -> BeamParameters:
         raise ValueError(f"{path}: beam_model: {error}") from None
 
 
-def summary(score: BackendScore) -> dict[str, Any]:
-    """What is typical and what is worst over the scans; None where no scan has a mean."""
-
-    def of(pick: Callable[[ScanScore], float | None], take: Callable[[Sequence[float]], float]) -> float | None:
-        values = [value for value in map(pick, score.scans) if value is not None]
-        return take(values) if values else None
-
-    def ninth(values: Sequence[float]) -> float:
-        return sorted(values)[min(math.ceil(0.9 * len(values)), len(values)) - 1]
-
-    middle = statistics.median
-    return {
-        "scans": len(score.scans),
-        "rank_median": of(lambda s: s.rank, middle),
-        "percentile_median": of(lambda s: s.percentile, middle),
-        "percentile_min": of(lambda s: s.percentile, min),
-        "error_position_median": of(lambda s: s.error_position, middle),
-        "error_position_90": of(lambda s: s.error_position, ninth),
-        "error_position_max": of(lambda s: s.error_position, max),
-        "error_heading_median": of(lambda s: s.error_heading, middle),
-        "error_heading_90": of(lambda s: s.error_heading, ninth),
-        "effective_median": of(lambda s: s.effective, middle),
-        "degenerate": sum(s.degenerate for s in score.scans),
-        "particle_beams_per_second": score.particle_beams_per_second,
-    }
-
-
 def _document(
     args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
 ) -> dict[str, Any]:
+    from gpusense.evaluation.scoring import summary
+
     options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
     return {
         "options": options,
@@ -219,6 +199,8 @@ def _document(
 def _print(
     args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
 ) -> None:
+    from gpusense.evaluation.scoring import summary
+
     columns = ("scan", "backend", "rank", "percentile", "error [m]", "error [rad]", "effective", "beams")
     rows = [
         (str(scan.index), score.device.selection, f"{scan.rank:g}", f"{scan.percentile:.3f}",
@@ -256,35 +238,8 @@ def _verdict(a: Agreement) -> str:
         f"  the logged pose has the same rank in {a.same_rank} of {a.scans} scans, no two particles change places "
         f"in {a.same_order}; least rank correlation {a.spearman:.9f}\n"
         f"  largest difference {a.difference:.3g} nats; particles that change places are at most {a.gap:.3g} nats "
-        f"apart, of {a.allowed:.3g} that rounding explains"
+        f"apart; rounding explains {a.allowed:.3g}"
     )
-
-
-def draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
-    """Draw the map with the logged poses and the weighted means, and how percentiles and errors are distributed."""
-    from gpusense.plots.drawing import draw_map, new_figure, save
-
-    figure = new_figure(11.0, 6.0)
-    axes = figure.subplot_mosaic([["map", "percentile"], ["map", "error"]], width_ratios=(1.6, 1.0))
-    ax, upper, lower = (axes[name] for name in ("map", "percentile", "error"))
-    draw_map(ax, grid)
-    logged = [scan.pose for scan in score.scans]
-    ax.plot([p[0] for p in logged], [p[1] for p in logged], ".-", color="#8fa3b8", lw=0.6, ms=3, label="logged pose")
-    found = [(scan.pose, scan.mean) for scan in score.scans if scan.mean is not None]
-    for pose, mean in found:
-        ax.plot([pose[0], mean[0]], [pose[1], mean[1]], color="#e4572e", lw=0.8)
-    means = [mean for _, mean in found]
-    ax.plot([p[0] for p in means], [p[1] for p in means], "o", color="#e4572e", ms=3, mew=0, label="weighted mean")
-    ax.legend(loc="best", fontsize="small")
-    upper.hist([scan.percentile for scan in score.scans], bins=30, color="#4c78a8")
-    upper.set(xlabel="percentile of the logged pose", ylabel="scans")
-    errors = [scan.error_position for scan in score.scans if scan.error_position is not None]
-    top = max(errors, default=0.0) or 1.0
-    low = max(min(errors, default=1e-3), 1e-3, top * 1e-6)
-    bins = [low * (top / low) ** (i / 30) for i in range(31)] if low < top else 30
-    lower.hist(errors, bins=bins, color="#e4572e")
-    lower.set(xscale="log", xlabel="error of the weighted mean [m]", ylabel="scans")
-    save(figure, path)
 
 
 def _option(name: str) -> str:
@@ -293,17 +248,3 @@ def _option(name: str) -> str:
 
 def _text(value: float | None, absent: str = "-") -> str:
     return absent if value is None else f"{value:.4g}"
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from None
-
-
-def _not_negative(text: str) -> float:
-    number = _number(text)
-    if not (math.isfinite(number) and number >= 0):
-        raise argparse.ArgumentTypeError(f"must be a finite number >= 0, got {text!r}")
-    return number

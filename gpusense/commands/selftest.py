@@ -1,4 +1,4 @@
-"""``gpusense selftest``: do the backends of this machine agree, and with the float64 truth?"""
+"""Run ``gpusense selftest``: compare the backends of this machine with the float64 truth and with one another."""
 
 from __future__ import annotations
 
@@ -8,15 +8,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
-from gpusense.commands.common import (
-    BACKEND_HELP,
-    add_json,
-    driver_text,
-    machine,
-    machine_line,
-    print_json,
-    print_table,
-)
+from gpusense.commands.arguments import BACKEND_HELP, add_json
+from gpusense.commands.output import driver_text, print_json, print_table
+from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,17 +25,17 @@ HELP = "Check that the backends present agree with the float64 truth and with on
 BREACH = 1
 
 _EPILOG = """\
-On a made-up building, every backend present computes distance transforms, expected ranges, angles of incidence and
+In a generated building, every backend present computes distance transforms, expected ranges, angles of incidence and
 log-likelihoods of a laser and of a ring of sonars, in both precisions. 'truth' is the float64 reference on the
-backend's own rounded inputs and expected ranges; 'SciPy' is its distance transform; 'specialize=False' is the same
-model with nothing left out; 'float64' is the same backend's other precision. The tolerances and their reasons are in
+backend's rounded inputs and expected ranges; 'SciPy' is its distance transform; 'specialize=False' is the same model
+without specialisation; 'float64' is the same backend's other precision. The tolerances and their reasons are in
 gpusense.evaluation.tolerances, and in the JSON document.
 
-Exit codes: 0 every difference is allowed, 1 one is not, 2 bad input or an absent device.
+Exit codes: 0 every difference is within its tolerance, 1 one is not, 2 bad input or an absent device.
 
-With --stiff the catalogue of stiff and extreme cases runs instead, on each backend and in each precision: sigma from
-1e-8 to 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, odd maps, resolutions, poses and scans. Errors
-are in eps (1 + |log p|) unless the unit says otherwise; the textbook's formulas are shown beside as what they are.
+--stiff runs the catalogue of stiff and extreme cases instead, on each backend and in each precision: sigma from 1e-8 to
+1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, extreme maps, resolutions, poses and scans. Errors are
+in eps (1 + |log p|) unless the unit is another; the textbook's formulas are listed for comparison.
 
 example:
   gpusense selftest
@@ -54,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     parser.add_argument(
         "--backend", action="append", default=[], metavar="DEVICE",
-        help=f"{BACKEND_HELP}; may be given several times; one alone is held against numpy (default: all present "
-        "except simulators)",
+        help=f"{BACKEND_HELP}; may be repeated; a single one is compared with numpy (default: all present except "
+        "simulators)",
     )  # fmt: skip
     parser.add_argument(
         "--stiff", action="store_true", help="run the stiff and extreme cases on each backend and in each precision"
@@ -69,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_stiff(args: argparse.Namespace) -> int:
-    """Run the catalogue of stiff cases; every row of every backend and precision must keep its bound."""
+    """Run the catalogue of stiff cases and print its rows; each must keep its bound."""
     from gpusense.evaluation import selftest, stiff
 
     backends = selftest.chosen_backends(args.backend)
@@ -105,7 +99,7 @@ def _run_stiff(args: argparse.Namespace) -> int:
 
 
 def _print_head(backends: Sequence[Backend]) -> None:
-    """Print what is tested, and what its proof left out."""
+    """Print the backends under test, with the kernels that their proofs excluded."""
     from gpusense.backends import devices
 
     reasons = {device.selection: device.reason for device in devices()}

@@ -1,1 +1,1 @@
-"""Evaluate devices and models: the proof of a device."""
+"""Evaluate devices, models and logs: proofs, self-test, stiff cases, scores, held-out likelihood and benchmarks."""

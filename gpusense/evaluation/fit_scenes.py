@@ -1,4 +1,4 @@
-"""Scenes from mild to stiff whose parameters are known, to hold a fit to."""
+"""Scenes of known parameters, from mild to stiff, that tests and benchmarks fit."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from gpusense.world.parameters import BeamParameters
 
 @dataclass(frozen=True)
 class Scene:
-    """Known parameters, and the expected ranges that readings are drawn for.
+    """Known parameters and an interval of expected ranges.
 
     Attributes:
-        name: What is hard about it.
-        parameters: The truth.
+        name: Number, span and hardness.
+        parameters: The parameters that readings are drawn with.
         range_max: Longest range [m].
-        span: Expected ranges are even between these parts of range_max.
+        span: Interval of the expected ranges, as shares of range_max; they are uniform there.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Scene:
     span: tuple[float, float]
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Readings and expected ranges, (count,) each."""
+        """Draw readings and expected ranges, (count,) each [m]."""
         expected = rng.uniform(*self.span, count) * self.range_max
         return sample_readings(expected, self.range_max, self.parameters, rng), expected
 
@@ -37,7 +37,7 @@ _SPANS = {"near": (0.01, 0.2), "even": (0.02, 0.98), "far": (0.8, 1.0), "one ran
 
 
 def learning_scenes(count: int = 50, seed: int = 0) -> list[Scene]:
-    """Scenes of every kind in turn: mild ones, then weights down to 0.5 %, sigma and lambda over decades, spans of z*.
+    """Make scenes of rising hardness: weights down to 0.5 %, sigma and lambda over decades, narrow spans of z*.
 
     Args:
         count: Number of scenes.

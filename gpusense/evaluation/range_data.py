@@ -1,7 +1,7 @@
-"""Recorded data to learn from: readings beside expected ranges.
+"""Read data to learn from: readings with their expected ranges.
 
-Expected ranges are cast at the poses of a log, or come with the readings in a file. Readings of one scan err together,
-and so do those of neighbouring scans, so that data are kept in blocks, and every other block may be held out.
+Expected ranges are cast at the poses of a log, or come with the readings in a file. Errors within a scan and between
+neighbouring scans are correlated, so data are grouped in blocks, and every other block may be held out.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from gpusense.world.scanner import Reading, classes
 
 Floats = NDArray[np.float64]
 
-# Scans whose rays are cast at once, and lines of a file that are read at once.
+# Scans per call of the ray caster, and lines per read of a file.
 SCANS, _LINES = 256, 1 << 16
-# A longer line is no line of numbers.
+# Longest line of numbers [bytes].
 _LONGEST_LINE = 4096
 
 
 @dataclass(frozen=True, eq=False)
 class RangeData:
-    """Readings beside the ranges that were expected.
+    """Readings with their expected ranges.
 
     Attributes:
         ranges: (n,) readings of any value [m].
         expected: (n,) expected ranges [m].
         incidence: (n,) angles of incidence, NaN where nothing is hit [rad], or None.
-        block: (n,) number of the block of each reading, from 0 on.
+        block: (n,) index of each reading's block, from 0.
         range_max: Readings of at least this are "no return" [m].
         range_min: Readings below this are missing [m].
     """
@@ -52,13 +52,17 @@ class RangeData:
     range_min: float = 0.0
 
     def chosen(self, which: NDArray[np.bool]) -> RangeData:
-        """Some of the readings."""
+        """Return the readings that a mask selects.
+
+        Args:
+            which: (n,) the mask.
+        """
         incidence = None if self.incidence is None else self.incidence[which]
         parts = self.ranges[which], self.expected[which], incidence, self.block[which]
         return RangeData(*parts, self.range_max, self.range_min)
 
     def halves(self) -> tuple[RangeData, RangeData]:
-        """Blocks 0, 2, 4, ... and the others.
+        """Split the data into blocks 0, 2, 4, ... and blocks 1, 3, 5, ....
 
         Raises:
             ValueError: there is only one block.
@@ -70,7 +74,7 @@ class RangeData:
 
     @property
     def kinds(self) -> NDArray[np.uint8]:
-        """(n,) the class of every reading."""
+        """Return (n,) the class of every reading."""
         return classes(self.ranges, self.range_min, self.range_max)
 
 
@@ -84,15 +88,15 @@ def data_of_log(
     incidence: bool = False,
     step: Callable[[str], None] = lambda text: None,
 ) -> RangeData:
-    """Readings of a log and the ranges that a map lets expect at their poses.
+    """Cast the expected ranges of a log's readings at its logged poses.
 
     Args:
         grid: The map.
         scans: Numbered scans of one scanner, each with a pose, as ``scoring.logged_scans`` returns them.
-        backend: Where rays are cast.
+        backend: Device that casts the rays.
         range_min: Readings below this are missing [m].
-        block: Scans of a block.
-        incidence: Also find the angles of incidence.
+        block: Scans per block.
+        incidence: Whether angles of incidence are computed too.
         step: Called with a text before every 256 scans.
     """
     block = checks.integer("block", block, low=1)
@@ -105,12 +109,12 @@ def data_of_log(
         if incidence:
             angles.append(np.asarray(model.incidence(poses), np.float64))
     count = model.scanner.count
-    # What float32 gives for "nothing" is range_max, rounded.
-    ahead = np.minimum(np.concatenate(expected).ravel(), model.scanner.range_max)
+    # In float32 "no obstacle" is range_max rounded, which may exceed range_max.
+    clamped = np.minimum(np.concatenate(expected).ravel(), model.scanner.range_max)
     ranges = np.concatenate([scan.ranges for _, scan in scans])
     blocks = np.repeat(np.arange(len(scans)) // block, count)
     angle = np.concatenate(angles).ravel() if incidence else None
-    return RangeData(ranges, ahead, angle, blocks, model.scanner.range_max, range_min)
+    return RangeData(ranges, clamped, angle, blocks, model.scanner.range_max, range_min)
 
 
 def data_of_pairs(
@@ -123,30 +127,38 @@ def data_of_pairs(
     limit: int | None = None,
     block: int = 100,
 ) -> RangeData:
-    """Readings and expected ranges of a file: a line each, two numbers or three with a comma between them.
+    """Read pairs of readings and expected ranges from a file with two or three comma-separated numbers per line.
 
-    The first is the reading z, the second the expected range z*, the third the angle of incidence [rad]. A first line
-    without numbers is a header; empty lines and those that begin with # are left out.
+    The columns are the reading z, the expected range z* and, if present, the angle of incidence [rad]. A first line
+    without numbers is a header. Empty lines and lines that begin with # are skipped.
 
     Args:
         path: The file, plain or compressed by gzip (.gz).
         range_max: Readings of at least this are "no return" [m].
         range_min: Readings below this are missing [m].
-        every: Every so many pairs, from ``offset`` on.
-        offset: Number of the first pair.
-        limit: At most so many pairs; None for all.
-        block: Neighbouring pairs of a block.
+        every: Stride: every ``every``-th pair is taken, from ``offset`` on.
+        offset: Index of the first pair.
+        limit: Largest number of pairs; None for all.
+        block: Neighbouring pairs per block.
 
     Raises:
-        FileNotFoundError: it is missing.
-        ValueError: a line breaks the format, which names it, or no pair is chosen.
+        FileNotFoundError: the file is missing.
+        ValueError: a line breaks the format, and the message names it; or no pair is chosen.
     """
     file = checks.existing_file(checks.path("pairs", path))
     range_max = checks.real("range_max", range_max, above=0)
     block = checks.integer("block", block, low=1)
-    parts, seen, kept, columns = [], 0, 0, 0
+    table = _chosen_rows(file, every, offset, limit)
+    incidence = table[:, 2].copy() if table.shape[1] == 3 else None
+    return RangeData(
+        table[:, 0].copy(), table[:, 1].copy(), incidence, np.arange(len(table)) // block, range_max, range_min
+    )
+
+
+def _chosen_rows(file: Any, every: int, offset: int, limit: int | None) -> Floats:
+    """Read (n, 2) or (n, 3) numbers: every ``every``-th row from ``offset`` on, ``limit`` of them at most."""
+    parts, seen, kept = [], 0, 0
     for rows in _number_rows(file):
-        columns = columns or rows.shape[1]
         first = max(offset - seen, 0) if seen <= offset else (offset - seen) % every
         chosen = rows[first::every]
         if limit is not None:
@@ -158,15 +170,11 @@ def data_of_pairs(
     if not kept:
         rule = f"must hold a pair of number {offset}, which is the first one chosen"
         raise ValueError(f"pairs: {rule}, got {seen} in {file}")
-    table = np.concatenate(parts)
-    incidence = table[:, 2].copy() if columns == 3 else None
-    return RangeData(
-        table[:, 0].copy(), table[:, 1].copy(), incidence, np.arange(len(table)) // block, range_max, range_min
-    )
+    return np.concatenate(parts)
 
 
 def _number_rows(file: Any) -> Iterator[Floats]:
-    """(n, 2) or (n, 3) numbers of a file, a block of lines at a time."""
+    """Yield (n, 2) or (n, 3) numbers of a file, one block of lines at a time."""
     with open(file, "rb") as raw:
         zipped = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
@@ -197,10 +205,10 @@ def _number_rows(file: Any) -> Iterator[Floats]:
 
 
 def _numbers(file: Any, lines: list[tuple[int, str]], columns: int) -> Floats:
-    """The numbers of some lines.
+    """Parse numbered lines of ``columns`` numbers each.
 
     Raises:
-        ValueError: the first line that does not hold so many.
+        ValueError: a line holds another number of columns or no numbers; the message names the first.
     """
     if columns in (2, 3) and all(text.count(",") == columns - 1 for _, text in lines):
         try:
@@ -226,6 +234,6 @@ def _number(word: str) -> float | None:
 
 
 def without_missing(data: RangeData) -> RangeData:
-    """The readings that say something, their ranges below range_max or infinite."""
+    """Return the readings that are not missing, with infinite ranges for "no return"."""
     kept = data.chosen(data.kinds != Reading.MISSING)
     return replace(kept, ranges=np.where(kept.kinds == Reading.MAX, np.inf, kept.ranges))

@@ -1,8 +1,8 @@
-"""Scoring launches as a device was given them, and the float64 reference on just that.
+"""Record scoring launches of a device and replay them with the float64 reference on the same inputs.
 
-:class:`Recorder` is a backend that keeps what every scoring launch was given and what it returned;
-:func:`replay` evaluates the float64 reference kernels on just that. A likelihood is thus judged apart from the rounding
-of its inputs, and apart from ray casting, which is judged by bits.
+:class:`Recorder` is a backend that keeps the arguments and results of every scoring launch; :func:`replay` evaluates
+the float64 reference kernels on these arguments. The comparison thus excludes the rounding of the inputs, and ray
+casting, whose results are compared bit by bit elsewhere.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from gpusense.reference.sensor_table import tabulated_density
 
 @dataclass(frozen=True)
 class Launch:
-    """A scoring launch: its arguments by name, what it returned included.
+    """A recorded scoring launch: its arguments by name, results included.
 
     Attributes:
         kernel: ``"score_beams"`` or ``"score_field"``.
-        flags: Flags of its code.
-        values: Arrays cut to their shapes, without the map's rectangles, and scalars rounded as the device got them.
+        flags: Flags of the compiled kernel.
+        values: Arrays cut to their shapes, without the map's rectangles, and scalars in the launch's precision.
         expected: (particles, rays) expected ranges of the same device for a beam launch, else None.
-        incidence: (particles, rays) the angles of incidence there, where the launch depends on them [rad].
+        incidence: (particles, rays) angles of incidence where the launch depends on them [rad], else None.
     """
 
     kernel: str
@@ -45,14 +45,14 @@ class Launch:
 
     @property
     def parts(self) -> np.ndarray:
-        """(particles, readings) log-likelihoods of the beams, where the launch was asked for them."""
+        """Return (particles, readings) log-likelihoods of the beams; the launch must have the flag ``PER_BEAM``."""
         return self.values["parts"].reshape(self.values["particles"], self.values["readings"])
 
 
 class Recorder(Proxy):
-    """A backend that passes everything on to another one and records scoring launches.
+    """A backend that forwards every call to another one and records scoring launches.
 
-    Give it to a model as ``backend=``. Ask for ``per_beam=True``, and for few particles: everything is copied.
+    Pass it to a model as ``backend=``. Score with ``per_beam=True`` and few particles: every argument is copied.
     """
 
     def __init__(self, backend: Backend) -> None:
@@ -73,13 +73,13 @@ class Recorder(Proxy):
 
     def _record(self, kernel: str, flags: frozenset[str], arguments: Sequence[Any]) -> Launch:
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
-        given = dict(zip(KERNELS[kernel].arguments, arguments, strict=True))
+        passed = dict(zip(KERNELS[kernel].arguments, arguments, strict=True))
         values: dict[str, Any] = {}
-        for argument, value in given.items():
+        for argument, value in passed.items():
             if argument.shape is None:
                 dtype = argument.dtype(real)
                 values[argument.name] = int(value) if dtype.kind == "i" else dtype.type(value)
-        # Only where these flags are set does a kernel see the argument; rays are cast on the device.
+        # A kernel reads these arguments only where the flags are set. The map's table stays on the device.
         needed = {
             "parts": {"PER_BEAM"} & flags,
             "pose_low": {"CAREFUL"} & flags,
@@ -89,39 +89,39 @@ class Recorder(Proxy):
             "start": {"SCANS"} & flags,
             "fixed_of": {"SCANS"} & flags,
         }
-        for argument, value in given.items():
+        for argument, value in passed.items():
             if argument.shape is None or not needed.get(argument.name, True):
                 continue
             count = argument.elements(values)
             array = self._backend.download(value, np.empty(count * argument.width, argument.dtype(real)))
             values[argument.name] = array.reshape(-1, argument.width) if argument.width > 1 else array
-        found = self._cast(flags, given, values, real) if kernel == "score_beams" else (None, None)
-        return Launch(kernel, flags, values, *found)
+        cast = self._cast(flags, passed, values, real) if kernel == "score_beams" else (None, None)
+        return Launch(kernel, flags, values, *cast)
 
     def _cast(
-        self, flags: frozenset[str], given: dict[Argument, Any], values: dict[str, Any], real: np.dtype
+        self, flags: frozenset[str], passed: dict[Argument, Any], values: dict[str, Any], real: np.dtype
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """What the launch's rays or cones hit, and at which angles, by the same device from the same buffers."""
-        by_name = {argument.name: value for argument, value in given.items()}
+        """Cast the launch's rays or cones from its buffers; return ranges and, with ``INCIDENCE``, angles."""
+        by_name = {argument.name: value for argument, value in passed.items()}
         shape = values["particles"], values["rays"]
-        found = {name: self._backend.empty(shape[0] * shape[1], real) for name in ("ranges", "incidence")}
+        outputs = {name: self._backend.empty(shape[0] * shape[1], real) for name in ("ranges", "incidence")}
         kernel = "cast_echoes" if "ECHO" in flags else "cast_ranges"
-        arguments = [found.get(argument.name, by_name.get(argument.name)) for argument in KERNELS[kernel].arguments]
+        arguments = [outputs.get(argument.name, by_name.get(argument.name)) for argument in KERNELS[kernel].arguments]
         self._backend.compile(kernel, flags)(shape[::-1], *arguments)
-        ranges = self._backend.download(found["ranges"], np.empty(shape, real))
-        angles = self._backend.download(found["incidence"], np.empty(shape, real)) if "INCIDENCE" in flags else None
+        ranges = self._backend.download(outputs["ranges"], np.empty(shape, real))
+        angles = self._backend.download(outputs["incidence"], np.empty(shape, real)) if "INCIDENCE" in flags else None
         return ranges, angles
 
 
 def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The truth of a launch: the float64 reference on the launch's own rounded inputs and expected ranges.
+    """Compute the truth of a launch: the float64 reference on its rounded inputs and expected ranges.
 
-    An end point that is nearer to a cell's edge than float32 can tell with twice its digits belongs to either cell: the
-    one is taken whose log-likelihood is nearer to what was found. So it is with bins of angles of incidence.
+    An end point nearer to a cell's edge than float32 resolves with twice its digits may belong to either cell: the
+    replay takes the cell whose log-likelihood is nearer to ``like``. Bins of angles of incidence are treated alike.
 
     Args:
-        launch: What was recorded.
-        like: (particles, readings) what was found; the launch's own parts by default, if it has some.
+        launch: A recorded launch.
+        like: (particles, readings) log-likelihoods to resolve ties by; by default the launch's parts, if it has them.
 
     Returns:
         log p (particles,) and the beams' parts (particles, readings), both float64, in the order of the launch.
@@ -135,24 +135,24 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
         if like is None and "PER_BEAM" in launch.flags:
             like = launch.parts
         if launch.incidence is not None and like is not None:
-            # What rounding did to a cosine, and to the angle that it is found from again.
+            # Rounding error of a cosine and of its arc cosine, from which the cosine is computed again.
             guard = 8 * float(np.finfo(launch.incidence.dtype).eps)
             for aside in (-guard, guard):
                 moved = _replay_beams(launch, values, aside)
                 parts = np.where(np.abs(moved - like) < np.abs(parts - like), moved, parts)
         if launch.kernel == "score_field" and "BILINEAR" not in launch.flags and like is not None:
-            # The bound of the plain arithmetic's error, 8 eps a cell, and once more eps with twice the digits.
+            # Error bound of an end point with twice the digits: eps times the bound of plain arithmetic, 8 eps a cell.
             size = np.max(np.abs(values["point"]), initial=0.0, where=np.isfinite(values["point"]))
             guard = 8 * float(np.finfo(np.float32).eps) ** 2 * (size + 2)
             for shift in itertools.product((-guard, guard), repeat=2):
                 moved = _replay_field(launch, values, shift)
                 parts = np.where(np.abs(moved - like) < np.abs(parts - like), moved, parts)
-        plainly = strand_sums if launch.kernel == "score_beams" else block_sums
-        return sum_terms(launch.flags, parts, values["fixed"], values["temperature"], plainly), parts
+        plain_sums = strand_sums if launch.kernel == "score_beams" else block_sums
+        return sum_terms(launch.flags, parts, values["fixed"], values["temperature"], plain_sums), parts
 
 
 def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) -> np.ndarray:
-    """The parts; ``shift`` is added to cosines of angles of incidence."""
+    """Return the beams' parts; ``shift`` is added to cosines of angles of incidence."""
     assert launch.expected is not None
     ray_of = np.repeat(np.arange(values["rays"]), np.diff(values["first"]))
     expected = launch.expected.astype(np.float64)[:, ray_of]
@@ -163,10 +163,10 @@ def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) ->
         cosine = np.where(np.isnan(angle), 2, np.cos(angle) + shift)
         terms = incidence_terms(terms, values["edges"], values["kinds"], cosine)
     if "SENSOR_TABLE" in launch.flags:
-        # In the launch's own precision, or a range next to a bin's border would fall into another bin.
+        # In the launch's precision: otherwise a range next to a bin's border would fall into another bin.
         bins = (launch.values[name] for name in ("sensor", "cells", "per_metre", "range_max"))
-        own = np.broadcast_to(launch.values["reading"], expected.shape), launch.expected[:, ray_of]
-        parts = tabulated_density(*own, *bins).astype(np.float64)
+        rounded = np.broadcast_to(launch.values["reading"], expected.shape), launch.expected[:, ray_of]
+        parts = tabulated_density(*rounded, *bins).astype(np.float64)
     else:
         parts = log_density(launch.flags, z, expected, terms)
     if "ALL_READINGS" in launch.flags:
@@ -176,11 +176,12 @@ def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) ->
 
 
 def _replay_field(launch: Launch, values: dict[str, Any], shift: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """Return the beams' parts; ``shift`` is added to the poses' x and y [cells]."""
     count, readings = values["particles"], values["readings"]
     parts = np.empty(count * readings)
     low = values.get("pose_low", np.zeros((count, 4))) + np.array([*shift, 0.0, 0.0])
-    alone = {"start": None, "fixed_of": None}
-    given = {**values, **alone, "pose_low": low, "log_p": np.empty(count), "parts": parts}
+    single_scan = {"start": None, "fixed_of": None}
+    arguments = {**values, **single_scan, "pose_low": low, "log_p": np.empty(count), "parts": parts}
     flags = launch.flags | {"FLOAT64", "PER_BEAM", "CAREFUL"}
-    field_kernels.score_field(flags, *(given[argument.name] for argument in KERNELS["score_field"].arguments))
+    field_kernels.score_field(flags, *(arguments[argument.name] for argument in KERNELS["score_field"].arguments))
     return parts.reshape(count, readings)

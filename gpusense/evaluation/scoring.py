@@ -1,7 +1,7 @@
-"""How well a model ranks the true pose: scans of a log scored for clouds of particles, on one backend or several.
+"""Score the scans of a log for clouds of particles and rank the logged poses, on one backend or several.
 
-Per scan the particles are the logged pose, half of the rest around it, and the other half uniformly over the map's
-free cells. The logged pose is ranked among them; it takes no part in the weighted mean, which it would pull to itself.
+Per scan the particles are the logged pose, half of the others around it, and the other half uniform over the map's
+free cells. The logged pose is ranked among them. The weighted mean excludes it, since it would bias the mean.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,37 +20,34 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
-from gpusense.evaluation.tolerances import scan_tolerance
+from gpusense.evaluation.agreement import Agreement, Comparison, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan, read_log
-from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.classed import choose_beams
-from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Reading, classify
 from gpusense.world.sensor_table import SensorTable
 
 Array = NDArray[Any]
-Model = BeamModel | LikelihoodFieldModel
 Floats = NDArray[np.float64]
 
-# For a laser and a map of 5 cm: end points lie within a cell or two of a wall, but people, door frames and grazing
-# incidence make one reading in five something else.
+# For a laser and a map of 5 cm cells: end points lie within a cell or two of a wall, except for one reading in five, by
+# people, door frames and grazing incidence.
 BEAM_PARAMETERS = BeamParameters(z_hit=0.75, z_short=0.1, z_max=0.05, z_rand=0.1, sigma_hit=0.1, lambda_short=0.2)
 FIELD_PARAMETERS = LikelihoodFieldParameters(z_hit=0.9, z_max=0.0, z_rand=0.1, sigma_hit=0.1, max_distance=1.0)
 
 
 @dataclass(frozen=True)
-class Cloud:
-    """How the particles of a scan are drawn.
+class ParticleSampler:
+    """Sampler of the particles of a scan.
 
     Attributes:
-        particles: Their number, at least 2.
-        sigma_position: Deviation of those around the logged pose, in x and in y, >= 0 [m].
-        sigma_heading: Deviation of their heading, >= 0 [rad].
-        seed: Seed; each scan draws from its own stream, so that a choice of scans changes nothing.
+        particles: Number of particles, at least 2.
+        sigma_position: Deviation of the particles around the logged pose, in x and in y, >= 0 [m].
+        sigma_heading: Deviation of their headings, >= 0 [rad].
+        seed: Seed; each scan has a random stream of its own, so its particles do not depend on the chosen scans.
     """
 
     particles: int = 20_000
@@ -62,7 +60,13 @@ class Cloud:
         checks.integer("seed", self.seed, low=0)
 
     def draw(self, index: int, pose: Pose, grid: OccupancyGrid) -> Floats:
-        """(N, 3) particles of the scan of that index: its pose, those around it, those all over the free cells."""
+        """Draw (N, 3) particles of a scan: its pose, particles around it, particles over all free cells [m, m, rad].
+
+        Args:
+            index: Index of the scan in its log, which selects the random stream.
+            pose: The logged pose.
+            grid: The map.
+        """
         random = np.random.default_rng((self.seed, index))
         near = (self.particles - 1) // 2
         around = cloud_around(pose, near, self.sigma_position, self.sigma_heading, random)
@@ -71,19 +75,19 @@ class Cloud:
 
 @dataclass(frozen=True)
 class ScanScore:
-    """What one scan says on one backend.
+    """Score of one scan on one backend.
 
     Attributes:
-        index: The scan's number in its log, from 0.
-        pose: Its logged pose.
-        rank: Rank of the logged pose, 1 the best; the mean of the places that it shares with its equals.
-        percentile: Share of the other particles that score worse, half of its equals included [%].
-        mean: Weighted mean of the other particles, its heading by the circular mean; None where no weight is left.
+        index: Index of the scan in its log, from 0.
+        pose: The logged pose.
+        rank: Rank of the logged pose, 1 the best; the mean rank where particles tie with it.
+        percentile: Share of the other particles that score worse, with half of the ties [%].
+        mean: Weighted mean of the other particles, its heading by the circular mean; None where all weights are 0.
         error_position: Distance of the mean from the logged pose [m], or None.
-        error_heading: Difference of heading, 0 to pi [rad], or None.
+        error_heading: Absolute difference of heading, 0 to pi [rad], or None.
         effective: Effective sample size of the other particles, or None.
         degenerate: Whether every other particle has probability 0.
-        beams: Readings that were evaluated at every particle.
+        beams: Readings that are evaluated at every particle.
         seconds: Time of the call.
     """
 
@@ -102,7 +106,13 @@ class ScanScore:
 
 @dataclass(frozen=True)
 class BackendScore:
-    """All scans on one backend."""
+    """Scores of all scans on one backend.
+
+    Attributes:
+        device: Description of the device.
+        particles: Particles per scan.
+        scans: Scores of the scans.
+    """
 
     device: BackendInfo
     particles: int
@@ -110,53 +120,30 @@ class BackendScore:
 
     @property
     def particle_beams_per_second(self) -> float | None:
-        """Evaluated readings per second; without the first scan, which compiles, where there is another."""
+        """Return evaluated readings per second, without the first scan, which compiles, if there are others."""
         steady = self.scans[1:] or self.scans
         seconds = sum(scan.seconds for scan in steady)
         return self.particles * sum(scan.beams for scan in steady) / seconds if seconds > 0 else None
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How two backends rank the same particles, over all scans.
-
-    Attributes:
-        left, right: Selection strings of the two.
-        scans: Number of scans compared.
-        same_rank: In how many the logged pose has the same rank.
-        same_order: In how many no two particles change places; particles that tie on one side may differ on the other.
-        spearman: Smallest rank correlation of all particles.
-        difference: Largest difference of log-likelihoods [nats].
-        gap: Largest difference in log-likelihood between two particles that change places [nats].
-        allowed: What rounding explains between these two [nats].
-    """
-
-    left: str
-    right: str
-    scans: int
-    same_rank: int
-    same_order: int
-    spearman: float
-    difference: float
-    gap: float
-    allowed: float
-
-    @property
-    def same(self) -> bool:
-        """Whether the ranking is the same, but for particles closer to one another than rounding can tell."""
-        return self.gap <= self.allowed
-
-
 def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: float) -> ScanScore:
-    """Judge the log-likelihoods of particles, of which the first is the logged pose."""
+    """Rank the logged pose among a scan's particles and compute the weighted mean of the others.
+
+    Args:
+        index: Index of the scan in its log.
+        poses: (N, 3) particles; the first is the logged pose [m, m, rad].
+        log_p: (N,) log-likelihoods.
+        beams: Readings that were evaluated at every particle.
+        seconds: Time of the call.
+    """
     better, equal = np.count_nonzero(log_p[1:] > log_p[0]), np.count_nonzero(log_p[1:] == log_p[0])
     others = len(log_p) - 1
-    found = normalize_weights(log_p[1:])
+    normalized = normalize_weights(log_p[1:])
     pose = cast(Pose, tuple(poses[0].tolist()))
     mean: Pose | None = None
     position = heading = effective = None
-    if not found.degenerate:
-        weights, effective = found.weights, found.effective_sample_size
+    if not normalized.degenerate:
+        weights, effective = normalized.weights, normalized.effective_sample_size
         x, y = (weights @ poses[1:, :2]).tolist()
         theta = math.atan2(float(weights @ np.sin(poses[1:, 2])), float(weights @ np.cos(poses[1:, 2])))
         mean = (x, y, theta)
@@ -164,65 +151,35 @@ def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: flo
         heading = abs(math.remainder(theta - pose[2], math.tau))
     return ScanScore(
         index, pose, 1 + better + equal / 2, 100 * (others - better - equal / 2) / others, mean, position, heading,
-        effective, found.degenerate, beams, seconds,
+        effective, normalized.degenerate, beams, seconds,
     )  # fmt: skip
 
 
-def ranks(values: Array) -> Floats:
-    """Ranks from the smallest value, equals sharing the mean of theirs."""
-    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    last = np.cumsum(counts)
-    return (last - (counts - 1) / 2)[inverse]
+def summary(score: BackendScore) -> dict[str, Any]:
+    """Return medians, 90 % quantiles and extremes over a backend's scans; None where no scan has a value."""
 
+    def over_scans(pick: Callable[[ScanScore], float | None], take: Callable[[Sequence[float]], float]) -> float | None:
+        values = [value for value in map(pick, score.scans) if value is not None]
+        return take(values) if values else None
 
-def correlation(left: Floats, right: Floats) -> float:
-    """Pearson's correlation, of ranks Spearman's; where a side is constant, 1 if the other one is the same."""
-    a, b = left - left.mean(), right - right.mean()
-    size = math.sqrt(float(a @ a) * float(b @ b))
-    return float(a @ b) / size if size else float(np.array_equal(left, right))
+    def quantile_90(values: Sequence[float]) -> float:
+        return sorted(values)[min(math.ceil(0.9 * len(values)), len(values)) - 1]
 
-
-def largest_gap(left: Array, right: Array) -> float:
-    """By how much, on the right, a particle beats one that the left puts before it."""
-    order = np.lexsort((-right, -left))
-    b = right[order].astype(np.float64)
-    lowest = np.minimum.accumulate(b)
-    with np.errstate(invalid="ignore"):
-        return float(np.max(np.where(b == lowest, 0.0, b - lowest), initial=0.0))
-
-
-class Comparison:
-    """Compares the same model on two backends, scan by scan."""
-
-    def __init__(self, left: Model, right: Model) -> None:
-        self._models = left, right
-        self._scans = self._same_rank = self._same_order = 0
-        self._spearman, self._difference, self._gap, self._allowed = 1.0, 0.0, 0.0, 0.0
-
-    def add(self, left: Array, right: Array) -> None:
-        """Take in the log-likelihoods of one scan's particles, of which the first is the logged pose."""
-        self._scans += 1
-        a, b = ranks(left), ranks(right)
-        self._same_rank += int(a[0] == b[0])
-        gap = max(largest_gap(left, right), largest_gap(right, left))
-        self._same_order += int(gap == 0)
-        self._spearman = min(self._spearman, correlation(a, b))
-        with np.errstate(invalid="ignore"):
-            apart = np.where(left == right, 0.0, np.abs(left.astype(np.float64) - right))
-        self._difference = max(self._difference, float(np.max(apart, initial=0.0)))
-        self._gap = max(self._gap, gap)
-        largest = float(np.max(np.abs(left), initial=0.0, where=np.isfinite(left)))
-        tolerances = [scan_tolerance(m.precision, min(m.scanner.count, 10_000)) for m in self._models]
-        allowed = sum(t.value * (1.0 if t.unit == "nats" else 1.0 + largest) for t in tolerances)
-        self._allowed = max(self._allowed, allowed)
-
-    def result(self) -> Agreement:
-        """Over all scans."""
-        left, right = (model.device.selection for model in self._models)
-        return Agreement(
-            left, right, self._scans, self._same_rank, self._same_order, self._spearman, self._difference, self._gap,
-            self._allowed,
-        )  # fmt: skip
+    middle = statistics.median
+    return {
+        "scans": len(score.scans),
+        "rank_median": over_scans(lambda s: s.rank, middle),
+        "percentile_median": over_scans(lambda s: s.percentile, middle),
+        "percentile_min": over_scans(lambda s: s.percentile, min),
+        "error_position_median": over_scans(lambda s: s.error_position, middle),
+        "error_position_90": over_scans(lambda s: s.error_position, quantile_90),
+        "error_position_max": over_scans(lambda s: s.error_position, max),
+        "error_heading_median": over_scans(lambda s: s.error_heading, middle),
+        "error_heading_90": over_scans(lambda s: s.error_heading, quantile_90),
+        "effective_median": over_scans(lambda s: s.effective, middle),
+        "degenerate": sum(s.degenerate for s in score.scans),
+        "particle_beams_per_second": score.particle_beams_per_second,
+    }
 
 
 def logged_scans(
@@ -233,11 +190,18 @@ def logged_scans(
     offset: int = 0,
     limit: int | None = None,
 ) -> list[tuple[int, Scan]]:
-    """The chosen scans of a log and their numbers: ``offset``, ``offset + every``, ... up to ``limit`` of them.
+    """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., ``limit`` of them at most.
+
+    Args:
+        path: The log.
+        range_max: Readings of at least this are "no return" [m]; None for the log's "no return".
+        every: Stride of the scans.
+        offset: Index of the first scan.
+        limit: Largest number of scans; None for all.
 
     Raises:
-        ValueError: the log breaks its format, none of its scans is chosen, or a chosen one has no pose.
-        FileNotFoundError: it is missing.
+        ValueError: the log breaks its format, no scan is chosen, or a chosen scan has no pose or another scanner.
+        FileNotFoundError: the log is missing.
     """
     last = None if limit is None else offset + every * limit
     chosen = list(itertools.islice(enumerate(read_log(path, range_max=range_max)), offset, last, every))
@@ -254,39 +218,40 @@ def logged_scans(
 def score_log(
     models: Sequence[Model],
     scans: Sequence[tuple[int, Scan]],
-    cloud: Cloud,
+    sampler: ParticleSampler,
     step: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[BackendScore], list[Agreement]]:
-    """Score every scan with every model on the same particles, and compare each two models.
+    """Score every scan with every model on the same particles, and compare the models in pairs.
 
     Args:
         models: The same model on one backend or several.
-        scans: Scans of the models' scanner, each with its number and its pose.
-        cloud: How the particles are drawn.
+        scans: Scans of the models' scanner, each with its index and its pose.
+        sampler: Draws the particles of a scan.
         step: Called with a text before each scan.
     """
-    found: list[list[ScanScore]] = [[] for _ in models]
+    scores: list[list[ScanScore]] = [[] for _ in models]
     pairs = list(itertools.combinations(range(len(models)), 2))
     comparisons = [Comparison(models[a], models[b]) for a, b in pairs]
     for index, scan in scans:
         step(f"scan {index}")
         assert scan.pose is not None
-        poses = cloud.draw(index, scan.pose, models[0].grid)
+        poses = sampler.draw(index, scan.pose, models[0].grid)
         beams = evaluated_beams(models[0], scan.ranges)
-        scored = []
-        for model, own in zip(models, found, strict=True):
+        log_ps = []
+        for model, scan_scores in zip(models, scores, strict=True):
             begin = time.perf_counter()
-            log_p = model.log_likelihood(poses, scan.ranges)
-            own.append(score_scan(index, poses, log_p, beams, time.perf_counter() - begin))
-            scored.append(log_p)
+            log_ps.append(model.log_likelihood(poses, scan.ranges))
+            scan_scores.append(score_scan(index, poses, log_ps[-1], beams, time.perf_counter() - begin))
         for comparison, (a, b) in zip(comparisons, pairs, strict=True):
-            comparison.add(scored[a], scored[b])
-    scores = [BackendScore(m.device, cloud.particles, tuple(own)) for m, own in zip(models, found, strict=True)]
-    return scores, [comparison.result() for comparison in comparisons]
+            comparison.add(log_ps[a], log_ps[b])
+    backend_scores = [
+        BackendScore(model.device, sampler.particles, tuple(each)) for model, each in zip(models, scores, strict=True)
+    ]
+    return backend_scores, [comparison.result() for comparison in comparisons]
 
 
 def evaluated_beams(model: Model, ranges: Array) -> int:
-    """How many readings of a scan a model evaluates at every particle: its hits, as far as ``beams=`` takes them."""
+    """Count the readings of a scan that a model evaluates at every particle: its hits after thinning by ``beams=``."""
     kinds = classify(ranges, model.scanner)
     informative = isinstance(model.parameters, SensorTable) or model.parameters.z_max > 0
     return int(np.count_nonzero(choose_beams(kinds, model.beams, informative) & (kinds == Reading.HIT)))

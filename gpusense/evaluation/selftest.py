@@ -1,4 +1,4 @@
-"""Do the backends of this machine agree? Each against the float64 truth on its own rounded inputs, and pairwise."""
+"""Compare the backends of this machine: each with the float64 truth on its rounded inputs, and in pairs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, fr
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.tables.distances import distance_transform, empty_rectangles
+from gpusense.tables.distances import distance_transform
+from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -38,13 +39,13 @@ _MODELS: dict[str, tuple[Callable[..., BeamModel | LikelihoodFieldModel], dict[s
         },
     ),
 }
-# How wide a sonar hears [rad], and beyond which angle walls are mirrors to it [rad].
+# Width of a sonar's cone [rad], and the angle of incidence beyond which a wall reflects sound away [rad].
 _CONE, _CRITICAL = 0.2, 1.1
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is computed: a map, a scanner, a scan of it and poses."""
+    """A map, a scanner, poses (N, 3) [m, m, rad] and a scan (K,) [m]."""
 
     grid: OccupancyGrid
     scanner: Scanner
@@ -53,7 +54,13 @@ class Scene:
 
 
 def scene_in(grid: OccupancyGrid, scanner: Scanner, seed: int = 0) -> Scene:
-    """A simulated scan with missing and max readings; poses near by, all over, in walls, off the map and on corners."""
+    """Simulate a scan with missing and max readings, and draw poses near it, everywhere, off the map and on corners.
+
+    Args:
+        grid: The map.
+        scanner: The scanner.
+        seed: Seed of the random numbers.
+    """
     random = np.random.default_rng(seed)
     pose = free_pose(grid, random, 0.2)
     ranges = simulate_scan(grid, scanner, pose, BeamParameters(), random)
@@ -69,7 +76,7 @@ def scene_in(grid: OccupancyGrid, scanner: Scanner, seed: int = 0) -> Scene:
 
 
 def built_in_scene(seed: int = 0) -> Scene:
-    """A building far from the origin whose corners, the scanner's mount and a resolution of 1/16 m are exact."""
+    """Make a scene in a building far from the origin; its corners, mount and resolution are exact in float32."""
     plain = building(seed, (24.0, 14.0), resolution=0.0625)
     grid = OccupancyGrid(plain.cells, plain.resolution, (3000.0, -5000.0, 0.0))
     scanner = Scanner.uniform(
@@ -79,18 +86,18 @@ def built_in_scene(seed: int = 0) -> Scene:
 
 
 Results = dict[str, tuple[np.ndarray, Tolerance]]
-# So often a GPU scores the scene's poses at once, which is often enough for them to be put in an order.
+# Copies of the scene's poses in one call on a GPU: enough for the models to order them.
 _REPEATS = 192
 
 
 def chosen_backends(selections: Sequence[str] = ()) -> list[Backend]:
-    """The backends of selection strings, each device once; a single one is joined by ``"numpy"``.
+    """Open the backends of selection strings, each device once; ``"numpy"`` joins a single one.
 
     Args:
-        selections: None means every backend present, simulators left out.
+        selections: Selection strings; none selects every backend present except simulators.
 
     Raises:
-        ValueError: a selection names nothing, or a device that is absent.
+        ValueError: a selection is unknown, or names a device that is absent.
     """
     names = list(selections) or [d.selection for d in devices() if d.available and d.kind != "simulator"]
     if len(names) == 1:
@@ -105,73 +112,102 @@ def run(
     *,
     sonar: bool = True,
 ) -> list[Check]:
-    """Compare backends, each with the truth and each two; ``step`` gets a backend's name before its turn.
+    """Compare backends with the truth and in pairs.
 
-    ``sonar`` says whether a ring of sonars is among the models, for which the normals of the map are found often.
+    Args:
+        backends: The backends.
+        scene: The scene; the built-in one by default.
+        step: Called with a backend's selection string before its turn.
+        sonar: Whether a ring of sonars is among the models; it needs the normals of the map.
     """
     scene, checks = scene or built_in_scene(), []
-    found: dict[str, Results] = {}
+    results: dict[str, Results] = {}
     for backend in backends:
         step(backend.info.selection)
-        found[backend.info.selection], own = own_results(backend, scene, sonar=sonar)
-        checks += own
-    for left, right in itertools.combinations(found, 2):
-        for quantity, (value, tolerance) in found[left].items():
-            if quantity in found[right]:
-                checks.append(Check.of(left, right, quantity, value, found[right][quantity][0], tolerance.twice()))
+        results[backend.info.selection], truth_checks = evaluate_backend(backend, scene, sonar=sonar)
+        checks += truth_checks
+    for left, right in itertools.combinations(results, 2):
+        for quantity, (value, tolerance) in results[left].items():
+            if quantity in results[right]:
+                checks.append(Check.of(left, right, quantity, value, results[right][quantity][0], tolerance.twice()))
     return checks
 
 
-def own_results(backend: Backend, scene: Scene, *, sonar: bool = True) -> tuple[Results, list[Check]]:
-    """What a backend makes of a scene, and how far that is from the truth by its own inputs."""
+def evaluate_backend(backend: Backend, scene: Scene, *, sonar: bool = True) -> tuple[Results, list[Check]]:
+    """Compute a scene on a backend, and compare the results with the truth on the backend's rounded inputs.
+
+    Args:
+        backend: The backend.
+        scene: The scene.
+        sonar: Whether a ring of sonars is among the models.
+
+    Returns:
+        Results by quantity, for comparison with other backends, and the comparisons with the truth.
+    """
+    results, checks = _tables(backend, scene)
+    launches: dict[str, Launch] = {}
+    for precision in ("float32", "float64")[: 1 + backend.info.float64]:
+        results |= _ranges(backend, scene, precision, sonar=sonar)
+        for model in (name for name in _MODELS if sonar or name != _SONAR):
+            key = f"{precision} {model}"
+            scores, score_checks, launches[key] = _scores(backend, scene, precision, model)
+            results |= scores
+            checks += score_checks
+    if backend.info.float64:
+        single = launches["float32 field, nearest"].parts
+        double = replay(launches["float64 field, nearest"], single)[1].astype(np.float32)
+        tolerance = TOLERANCES["field look-ups"]
+        checks.append(
+            Check.of(backend.info.selection, "float64", "field, nearest, look-ups", single, double, tolerance)
+        )
+    return results, checks
+
+
+def _tables(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
+    """Compute the map's tables, and compare the distance transform with SciPy's."""
     name, obstacles = backend.info.selection, scene.grid.obstacles()
     rows, cols = obstacles.shape
     squared, exact = distance_transform(obstacles, backend=backend), TOLERANCES["distance transform"]
     planes = backend.download(empty_rectangles(backend, obstacles, 1), np.empty(4 * (rows + 2) * (cols + 2), np.uint16))
     sides = np.minimum(planes & 255, planes >> 8)
     results: Results = {exact.name: (squared, exact), "empty squares": (sides, TOLERANCES["empty squares"])}
-    checks = [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]
-    launches: dict[str, Launch] = {}
-    same_bits = TOLERANCES["batching, order, repetition"]
-    for precision in ("float32", "float64")[: 1 + backend.info.float64]:
-        caster = RayCaster(scene.grid, scene.scanner.range_max, backend=backend, precision=precision)
-        ranges = TOLERANCES[f"{precision} ranges"]
-        results[ranges.name] = caster.cast(scene.poses, scene.scanner.bearings), ranges
-        if sonar:
-            ring = _model(_SONAR, scene, backend, precision)
-            assert isinstance(ring, BeamModel)
-            results[f"{precision} ranges of cones"] = ring.expected_ranges(scene.poses), ranges
-            angles = TOLERANCES[f"{precision} angles of incidence"]
-            # A cone from which nothing returns has no angle, which -1 tells from every one.
-            results[angles.name] = np.nan_to_num(ring.incidence(scene.poses), nan=-1.0), angles
-        beam, scan = beam_tolerance(precision), scan_tolerance(precision, scene.scanner.count)
-        for model in (name for name in _MODELS if sonar or name != _SONAR):
-            recorder = Recorder(backend)
-            log_p, parts = _score(model, scene, recorder, precision)
-            key = f"{precision} {model}"
-            results |= {f"{key}, scans": (log_p, scan), f"{key}, beams": (parts, beam)}
-            (launch,) = recorder.launches
-            launches[key] = launch
-            true_log_p, true_parts = replay(launch)
-            _, unspecialized = _score(model, scene, backend, precision, specialize=False)
-            repeats = _REPEATS if backend.info.kind == "gpu" else 1
-            alone = _model(model, scene, backend, precision).log_likelihood(
-                np.tile(scene.poses, (repeats, 1)), scene.ranges
-            )
-            loose = TOLERANCES[f"specialize=False, {precision}"]
-            checks += [
-                Check.of(name, "truth", f"{key}, scans", launch.values["log_p"], true_log_p, scan),
-                Check.of(name, "truth", f"{key}, beams", launch.parts, true_parts, beam),
-                Check.of(name, "specialize=False", f"{key}, beams", unspecialized, parts, loose),
-                Check.of(name, "per_beam=True", f"{key}, scans alone", alone, np.tile(log_p, repeats), same_bits),
-            ]
-    if backend.info.float64:
-        single = launches["float32 field, nearest"].parts
-        double = replay(launches["float64 field, nearest"], single)[1].astype(np.float32)
-        checks.append(
-            Check.of(name, "float64", "field, nearest, look-ups", single, double, TOLERANCES["field look-ups"])
-        )
-    return results, checks
+    return results, [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]
+
+
+def _ranges(backend: Backend, scene: Scene, precision: str, *, sonar: bool) -> Results:
+    """Compute expected ranges and, for the ring of sonars, those of cones and angles of incidence."""
+    caster = RayCaster(scene.grid, scene.scanner.range_max, backend=backend, precision=precision)
+    ranges, angles = TOLERANCES[f"{precision} ranges"], TOLERANCES[f"{precision} angles of incidence"]
+    results: Results = {ranges.name: (caster.cast(scene.poses, scene.scanner.bearings), ranges)}
+    if sonar:
+        ring = _model(_SONAR, scene, backend, precision)
+        assert isinstance(ring, BeamModel)
+        results[f"{precision} ranges of cones"] = ring.expected_ranges(scene.poses), ranges
+        # A cone without return has no angle: -1 stands for it, which is no angle of incidence.
+        results[angles.name] = np.nan_to_num(ring.incidence(scene.poses), nan=-1.0), angles
+    return results
+
+
+def _scores(backend: Backend, scene: Scene, precision: str, model: str) -> tuple[Results, list[Check], Launch]:
+    """Score a scene with one model; compare with the truth, the unspecialised model and scores without ``per_beam``."""
+    name, key = backend.info.selection, f"{precision} {model}"
+    beam, scan = beam_tolerance(precision), scan_tolerance(precision, scene.scanner.count)
+    recorder = Recorder(backend)
+    log_p, parts = _score(model, scene, recorder, precision)
+    (launch,) = recorder.launches
+    true_log_p, true_parts = replay(launch)
+    _, unspecialized = _score(model, scene, backend, precision, specialize=False)
+    repeats = _REPEATS if backend.info.kind == "gpu" else 1
+    poses = np.tile(scene.poses, (repeats, 1))
+    alone = _model(model, scene, backend, precision).log_likelihood(poses, scene.ranges)
+    loose, same_bits = TOLERANCES[f"specialize=False, {precision}"], TOLERANCES["batching, order, repetition"]
+    checks = [
+        Check.of(name, "truth", f"{key}, scans", launch.values["log_p"], true_log_p, scan),
+        Check.of(name, "truth", f"{key}, beams", launch.parts, true_parts, beam),
+        Check.of(name, "specialize=False", f"{key}, beams", unspecialized, parts, loose),
+        Check.of(name, "per_beam=True", f"{key}, scans alone", alone, np.tile(log_p, repeats), same_bits),
+    ]
+    return {f"{key}, scans": (log_p, scan), f"{key}, beams": (parts, beam)}, checks, launch
 
 
 def _model(model: str, scene: Scene, backend: Any, precision: str, **options: Any) -> BeamModel | LikelihoodFieldModel:
@@ -181,7 +217,7 @@ def _model(model: str, scene: Scene, backend: Any, precision: str, **options: An
 
 
 def sonar_of(scanner: Scanner) -> Scanner:
-    """A ring of sonars with a scanner's bearings, cones of three rays."""
+    """Make a ring of sonars with a scanner's bearings and cones of three rays."""
     return Scanner(
         scanner.bearings, scanner.range_max, range_min=scanner.range_min, mount=scanner.mount,
         cone=_CONE, cone_rays=3, critical_incidence=_CRITICAL,
@@ -194,7 +230,7 @@ def _score(model: str, scene: Scene, backend: Any, precision: str, **options: An
 
 
 def scipy_squares(obstacles: np.ndarray) -> np.ndarray:
-    """The squared distance transform as SciPy has it, for maps with an obstacle: int32."""
+    """Compute the squared distance transform (int32) with SciPy; the map must have an obstacle."""
     from scipy.ndimage import distance_transform_edt
 
     return np.rint(np.square(distance_transform_edt(~obstacles))).astype(np.int32)

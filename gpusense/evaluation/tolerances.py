@@ -1,9 +1,9 @@
-"""How far results may lie apart, and why: the one table that the tests, ``gpusense selftest`` and the documents use.
+"""Tolerances with their reasons: the one table that the tests, ``gpusense selftest`` and the pages use.
 
-A float32 result is never held against the float64 result of the same call: they round their inputs differently, and a
-ray that grazes a corner may then end at another wall. Ray casting is judged by bits across devices; a likelihood is
-judged against the float64 reference kernel *on the float32 launch's own rounded inputs and expected ranges* (see
-``replay.replay``). Two devices that each keep a bound against that truth lie at most twice the bound apart.
+A float32 result is never compared with the float64 result of the same call: their inputs are rounded differently, and a
+ray that grazes a corner may then end at another wall. Ranges are compared bit by bit across devices. A likelihood is
+compared with the float64 reference kernel *on the float32 launch's rounded inputs and expected ranges* (see
+``replay.replay``). Two devices that each keep a bound against that truth differ by at most twice the bound.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS
 
 Floats = NDArray[np.floating]
 
@@ -25,13 +25,13 @@ _COUNTED = ("cells that differ", "values with other bits", "beams in another cel
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The largest difference allowed.
+    """Largest difference allowed for one quantity.
 
     Attributes:
-        name: What is compared.
-        value: The largest difference, itself allowed.
-        unit: What the difference is measured in; eps is float32's, 1.2e-7.
-        reason: Where the number comes from.
+        name: The quantity.
+        value: Largest difference allowed, inclusive.
+        unit: Unit of the difference; eps is float32's, 1.2e-7.
+        reason: Derivation of the value.
     """
 
     name: str
@@ -40,18 +40,22 @@ class Tolerance:
     reason: str
 
     def twice(self) -> Tolerance:
-        """The tolerance between two results that each keep this one against the truth."""
+        """Return the tolerance between two results that each keep this one against the truth."""
         return Tolerance(self.name, 2 * self.value, self.unit, f"both sides keep half of it: {self.reason}")
 
-    def difference(self, found: ArrayLike, truth: ArrayLike) -> float:
-        """Largest difference of two arrays of one shape in the tolerance's unit.
+    def difference(self, computed: ArrayLike, truth: ArrayLike) -> float:
+        """Return the largest difference of two arrays of one shape in the tolerance's unit.
 
-        What is counted differs in its bits; NaN equals NaN and -0 does not equal 0. Elsewhere equal values, infinite
-        ones included, differ by 0, and a NaN, or an infinity on one side only, differs infinitely.
+        Units that count compare bits: NaN equals NaN, and -0 does not equal 0. In other units equal values differ by
+        0, infinite ones included; a NaN, or an infinity on one side only, differs infinitely.
+
+        Args:
+            computed: The array to check.
+            truth: The array to compare it with.
         """
         if self.unit in _COUNTED:
-            return differing(found, truth)
-        a, b = np.asarray(found, np.float64), np.asarray(truth, np.float64)
+            return differing(computed, truth)
+        a, b = np.asarray(computed, np.float64), np.asarray(truth, np.float64)
         if a.shape != b.shape:
             return math.inf
         with np.errstate(all="ignore"):
@@ -60,7 +64,7 @@ class Tolerance:
         return float(np.max(np.where(a == b, 0.0, apart), initial=0.0))
 
     def _size(self, size: Floats) -> Floats:
-        """One unit at each value of that size."""
+        """Return the tolerance's unit at each magnitude."""
         if self.unit == "relative":
             return size
         scale = _EPS if self.unit.startswith("eps") else 1.0
@@ -73,11 +77,11 @@ _ALL = (
     Tolerance("placed poses", 0, "values with other bits", "float64 sums, products and quotients, each rounded"),
     Tolerance(
         "cosines and sines of headings", 0.9, "ulps of float64",
-        "half an ulp of the last sum, and up to 0.4 of what rounds its terms and of the polynomials",
+        "half an ulp of the last sum, and up to 0.4 from the rounding of its terms and the polynomials",
     ),
     Tolerance(
         "exp, 1 - exp and log in lanes", 1.1, "ulps of float32",
-        "half an ulp of the last operation, and what rounds its terms and the polynomials",
+        "half an ulp of the last operation, and the rounding of its terms and the polynomials",
     ),
     Tolerance(
         "erf in lanes", 4, "ulps of float32",
@@ -85,8 +89,7 @@ _ALL = (
     ),
     Tolerance(
         "float32 ranges", 0, "values with other bits",
-        "+, -, *, / and floor are rounded alike by every device, nothing is contracted, and sines and cosines are made "
-        "of these alone",
+        "+, -, *, / and floor round alike on every device, nothing is contracted; sines and cosines use only these",
     ),
     Tolerance(
         "float64 ranges", 1e-12, "relative",
@@ -100,8 +103,8 @@ _ALL = (
         "exp, log, tanh and division within a few eps, erf within 16 eps (OpenCL), u^2 / 2 within 3 eps of itself",
     ),
     Tolerance("float64 beam", 1e-11, "1 + |log p_k|", "a few eps, with room for drivers whose erf or tanh is poor"),
-    Tolerance("float32 scan, K = 1000", 2e-3, "nats", "below what changes a particle's weight by 0.2 %"),
-    Tolerance("float32 scan, K = 10 000", 1e-2, "nats", "below what changes a particle's weight by 1 %"),
+    Tolerance("float32 scan, K = 1000", 2e-3, "nats", "changes a particle's weight by less than 0.2 %"),
+    Tolerance("float32 scan, K = 10 000", 1e-2, "nats", "changes a particle's weight by less than 1 %"),
     Tolerance("float64 scan", 1e-11, "1 + |log p|", "a few eps a beam, and a compensated sum"),
     Tolerance(
         "field look-ups", 0, "beams in another cell",
@@ -110,7 +113,7 @@ _ALL = (
     ),
     Tolerance(
         "landmark", 16, "eps (1 + |log p_k|) of the precision",
-        "exponents and angles in two numbers; what is left are exp, log, log1p and erf within a few eps",
+        "exponents and angles in two numbers; exp, log, log1p and erf add a few eps",
     ),
     Tolerance(
         "normals of straight walls, mean", 2, "degrees",
@@ -130,14 +133,14 @@ _ALL = (
     ),
     Tolerance(
         "float32 sums to learn from", 2e-5, "relative",
-        "a pair's terms carry the rounding of z, z* and sigma to float32, which u^2 multiplies by its size",
+        "a pair's terms carry the rounding of z, z* and sigma to float32, amplified by u^2",
     ),
     Tolerance(
         "learned parameters", 1e-6, "relative",
-        "float64 on every backend: EM ends within 1e-8 nats of the optimum, and goes the same way to it everywhere",
+        "float64 on every backend: EM ends within 1e-8 nats of the optimum, by the same iterates everywhere",
     ),
     Tolerance(
-        "exact EM falls", 1e-9, "|log-likelihood|", "rounding of sums; every step is held to what it gains before",
+        "exact EM falls", 1e-9, "|log-likelihood|", "rounding of sums; a step that does not gain is rejected",
     ),
     Tolerance("batching, order, repetition", 0, "values with other bits", "one work-item scores a particle by itself"),
 )  # fmt: skip
@@ -152,10 +155,10 @@ class Check:
 
     Attributes:
         left: Selection string of a backend.
-        right: That of another one, or what the truth is.
-        quantity: What is compared.
+        right: Selection string of another backend, or the name of the truth.
+        quantity: The quantity compared.
         difference: The largest difference, in the tolerance's unit.
-        tolerance: What is allowed.
+        tolerance: The largest difference allowed.
     """
 
     left: str
@@ -165,29 +168,33 @@ class Check:
     tolerance: Tolerance
 
     @classmethod
-    def of(cls, left: str, right: str, quantity: str, found: Any, truth: Any, tolerance: Tolerance) -> Check:
-        """Compare what was found with what it should be."""
-        return cls(left, right, quantity, tolerance.difference(found, truth), tolerance)
+    def of(cls, left: str, right: str, quantity: str, computed: Any, truth: Any, tolerance: Tolerance) -> Check:
+        """Compare a computed array with the truth."""
+        return cls(left, right, quantity, tolerance.difference(computed, truth), tolerance)
 
     @property
     def passed(self) -> bool:
-        """Whether the difference is allowed."""
+        """Return whether the difference is allowed."""
         return self.difference <= self.tolerance.value
 
 
 def beam_tolerance(dtype: DTypeLike) -> Tolerance:
-    """The tolerance of one beam's log-likelihood in a precision."""
+    """Return the tolerance of one beam's log-likelihood in a precision."""
     return TOLERANCES[f"{np.dtype(dtype).name} beam"]
 
 
 def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
-    """The tolerance of a scan's log-likelihood in an ordinary scene of so many beams.
+    """Return the tolerance of a scan's log-likelihood in an ordinary scene.
 
-    In a scene where beams have |log p_k| in the thousands, float32 cannot hold the sum to 2e-3 nats; there
-    :func:`per_scan` says what remains.
+    In a scene where beams have |log p_k| in the thousands, float32 cannot represent the sum to 2e-3 nats;
+    :func:`per_scan` bounds the error there.
+
+    Args:
+        dtype: The precision, float32 or float64.
+        beams: Number of beams.
 
     Raises:
-        ValueError: float32 and more than 10 000 beams, for which nothing is promised in nats.
+        ValueError: float32 and more than 10 000 beams, for which there is no bound in nats.
     """
     if np.dtype(dtype) == np.float64:
         return TOLERANCES["float64 scan"]
@@ -197,14 +204,14 @@ def scan_tolerance(dtype: DTypeLike, beams: int) -> Tolerance:
 
 
 def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
-    """The largest error of each beam's log-likelihood.
+    """Return the largest error allowed of each beam's log-likelihood.
 
     Args:
         log_p: Log-likelihoods of beams, of any shape.
-        dtype: The precision that is judged, float32 or float64.
+        dtype: The precision under test, float32 or float64.
 
     Returns:
-        float64 of the same shape [nats]; 0 where log p is infinite, which must be met exactly.
+        float64 of the same shape [nats]; 0 where log p is infinite, which must be exact.
     """
     tolerance = beam_tolerance(dtype)
     scale = tolerance.value * (_EPS if tolerance.unit.startswith("eps") else 1.0)
@@ -213,16 +220,16 @@ def per_beam(log_p: ArrayLike, dtype: DTypeLike) -> Floats:
 
 
 def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperature: float = 1.0) -> Floats:
-    """The largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
+    """Return the largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
 
-    BLOCK_TERMS terms are added plainly, which loses (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes. Blocks
-    are added with compensation, which loses the square of what their plain sum would. The final sum and its product
-    with the temperature round once each. float64 is held to its own, wider rule.
+    BLOCK_TERMS terms are added plainly, with an error of (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes.
+    Blocks are added with compensation, with the square of a plain sum's relative error. The final sum and its product
+    with the temperature round once each. float64 has a wider rule of its own.
 
     Args:
         parts: (..., K) log-likelihoods of the beams before the temperature.
-        dtype: The precision that is judged, float32 or float64.
-        fixed: What is added for readings that do not depend on the pose.
+        dtype: The precision under test, float32 or float64.
+        fixed: Constant term of the readings that do not depend on the pose.
         temperature: The factor of the sum.
 
     Returns:
@@ -242,7 +249,7 @@ def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperat
 
 
 def differing(left: ArrayLike, right: ArrayLike) -> int:
-    """How many values of two arrays differ in their bits; NaN equals NaN, and 0 differs from -0."""
+    """Count the values of two arrays that differ in their bits; NaN equals NaN, and 0 differs from -0."""
     a, b = np.asarray(left), np.asarray(right)
     if a.dtype != b.dtype or a.shape != b.shape:
         return max(a.size, b.size, 1)

@@ -16,8 +16,8 @@ from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
+from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.launches import Program, launch
-from gpusense.reference.heading import LIMIT
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_scalars, place_poses
 from gpusense.world.windows import Corners, Window
@@ -91,7 +91,7 @@ class Poses:
         """The flags of kernels that place these poses."""
         if self.host is None:
             return _HUGE_SINGLE if self._dtype == _SINGLE else _HUGE
-        return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LIMIT else _PLAIN
+        return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LARGEST_HEADING else _PLAIN
 
     def buffer(self, backend: Backend, space: Workspace, part: Part) -> Buffer:
         """Return some poses on the device, uploaded where they are not there; None where the host must place them."""

@@ -7,21 +7,37 @@ from gpusense.plots.drawing import (
     draw_pose,
     draw_pose_density,
     draw_scan,
-    localization_figure,
     new_figure,
     pose_lattice,
     save,
 )
+from gpusense.plots.localization import localization_figure
+from gpusense.plots.positions import (
+    draw_beacons,
+    draw_fix,
+    draw_position_density,
+    draw_solution_set,
+    position_log_density,
+    set_view,
+    tile_centers,
+)
 
 __all__ = [
     "add_colour_bar",
+    "draw_beacons",
+    "draw_fix",
     "draw_map",
     "draw_particles",
     "draw_pose",
     "draw_pose_density",
+    "draw_position_density",
     "draw_scan",
+    "draw_solution_set",
     "localization_figure",
     "new_figure",
     "pose_lattice",
+    "position_log_density",
     "save",
+    "set_view",
+    "tile_centers",
 ]

@@ -1,4 +1,4 @@
-"""Work-precision diagrams and performance profiles, as Matplotlib figures."""
+"""Draw work-precision diagrams and performance profiles as Matplotlib figures."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ MEASURES = {
         ("log-p", "log_p", "rms", "RMS error of the scan's log-likelihood [nats]"),
     ),
 }
-"""By problem: the diagrams' short names, kinds and names of errors, and axes."""
+"""By problem: each diagram's short name, its error's kind and name, and its axis label."""
 
-# Exact points whose share of rays off by more than a cell is larger are drawn where they were measured.
+# Largest share of rays off by more than a cell for which an exact point is drawn in the strip of exact points.
 _EXACT_ENOUGH = 1e-3
-# Errors below this are drawn at it: they are rounding.
+# Lower clamp of drawn errors, which are rounding below it.
 _SMALLEST = 1e-9
 
-# Okabe and Ito's colours for colour-blind eyes first.
+# Okabe and Ito's palette first, which remains distinct under colour blindness.
 _COLOURS = (
     "#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f4f24", "#5e3c99", "#66a61e",
     "#a6761d", "#e7298a", "#8b0000", "#1b7f79", "#7a7a7a", "#b5651d", "#2f4f9f", "#c71585", "#556b2f", "#008b8b",
@@ -49,14 +49,14 @@ _LINES = {"float32": "-", "float64": ":"}
 
 @dataclass(frozen=True)
 class Style:
-    """What the curves look like: a colour for each method, a marker for each device."""
+    """Style of the curves: a colour for each method, a marker for each device."""
 
     colours: Mapping[str, str]
     markers: Mapping[str, str]
 
     @classmethod
     def of(cls, points: Sequence[Point]) -> Style:
-        """The style of a report, the same in all its diagrams."""
+        """Make the style of a report's points, for all its diagrams."""
         methods = list(dict.fromkeys(map(label, points)))
         devices = list(dict.fromkeys(point["backend"] for point in points))
         return cls(
@@ -66,7 +66,7 @@ class Style:
 
 
 def work_precision(points: Sequence[Point], style: Style, measure: Sequence[str], timing: str = "call") -> Figure:
-    """Time over error, a panel for each scene, both axes logarithmic.
+    """Draw time over error, a panel for each scene, both axes logarithmic.
 
     Args:
         points: Points of one problem and one cloud.
@@ -87,19 +87,19 @@ def work_precision(points: Sequence[Point], style: Style, measure: Sequence[str]
         ax.set_title(scene, loc="left")
     for ax in axes.flat[len(scenes) :]:
         ax.set_visible(False)
-    what = "ray" if points and points[0]["problem"] == "ranges" else "particle-beam"
+    unit = "ray" if points and points[0]["problem"] == "ranges" else "particle-beam"
     words = "call, arrays in and out" if timing == "call" else "launch alone"
     for i, ax in enumerate(axes.flat[: len(scenes)]):
         if i >= len(scenes) - columns:
             ax.set_xlabel(title)
         if i % columns == 0:
-            ax.set_ylabel(f"time per {what} [ns]\n{words}")
+            ax.set_ylabel(f"time per {unit} [ns]\n{words}")
     _legend(figure, style, points, front=True)
     return figure
 
 
 def place(point: Point, kind: str, name: str) -> float | None:
-    """Where a point lies on the axis of errors: 0 for the strip of exact ones, None for that of failed ones."""
+    """Return a point's place on the axis of errors: 0 for the strip of exact points, None for that of failed ones."""
     error = error_of(point, kind, name)
     if error is None:
         return None
@@ -114,7 +114,7 @@ def _panel(ax: Axes, points: Sequence[Point], style: Style, kind: str, name: str
     errors = [error for error, y, _ in placed if error and y]
     low = 10.0 ** math.floor(math.log10(min(errors, default=1e-2)))
     high = 10.0 ** math.ceil(math.log10(max(errors, default=1.0) * 1.001))
-    # Strips for exact and failed points, each an eighth of the decades in between.
+    # Strips for exact and failed points; the width of each is 14 % of the decades in between.
     width = (high / low) ** 0.14
     left, right = low / width**0.5, high * width**0.5
     ax.set(xscale="log", yscale="log", xlim=(low / width, high * width))
@@ -133,16 +133,16 @@ def _panel(ax: Axes, points: Sequence[Point], style: Style, kind: str, name: str
             key = (label(point), point["backend"], point["precision"])
             curves.setdefault(key, []).append((left if error == 0 else error, y, point))
         elif point["status"] != "left out":
-            # Without a time it is listed from the top of the strip down.
+            # A failed point without a time is listed from the top of the strip downwards.
             height = y if y else 0.96 - 0.045 * unplaced
             unplaced += not y
             ax.plot([right], [height], "x", color=colour, ms=7, mew=1.6,
                     transform=ax.transData if y else ax.get_xaxis_transform(), clip_on=False)  # fmt: skip
             ax.plot([right], [height], marker, color=colour, ms=4, mfc="none", mew=0.6,
                     transform=ax.transData if y else ax.get_xaxis_transform(), clip_on=False)  # fmt: skip
-    for (method, backend, precision), own in curves.items():
-        own.sort(key=lambda item: item[2]["value"] or 0)
-        ax.plot([x for x, _, _ in own], [y for _, y, _ in own], _LINES[precision], color=style.colours[method],
+    for (method, backend, precision), curve in curves.items():
+        curve.sort(key=lambda item: item[2]["value"] or 0)
+        ax.plot([x for x, _, _ in curve], [y for _, y, _ in curve], _LINES[precision], color=style.colours[method],
                 marker=style.markers[backend], ms=5, lw=1.1, mew=0.7,
                 mfc="none" if precision == "float64" else style.colours[method], alpha=0.9, zorder=3)  # fmt: skip
     ax.grid(True, which="major", color="#e3e7ed", lw=0.6, zorder=1)
@@ -150,7 +150,7 @@ def _panel(ax: Axes, points: Sequence[Point], style: Style, kind: str, name: str
 
 
 def _label_times(ax: Axes) -> None:
-    """Plain numbers at 1, 2 and 5 of each decade."""
+    """Label the axis of times with plain numbers at 1, 2 and 5 of each decade."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=30))
@@ -159,7 +159,7 @@ def _label_times(ax: Axes) -> None:
 
 
 def _draw_front(ax: Axes, seen: Sequence[tuple[float, float]], high: float) -> None:
-    """The Pareto front as stairs: what no other point beats in both error and time."""
+    """Draw the Pareto front as stairs: the points that no other point dominates in error and time."""
     front = [seen[i] for i in pareto_front(seen)]
     if front:
         ax.step([x for x, _ in front] + [high], [y for _, y in front] + [front[-1][1]], where="post", color=_FRONT,
@@ -190,10 +190,10 @@ def _legend(figure: Figure, style: Style, points: Sequence[Point], *, front: boo
 
 
 def profile_figure(profiles: Sequence[Mapping[str, Any]], points: Sequence[Point], style: Style) -> Figure:
-    """Performance profiles: a panel for each problem and kind of device.
+    """Draw performance profiles, a panel for each problem and kind of device.
 
     Args:
-        profiles: What ``profiles_of`` returned.
+        profiles: Profiles of :func:`gpusense.evaluation.benchmark.profiles.profiles_of`.
         points: The report's points.
         style: Colours and markers.
     """

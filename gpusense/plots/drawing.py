@@ -1,6 +1,6 @@
-"""Drawing: maps, scans, particles and densities over poses, each onto a Matplotlib ``Axes``.
+"""Draw maps, scans, particles and densities over poses, each onto a Matplotlib ``Axes``.
 
-Matplotlib is imported when something is drawn. ``pyplot`` and its global state are never touched: make a figure with
+Matplotlib is imported on first use. ``pyplot`` and its global state are never touched: make a figure with
 :func:`new_figure`, draw, and write it with :func:`save`.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,14 +28,24 @@ if TYPE_CHECKING:
 
 FREE, UNKNOWN, OCCUPIED = "#ffffff", "#dfe3e8", "#4a5568"
 BEAM, ROBOT, FRAME = "#0077b6", "#d7263d", "#9aa5b1"
-# From unlikely to likely, ever darker: as good on paper, in grey and to colour-blind eyes.
+# From unlikely to likely with falling lightness: readable on paper, in grey and under colour blindness.
 SCALE = ("#eef1f5", "#ffd166", "#f3722c", "#b5179e", "#3a0ca3")
-# Dots per inch of a saved image; shapes of many points are drawn as pixels in vector formats too.
+# Dots per inch of a saved image; clouds of points are rasterised in vector formats too.
 DPI = 150
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of that size [inches] whose parts make room for each other."""
+    """Make an empty figure with a constrained layout.
+
+    Args:
+        width: Width [inches].
+        height: Height [inches].
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.new_figure(6.0, 4.0).get_size_inches().tolist()
+        [6.0, 4.0]
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -46,20 +55,30 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def draw_map(ax: Axes, grid: OccupancyGrid) -> AxesImage:
-    """The map: occupied cells dark, unknown ones grey, free ones white; axes in metres of the world.
+    """Draw a map: occupied cells dark, unknown cells grey, free cells white; axes in metres of the world.
 
-    What :func:`draw_pose_density` draws shows through the free cells.
+    Free cells are transparent to :func:`draw_pose_density`.
 
     Args:
-        ax: Where to draw.
-        grid: The map; its origin's yaw turns the picture.
+        ax: Axes to draw onto.
+        grid: The map; its origin's yaw rotates the picture.
+
+    Returns:
+        The image of the map.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> image = gs.plots.draw_map(ax, gs.worlds.building())
+        >>> ax.get_xlabel()
+        'x [m]'
     """
     from matplotlib.colors import to_rgba
 
     palette = np.array([to_rgba(FREE), to_rgba(UNKNOWN), to_rgba(OCCUPIED)], dtype=np.float32)
     kinds = np.where(grid.occupied, 2, np.where(grid.unknown, 1, 0))
     _over_grid(ax, grid, palette[kinds], zorder=0)
-    palette[0, 3] = 0  # the upper layer is for what is drawn in between
+    palette[0, 3] = 0  # free cells of the upper layer are transparent to the layers in between
     image = _over_grid(ax, grid, palette[kinds], zorder=2)
     x_min, y_min, x_max, y_max = grid.bounds()
     ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), aspect="equal", xlabel="x [m]", ylabel="y [m]")
@@ -70,19 +89,26 @@ def draw_map(ax: Axes, grid: OccupancyGrid) -> AxesImage:
 
 
 def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, ranges: ArrayLike) -> int:
-    """A scan as it lies on the map when the robot stands at a pose: thin beams, their end points, the robot.
+    """Draw a scan at a pose: thin beams, their end points, the robot.
 
     Readings without a range ("no return" and missing ones) are not drawn.
 
     Args:
-        ax: Where to draw, usually onto :func:`draw_map`.
-        grid: The map, which gives the size of the robot's arrow.
+        ax: Axes to draw onto, usually those of :func:`draw_map`.
+        grid: The map; its size sets the length of the robot's arrow.
         scanner: The scanner's geometry, mount included.
         pose: (3,) the robot's x, y and theta in the world [m, m, rad].
         ranges: (K,) readings [m].
 
     Returns:
         The number of readings that were drawn.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=5.0)
+        >>> gs.plots.draw_scan(ax, gs.worlds.building(), scanner, (4.0, 3.0, 0.0), [2.0, float("inf"), 3.0])
+        2
     """
     from matplotlib.collections import LineCollection
 
@@ -102,7 +128,18 @@ def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, 
 
 
 def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) -> None:
-    """A pose: a ring at its position and an arrow along its heading, ``length`` metres long (0: no arrow)."""
+    """Draw a pose: a ring at its position and an arrow along its heading.
+
+    Args:
+        ax: Axes to draw onto.
+        pose: (3,) x, y and theta in the world [m, m, rad].
+        length: Length of the arrow [m]; 0 draws none.
+        colour: Colour of ring and arrow.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.draw_pose(gs.plots.new_figure(6.0, 4.0).subplots(), (1.0, 2.0, 0.5), length=0.5)
+    """
     x, y, theta = checks.array("pose", pose, (3,)).tolist()
     if length > 0:
         tip = (x + length * math.cos(theta), y + length * math.sin(theta))
@@ -114,7 +151,18 @@ def draw_pose(ax: Axes, pose: ArrayLike, *, length: float, colour: str = ROBOT) 
 
 
 def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
-    """A colour bar as high as its axes; the arrow at its low end says that values go on below."""
+    """Add a colour bar beside an axes, with an arrow at its low end for values below the scale.
+
+    Args:
+        ax: The axes.
+        mappable: Image or collection with the colours, as the drawing functions return it.
+        label: The bar's label.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> gs.plots.add_colour_bar(ax, gs.plots.draw_particles(ax, [(0.0, 0.0, 0.0)], [-1.0]), "log p [nats]")
+    """
     bar = ax.figure.colorbar(mappable, cax=ax.inset_axes((1.015, 0.0, 0.02, 1.0)), extend="min")
     bar.set_label(label)
     bar.outline.set_edgecolor(FRAME)
@@ -123,17 +171,24 @@ def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
 def draw_particles(
     ax: Axes, poses: ArrayLike, log_p: ArrayLike, *, size: float = 3.0, depth: float | None = None
 ) -> PathCollection:
-    """Particles coloured by their log-likelihood, the likely ones on top.
+    """Draw particles coloured by their log-likelihood, the likeliest on top.
 
     Args:
-        ax: Where to draw.
+        ax: Axes to draw onto.
         poses: (N, 3) x, y and theta in the world [m, m, rad].
-        log_p: (N,) log-likelihoods, natural logarithm; -inf is drawn as the colour scale's low end.
+        log_p: (N,) log-likelihoods, natural logarithm; -inf has the colour of the scale's low end.
         size: Area of a particle [points squared].
-        depth: How far the colour scale reaches below the best [nats]; by default half of the particles lie on it.
+        depth: Extent of the colour scale below the best value [nats]; by default half of the particles lie on it.
 
     Returns:
-        What a colour bar takes.
+        The collection, for :func:`add_colour_bar`.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> poses = [(0.0, 0.0, 0.0), (1.0, 2.0, 0.5)]
+        >>> gs.plots.draw_particles(ax, poses, [-3.0, -1.0]).get_offsets().tolist()
+        [[0.0, 0.0], [1.0, 2.0]]
     """
     position = checks.array("poses", poses, ("N", 3))[:, :2]
     value = checks.array("log_p", log_p, (len(position),), finite=False)
@@ -148,20 +203,26 @@ def draw_particles(
 def pose_lattice(
     grid: OccupancyGrid, spacing: float, theta: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool], tuple[float, float]]:
-    """Poses with one heading all over a map, in a lattice along the grid's own axes.
+    """Make a lattice of poses with one heading over a map, along the grid's axes.
 
     Args:
         grid: The map.
-        spacing: Wanted distance between neighbours [m], > 0; it is rounded to whole cells.
+        spacing: Distance between neighbours [m], > 0; it is rounded to whole cells.
         theta: The heading of all poses in the world [rad].
 
     Returns:
-        (R C, 3) poses row by row, (R, C) whether there is a free cell to stand on, and the lattice's extent (W, H)
-        along the grid's axes [m], for :func:`draw_pose_density`. A pose stands on the free cell that is nearest to
-        the middle of its tile.
+        (R C, 3) poses row by row, (R, C) whether the pose's tile has a free cell, and the lattice's extent (W, H)
+        along the grid's axes [m], for :func:`draw_pose_density`. A pose lies in the free cell nearest to the middle of
+        its tile.
 
     Raises:
         TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+
+    Example:
+        >>> import gpusense as gs
+        >>> poses, free, extent = gs.plots.pose_lattice(gs.worlds.building(), 0.5, theta=0.0)
+        >>> poses.shape, free.shape, extent
+        ((2400, 3), (40, 60), (30.0, 20.0))
     """
     step = max(round(checks.real("spacing", spacing, above=0) / grid.resolution), 1)
     rows, cols = (-(-count // step) for count in grid.shape)
@@ -181,17 +242,24 @@ def pose_lattice(
 def draw_pose_density(
     ax: Axes, grid: OccupancyGrid, log_p: ArrayLike, extent: tuple[float, float], *, depth: float | None = None
 ) -> AxesImage:
-    """P(z | x, m) over a lattice of poses with one heading, as log-likelihood below the best.
+    """Draw P(z | x, m) over a lattice of poses with one heading, as log-likelihood below the best.
 
     Args:
-        ax: Where to draw, usually onto :func:`draw_map`.
-        grid: The map that gives the frame.
+        ax: Axes to draw onto, usually those of :func:`draw_map`.
+        grid: The map, whose frame the lattice has.
         log_p: (R, C) log-likelihoods from the grid's first row and column on, natural logarithm; NaN is left blank.
-        extent: (W, H) that they cover along the grid's axes [m], as :func:`pose_lattice` says.
-        depth: How far the colour scale reaches below the best [nats]; by default half of the values lie on it.
+        extent: (W, H) of the lattice along the grid's axes [m], as :func:`pose_lattice` returns it.
+        depth: Extent of the colour scale below the best value [nats]; by default half of the values lie on it.
 
     Returns:
-        What a colour bar takes.
+        The image, for :func:`add_colour_bar`.
+
+    Example:
+        >>> import gpusense as gs
+        >>> import numpy as np
+        >>> ax, grid = gs.plots.new_figure(6.0, 4.0).subplots(), gs.worlds.building()
+        >>> _, free, extent = gs.plots.pose_lattice(grid, 0.5, theta=0.0)
+        >>> image = gs.plots.draw_pose_density(ax, grid, np.where(free, -1.0, np.nan), extent)
     """
     value = checks.array("log_p", log_p, ("R", "C"), finite=False)
     low, high = _scale(value[~np.isnan(value)], depth)
@@ -199,62 +267,15 @@ def draw_pose_density(
     return _over_grid(ax, grid, below, extent, cmap=_colours(), vmin=low - high, vmax=0.0, zorder=1)
 
 
-def localization_figure(
-    grid: OccupancyGrid,
-    scanner: Scanner,
-    ranges: ArrayLike,
-    truth: ArrayLike,
-    best: ArrayLike,
-    poses: ArrayLike,
-    log_p: ArrayLike,
-    densities: Mapping[str, ArrayLike],
-    extent: tuple[float, float],
-) -> Figure:
-    """Four maps: a scan at the best pose, particles with those near the truth enlarged, and two densities.
-
-    Args:
-        grid: The map.
-        scanner: The scanner's geometry.
-        ranges: (K,) readings [m].
-        truth: (3,) the robot's true pose in the world [m, m, rad].
-        best: (3,) the pose at which the scan is drawn.
-        poses: (N, 3) particles.
-        log_p: (N,) their log-likelihoods.
-        densities: Two (R, C) log-likelihoods of :func:`pose_lattice`, by their titles.
-        extent: Of that lattice.
-    """
-    figure = new_figure(15.0, 9.8)
-    axes = figure.subplots(2, 2)
-    for ax in axes.flat:
-        draw_map(ax, grid)
-    drawn = draw_scan(axes[0, 0], grid, scanner, best, ranges)
-    axes[0, 0].set_title(f"The scan at the best particle: {drawn} ranges of {scanner.count} beams", loc="left")
-    x, y, _ = checks.array("truth", truth, (3,)).tolist()
-    zoom = axes[0, 1].inset_axes((0.735, 0.655, 0.255, 0.325))
-    draw_map(zoom, grid)
-    zoom.set(xlim=(x - 1.5, x + 1.5), ylim=(y - 1.3, y + 1.3), xticks=[], yticks=[], xlabel="", ylabel="")
-    for ax, size in ((axes[0, 1], 2.0), (zoom, 3.0)):
-        cloud = draw_particles(ax, poses, log_p, size=size)
-    axes[0, 1].indicate_inset_zoom(zoom, edgecolor=ROBOT, alpha=1.0)
-    add_colour_bar(axes[0, 1], cloud, "log P(z | x, m) [nats]")
-    axes[0, 1].set_title("The particles and their likelihood by the beam model", loc="left")
-    for ax, (title, density) in zip(axes[1], densities.items(), strict=True):
-        image = draw_pose_density(ax, grid, density, extent)
-        add_colour_bar(ax, image, "log P(z | x, m) below its maximum [nats]")
-        draw_pose(ax, (x, y, 0.0), length=0.0)
-        ax.set_title(title, loc="left")
-    return figure
-
-
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure in the format of the path's ending; the file is there whole or as it was before.
+    """Write a figure atomically, in the format of the path's ending.
 
     Args:
-        figure: What to write.
+        figure: The figure.
         path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
         ValueError: the ending names no format.
     """
     target = checks.path("path", path)
@@ -272,7 +293,7 @@ def _colours() -> Colormap:
 
 
 def _scale(value: NDArray[np.float64], depth: float | None) -> tuple[float, float]:
-    """The ends of a colour scale for log-likelihoods."""
+    """Return the ends of a colour scale for log-likelihoods."""
     finite = value[np.isfinite(value)]
     if finite.size == 0:
         return -1.0, 0.0
@@ -284,7 +305,7 @@ def _scale(value: NDArray[np.float64], depth: float | None) -> tuple[float, floa
 def _over_grid(
     ax: Axes, grid: OccupancyGrid, values: NDArray[Any], extent: tuple[float, float] | None = None, **options: Any
 ) -> AxesImage:
-    """An image that starts in the grid's corner and is moved and turned with its origin."""
+    """Draw an image from the grid's corner on, transformed by the grid's origin."""
     from matplotlib.transforms import Affine2D
 
     x, y, yaw = grid.origin

@@ -1,6 +1,6 @@
-"""Pictures of a fit: readings, the density over their histogram, the way of the log-likelihood, the density's surface.
+"""Draw a fit: readings, the density over their histogram, the log-likelihood's trace, the density's surface.
 
-Book figures 6.5 and 6.6. Matplotlib is imported when something is drawn; see :mod:`gpusense.plots.drawing`.
+Book figures 6.5 and 6.6. Matplotlib is imported on first use; see :mod:`gpusense.plots.drawing`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Reading
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from gpusense.learning.beam.incidence import IncidenceFit
 
 # Cells of the histograms over (z, z*), and of those over z.
 _CELLS, _BARS = 200, 80
-# More readings than these are thinned before they are drawn one by one.
+# Largest number of readings drawn one by one; more are thinned.
 _DRAWN = 10_000
 
 
 def distances_of(data: RangeData, count: int = 3) -> list[float]:
-    """Expected ranges, well apart, around which many readings lie."""
+    """Choose expected ranges, well apart, with many readings around each: quantiles of the expected ranges [m]."""
     known = data.expected[(data.kinds != Reading.MISSING) & (data.expected < data.range_max)]
     if not len(known):
         return []
@@ -36,7 +37,12 @@ def distances_of(data: RangeData, count: int = 3) -> list[float]:
 
 
 def readings_figure(data: RangeData, distances: list[float]) -> Figure:
-    """Readings against expected ranges, and raw readings where about one distance is expected (book figure 6.5)."""
+    """Draw readings against expected ranges, and raw readings around some expected ranges (book figure 6.5).
+
+    Args:
+        data: The readings.
+        distances: The expected ranges [m].
+    """
     from matplotlib.colors import LogNorm
 
     figure = new_figure(12.0, 5.0)
@@ -58,7 +64,7 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
     edge = min(data.range_max, 2.5 * max(distances, default=data.range_max))
     for place, distance in enumerate(distances):
         near, width = _near(data, distance)
-        # What lies beyond, readings without return too, is drawn on the upper edge.
+        # Readings beyond, and those without return, are drawn on the upper edge.
         z = np.minimum(np.where(data.kinds == Reading.MAX, edge, data.ranges)[near], edge)
         z = z[:: max(-(-len(z) // _DRAWN), 1)]
         right.plot(
@@ -74,45 +80,62 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
 def density_figure(
     data: RangeData, parameters: BeamParameters, distances: list[float], range_bias: float = 0.0
 ) -> Figure:
-    """Histograms of readings where about one distance is expected, and the fitted density there (book figure 6.6)."""
-    from gpusense.models.scan.densities import log_mixture
+    """Draw histograms of readings around some expected ranges, with the fitted density (book figure 6.6).
 
+    Args:
+        data: The readings.
+        parameters: The fitted parameters.
+        distances: The expected ranges [m].
+        range_bias: Fitted offset of the readings [m].
+    """
     figure = new_figure(5.0 * max(len(distances), 1), 4.2)
     axes = figure.subplots(1, max(len(distances), 1), squeeze=False)[0]
     for ax, distance in zip(axes, distances, strict=False):
-        near, width = _near(data, distance)
-        hit = near & (data.kinds == Reading.HIT)
-        total, none = int(near.sum()), int((near & (data.kinds == Reading.MAX)).sum())
-        top = min(data.range_max, 2.5 * distance + 1)
-        edges = np.linspace(0, top, _BARS + 1)
-        counts, _ = np.histogram(data.ranges[hit], edges)
-        wide = edges[1] - edges[0]
-        ax.stairs(counts / (max(total, 1) * wide), edges, fill=True, color=FRAME, label=f"{total} readings")
-        z = np.unique(np.concatenate([np.linspace(0, top * (1 - 1e-9), 800), distance + np.linspace(-0.5, 0.5, 201)]))
-        z = z[(z >= 0) & (z < min(top, data.range_max))]
-        # Readings are of all the distances near by; so is the density.
-        ahead = _spaced(data.expected[near], 60)
-        shifted = np.clip(z - range_bias, 0, np.nextafter(data.range_max, 0))
-        log_p = log_mixture(shifted, ahead[:, None], range_max=data.range_max, **parameters.to_dict())
-        ax.plot(
-            z,
-            np.exp(log_p).mean(axis=0) if len(ahead) else np.zeros_like(z),
-            color=ROBOT,
-            lw=1.2,
-            label="fitted p(z | z*)",
-        )
-        lowest = min(0.3 / (max(total, 1) * wide), 0.5 * parameters.z_rand / data.range_max or math.inf)
-        ax.set(yscale="log", ylim=(max(lowest, 1e-6), None), xlabel="reading z [m]",
-               title=f"z* = {distance:.2f} +- {width:.2f} m; no return: {none / max(total, 1):.3f}, "
-               f"fitted {parameters.z_max:.3f}")  # fmt: skip
-        ax.title.set_fontsize("medium")
-        ax.legend(loc="upper right", fontsize="small")
+        _density_panel(ax, data, parameters, distance, range_bias)
     axes[0].set_ylabel("density [1/m]")
     return figure
 
 
+def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distance: float, range_bias: float) -> None:
+    """Draw the histogram of the readings around one expected range, with the fitted density."""
+    from gpusense.models.scan.densities import log_mixture
+
+    near, width = _near(data, distance)
+    hit = near & (data.kinds == Reading.HIT)
+    total, none = int(near.sum()), int((near & (data.kinds == Reading.MAX)).sum())
+    top = min(data.range_max, 2.5 * distance + 1)
+    edges = np.linspace(0, top, _BARS + 1)
+    counts, _ = np.histogram(data.ranges[hit], edges)
+    wide = edges[1] - edges[0]
+    ax.stairs(counts / (max(total, 1) * wide), edges, fill=True, color=FRAME, label=f"{total} readings")
+    z = np.unique(np.concatenate([np.linspace(0, top * (1 - 1e-9), 800), distance + np.linspace(-0.5, 0.5, 201)]))
+    z = z[(z >= 0) & (z < min(top, data.range_max))]
+    # The density is the mean over the expected ranges of these readings.
+    expected = _spaced(data.expected[near], 60)
+    shifted = np.clip(z - range_bias, 0, np.nextafter(data.range_max, 0))
+    log_p = log_mixture(shifted, expected[:, None], range_max=data.range_max, **parameters.to_dict())
+    ax.plot(
+        z,
+        np.exp(log_p).mean(axis=0) if len(expected) else np.zeros_like(z),
+        color=ROBOT,
+        lw=1.2,
+        label="fitted p(z | z*)",
+    )
+    lowest = min(0.3 / (max(total, 1) * wide), 0.5 * parameters.z_rand / data.range_max or math.inf)
+    ax.set(yscale="log", ylim=(max(lowest, 1e-6), None), xlabel="reading z [m]",
+           title=f"z* = {distance:.2f} +- {width:.2f} m; no return: {none / max(total, 1):.3f}, "
+           f"fitted {parameters.z_max:.3f}")  # fmt: skip
+    ax.title.set_fontsize("medium")
+    ax.legend(loc="upper right", fontsize="small")
+
+
 def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
-    """The log-likelihood after each iteration, and what was still to gain."""
+    """Draw the log-likelihood after each iteration, and its distance from the highest value.
+
+    Args:
+        trace: (I,) log-likelihoods [nats].
+        method: Name of the method, for the title.
+    """
     figure = new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2)
     iteration = np.arange(len(trace))
@@ -121,12 +144,18 @@ def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
     left.ticklabel_format(axis="y", useOffset=False)
     rest = trace.max() - trace
     right.semilogy(iteration[rest > 0], rest[rest > 0], ".-", color=ROBOT)
-    right.set(xlabel="iteration", ylabel="below the highest [nats]", title="What was still to gain")
+    right.set(xlabel="iteration", ylabel="below the highest [nats]", title="remaining gain")
     return figure
 
 
 def surface_figure(data: RangeData, parameters: BeamParameters, range_bias: float = 0.0) -> Figure:
-    """log p(z | z*) over readings and expected ranges, and what a reading without return adds."""
+    """Draw log p(z | z*) over readings and expected ranges; the title has log p of a reading without return.
+
+    Args:
+        data: The readings, which set the extent.
+        parameters: The fitted parameters.
+        range_bias: Fitted offset of the readings [m].
+    """
     from gpusense.models.scan.densities import log_mixture
 
     figure = new_figure(6.6, 5.2)
@@ -146,14 +175,14 @@ def surface_figure(data: RangeData, parameters: BeamParameters, range_bias: floa
 
 
 def incidence_figure(fit: IncidenceFit) -> Figure:
-    """Each parameter over the angle of incidence, with standard errors; the pooled fit dashed."""
+    """Draw each parameter over the angle of incidence, with standard errors; the pooled fit is dashed."""
     figure = new_figure(12.0, 6.0)
     axes = figure.subplots(2, 3).flat
     edges = np.degrees(fit.parameters.edges)
     middle = 0.5 * (edges[1:] + edges[:-1])
     for ax, (name, pooled) in zip(axes, fit.pooled.parameters.to_dict().items(), strict=True):
-        values = [getattr(each, name) for each in fit.parameters.parameters]
-        errors = np.array([each.standard_errors[name] for each in fit.fits])
+        values = [getattr(parameters, name) for parameters in fit.parameters.parameters]
+        errors = np.array([bin_fit.standard_errors[name] for bin_fit in fit.fits])
         ax.stairs(values, edges, color=BEAM, baseline=None)
         ax.errorbar(middle, values, np.where(np.isfinite(errors), errors, 0), fmt=".", color=BEAM, capsize=2)
         ax.axhline(pooled, color=FRAME, ls="--", lw=0.8)
@@ -162,21 +191,21 @@ def incidence_figure(fit: IncidenceFit) -> Figure:
 
 
 def _near(data: RangeData, distance: float) -> tuple[NDArray[np.bool], float]:
-    """Readings that say something where about a distance is expected, and how far off it may be [m]."""
+    """Select readings that are not missing with expected ranges near a distance; return also half the interval [m]."""
     width = max(0.03 * distance, 0.02)
     near: Any = (np.abs(data.expected - distance) <= width) & (data.kinds != Reading.MISSING)
     return near, width
 
 
 def _spaced(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """So many of some values, from the least to the largest."""
-    return (
-        np.sort(values)[np.linspace(0, len(values) - 1, min(count, len(values))).astype(int)] if len(values) else values
-    )
+    """Return ``count`` of the values at most, evenly spaced in rank, from the least to the largest."""
+    if not len(values):
+        return values
+    return np.sort(values)[np.linspace(0, len(values) - 1, min(count, len(values))).astype(int)]
 
 
 def _top(data: RangeData) -> float:
-    """Up to where most ranges lie: pictures of a laser of 80 m in an office would be empty."""
+    """Return an upper limit for axes that holds most ranges [m]; an office is small beside a laser's 80 m."""
     ranges = data.ranges[data.kinds == Reading.HIT]
     known = np.concatenate([ranges, data.expected[data.expected < data.range_max]])
     return min(1.1 * float(np.quantile(known, 0.995)), data.range_max) if len(known) else data.range_max

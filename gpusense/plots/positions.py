@@ -1,7 +1,7 @@
-"""Drawing: where the robot may stand, given ranges or bearings of beacons, without uncertainty and with it.
+"""Draw possible positions from ranges or bearings of beacons, without uncertainty and with it.
 
-The pictures of the lectures' "Distances Only" and "Bearings Only". As in ``drawing``, Matplotlib is imported when
-something is drawn, and everything is drawn onto a Matplotlib ``Axes``.
+The pictures of the lectures' "Distances Only" and "Bearings Only". As in ``drawing``, Matplotlib is imported on first
+use, and each function draws onto a Matplotlib ``Axes``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense.plots.drawing import BEAM, FRAME, OCCUPIED, ROBOT, _colours, draw_pose
 from gpusense.positions.fix import PositionFix
-from gpusense.positions.problem import make_problem
+from gpusense.positions.problem import Problem, make_problem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,9 +39,9 @@ def position_log_density(
     sigma_range: ArrayLike | None = None,
     sigma_bearing: ArrayLike | None = None,
 ) -> Floats:
-    """log p(ranges, bearings | x, y): the sum over beacons of the logarithms of Gaussian densities.
+    """Compute log p(ranges, bearings | x, y): the sum over beacons of the logarithms of Gaussian densities.
 
-    Bearings without a known heading are taken with the heading that fits them best at each point (profile likelihood).
+    Without a heading, bearings are scored with the heading that fits best at each point (profile likelihood).
 
     Args:
         points: (..., 2) x and y [m].
@@ -57,6 +57,13 @@ def position_log_density(
 
     Raises:
         TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+
+    Example:
+        >>> import gpusense as gs
+        >>> beacons = [(0.0, 0.0), (4.0, 0.0)]
+        >>> log_p = gs.plots.position_log_density([(2.0, 1.5), (2.0, 0.0)], beacons, ranges=[2.5, 2.5], sigma_range=0.1)
+        >>> bool(log_p[0] > log_p[1])
+        True
     """
     places = checks.array("points", points)
     if places.ndim < 1 or places.shape[-1] != 2:
@@ -72,22 +79,37 @@ def position_log_density(
     )  # fmt: skip
     states = (places - problem.origin).reshape(-1, 2)
     if problem.bearings is not None and heading is None:
-        offset = problem.points - (states[:, :1] + 1j * states[:, 1:])
-        share = problem.sigma_bearing**-2.0
-        facing = np.angle((share * np.exp(1j * (np.angle(offset) - problem.bearings))).sum(axis=1))
-        # The mean on the circle starts, that of the wrapped residuals ends.
-        for _ in range(2):
-            off = problem.residuals(np.column_stack([states, facing]))[:, -len(share) :]
-            facing = facing - (off @ share) / share.sum()
-        states = np.column_stack([states, facing])
+        states = np.column_stack([states, _best_headings(problem, states)])
     scaled = problem.residuals(states) * problem.scales
     norm = np.log(problem.sigmas).sum() + 0.5 * math.log(2 * math.pi) * len(problem.sigmas)
     density: Floats = -0.5 * np.sum(scaled * scaled, axis=1) - norm
     return density.reshape(places.shape[:-1])
 
 
+def _best_headings(problem: Problem, states: Floats) -> Floats:
+    """Return (N,) the heading that fits the bearings best at each of (N, 2) positions [rad]."""
+    assert problem.bearings is not None
+    offset = problem.points - (states[:, :1] + 1j * states[:, 1:])
+    weight = problem.sigma_bearing**-2.0
+    heading = np.angle((weight * np.exp(1j * (np.angle(offset) - problem.bearings))).sum(axis=1))
+    # From the circular mean to the mean of the wrapped residuals.
+    for _ in range(2):
+        residuals = problem.residuals(np.column_stack([states, heading]))[:, -len(weight) :]
+        heading = heading - (residuals @ weight) / weight.sum()
+    return heading
+
+
 def draw_beacons(ax: Axes, xy: ArrayLike) -> None:
-    """The beacons: dark squares with their numbers, counted from 1 as P1, P2, ..."""
+    """Draw beacons as dark squares with the labels P1, P2, ....
+
+    Args:
+        ax: Axes to draw onto.
+        xy: (M, 2) beacons [m].
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.draw_beacons(gs.plots.new_figure(6.0, 4.0).subplots(), [(0.0, 0.0), (4.0, 0.0)])
+    """
     places = checks.array("xy", xy, ("M", 2))
     ax.scatter(places[:, 0], places[:, 1], marker="s", s=42, c=OCCUPIED, edgecolors="white", linewidths=1.0, zorder=6)
     for k, place in enumerate(places):
@@ -104,26 +126,40 @@ def draw_solution_set(
     bearings: ArrayLike | None = None,
     heading: float | None = None,
 ) -> int:
-    """Where each measurement, or pair of bearings, puts the robot: circles, rays or arcs; no uncertainty.
+    """Draw the set of positions that each measurement allows without uncertainty: circles, rays or arcs.
 
-    A range leaves a circle around its beacon. A bearing with a known heading leaves a ray that ends in the beacon.
-    Without a heading, the angle between two bearings leaves an arc of a circle through both beacons.
+    A range allows a circle around its beacon. A bearing with a known heading allows a ray that ends in the beacon.
+    Without a heading, the angle between two bearings allows an arc of a circle through both beacons.
 
     Args:
-        ax: Where to draw; its limits say how far rays are drawn, so set them first.
+        ax: Axes to draw onto; rays are as long as its diagonal, so set its limits first.
         xy: (M, 2) beacons [m].
         ranges: (M,) [m], or None.
         bearings: (M,) [rad], or None.
         heading: The robot's heading [rad], or None.
 
     Returns:
-        How many curves were drawn.
+        The number of curves that were drawn.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> gs.plots.draw_solution_set(ax, [(0.0, 0.0), (4.0, 0.0)], ranges=[2.5, 2.5])
+        2
     """
     from matplotlib.collections import LineCollection
 
     problem = make_problem(xy, ranges=ranges, bearings=bearings, heading=heading)
-    world = problem.points + complex(*problem.origin)
     reach = math.hypot(np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()))
+    curves = _solution_curves(problem, reach)
+    lines = [np.column_stack([curve.real, curve.imag]) for curve in curves]
+    ax.add_collection(LineCollection(lines, colors=BEAM, linewidths=1.4, zorder=4), autolim=False)
+    return len(lines)
+
+
+def _solution_curves(problem: Problem, reach: float) -> list[NDArray[np.complex128]]:
+    """Return the curves of positions that the measurements allow, as complex numbers; rays have length ``reach``."""
+    world = problem.points + complex(*problem.origin)
     curves: list[NDArray[np.complex128]] = []
     if problem.ranges is not None:
         around = np.exp(1j * np.linspace(0, 2 * np.pi, FINE))
@@ -135,19 +171,22 @@ def draw_solution_set(
         for i in range(len(world)):
             for j in range(i):
                 curves.append(_arc(world[i], world[j], problem.bearings[j] - problem.bearings[i], reach))
-    lines = [np.column_stack([curve.real, curve.imag]) for curve in curves]
-    ax.add_collection(LineCollection(lines, colors=BEAM, linewidths=1.4, zorder=4), autolim=False)
-    return len(lines)
+    return curves
 
 
 def draw_fix(ax: Axes, fix: PositionFix, *, length: float = 0.0, ellipses: bool = True) -> None:
-    """The solutions, their headings and the ellipses that hold the position with 95 %.
+    """Draw the solutions of a fix, their headings and the 95 % ellipses of the position.
 
     Args:
-        ax: Where to draw.
-        fix: What was found; covariances that do not exist are not drawn.
-        length: Of a heading's arrow [m]; 0 draws none.
-        ellipses: Whether to draw ellipses; a small point then marks a solution instead of a ring.
+        ax: Axes to draw onto.
+        fix: The fix; covariances that are not finite are not drawn.
+        length: Length of a heading's arrow [m]; 0 draws none.
+        ellipses: Whether to draw ellipses; small points then mark the solutions instead of rings.
+
+    Example:
+        >>> import gpusense as gs
+        >>> fix = gs.trilaterate([(0.0, 0.0), (4.0, 0.0)], [2.5, 2.5], sigma=0.1)
+        >>> gs.plots.draw_fix(gs.plots.new_figure(6.0, 4.0).subplots(), fix)
     """
     from matplotlib.patches import Ellipse
 
@@ -168,16 +207,23 @@ def draw_fix(ax: Axes, fix: PositionFix, *, length: float = 0.0, ellipses: bool 
 def draw_position_density(
     ax: Axes, log_p: ArrayLike, extent: tuple[float, float, float, float], *, depth: float = 12.0
 ) -> AxesImage:
-    """A log density over x and y, below its maximum.
+    """Draw a log density over x and y, relative to its maximum.
 
     Args:
-        ax: Where to draw.
+        ax: Axes to draw onto.
         log_p: (R, C) log densities at the middles of equal tiles, row 0 at the least y.
-        extent: x_min, x_max, y_min, y_max that the tiles cover [m].
-        depth: How far the colour scale reaches below the maximum [nats], > 0.
+        extent: x_min, x_max, y_min, y_max of the tiles [m].
+        depth: Extent of the colour scale below the maximum [nats], > 0.
 
     Returns:
-        What a colour bar takes.
+        The image, for :func:`add_colour_bar`.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax, extent = gs.plots.new_figure(6.0, 4.0).subplots(), (0.0, 4.0, -2.0, 2.0)
+        >>> points = gs.plots.tile_centers(extent, 40)
+        >>> log_p = gs.plots.position_log_density(points, [(0.0, 0.0)], ranges=[2.5], sigma_range=0.1)
+        >>> image = gs.plots.draw_position_density(ax, log_p, extent)
     """
     value = checks.array("log_p", log_p, ("R", "C"))
     below = np.maximum(value - value.max(initial=-np.inf), -checks.real("depth", depth, above=0))
@@ -185,7 +231,17 @@ def draw_position_density(
 
 
 def tile_centers(extent: tuple[float, float, float, float], count: int) -> Floats:
-    """(R, C, 2) middles of square tiles over an extent, ``count`` of them along its longer side."""
+    """Return (R, C, 2) the middles of square tiles over an extent [m].
+
+    Args:
+        extent: x_min, x_max, y_min, y_max [m].
+        count: Number of tiles along the longer side.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.tile_centers((0.0, 4.0, 0.0, 2.0), 4).shape
+        (2, 4, 2)
+    """
     x_min, x_max, y_min, y_max = extent
     side = max(x_max - x_min, y_max - y_min) / count
     cols, rows = max(round((x_max - x_min) / side), 1), max(round((y_max - y_min) / side), 1)
@@ -195,7 +251,17 @@ def tile_centers(extent: tuple[float, float, float, float], count: int) -> Float
 
 
 def set_view(ax: Axes, extent: tuple[float, float, float, float], title: str) -> None:
-    """Limits, equal scales, names of the axes and a title."""
+    """Set limits, equal scales, axis labels and a title.
+
+    Args:
+        ax: The axes.
+        extent: x_min, x_max, y_min, y_max [m].
+        title: The title.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.plots.set_view(gs.plots.new_figure(6.0, 4.0).subplots(), (0.0, 4.0, -2.0, 2.0), "Distances only")
+    """
     ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xlabel="x [m]", ylabel="y [m]")
     ax.set_title(title, loc="left")
     ax.spines[:].set_color(FRAME)
@@ -203,7 +269,7 @@ def set_view(ax: Axes, extent: tuple[float, float, float, float], title: str) ->
 
 
 def _arc(first: complex, second: complex, angle: float, reach: float) -> NDArray[np.complex128]:
-    """Points p with second - p = k exp(i angle) (first - p) for k > 0: they see ``second`` turned from ``first``."""
+    """Return points p with second - p = k exp(i angle) (first - p), k > 0, which see both beacons at this angle."""
     # k = tan(t / 2) is 0 at the second beacon and infinite at the first one.
     t = np.linspace(0, np.pi, FINE)
     turn = np.exp(1j * angle)

@@ -11,18 +11,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface.constants import NEARBY, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_sum
 from gpusense.reference.log_terms import bounded_square, either, log_one_plus
 
-# Distributions of a heading: sum of normals, its Fourier series, von Mises.
-NEARBY, SERIES, VON_MISES = 0, 1, 2
-WRAPS, WAVES = 3, 6
 # Terms of a heading: 1 / (sigma sqrt 2) or sqrt(2 kappa), log of z_hit and the peak, log of the uniform part, 2 pi /
 # sigma^2, and from WAVE on 2 q^(n n).
 SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, DECAY, WAVE = range(7)
 HALF_TURN = 3.141592653589793
-# exp(-NEGLIGIBLE) is below half an eps.
-NEGLIGIBLE = 40.0
 # sin x = x + x z (SINE[0] + SINE[1] z + ...) with z = x^2, its power series.
 SINE = (
     -0.16666666666666666, 0.008333333333333333, -0.0001984126984126984, 2.7557319223985893e-06,

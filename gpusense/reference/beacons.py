@@ -12,20 +12,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
+from gpusense.interface.constants import BEACON, STUDENT_T, TWO_NORMALS
 from gpusense.reference.error_free import Pair, add_term, pair_product, pair_sum, two_sum
 from gpusense.reference.log_terms import bounded_square, either
 from gpusense.reference.offsets import distance_pair, offset
 
-NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
-# A beacon has its place (x, its low part, y, its low part), and the reading minus the bias with its low part.
-BEACON = 6
 # 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
 # peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
 # of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
 SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, RANGE_MAX, BIAS = range(7)
 WIDE_SCALE, WIDE_SCALE_LOW, WIDE_PEAK, WIDE_PEAK_LOW = range(7, 11)
 OFFSET, OFFSET_LOW, POWER, T_SCALE, ARC, ODD = range(7, 13)
-TERMS = 13
 # From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
 STEEPEST = 1e18
 

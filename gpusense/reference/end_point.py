@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense.interface.constants import FIELD_RING
 from gpusense.reference.error_free import Pair, pair_sum, two_product, two_sum
 
-FIELD_RING = 2
 EDGE = 2.0**-33
 
 

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-BLOCK_TERMS = 16
-STRANDS = 4
+from gpusense.interface.constants import BLOCK_TERMS, STRANDS
 
 Pair = tuple[np.ndarray, np.ndarray]
 

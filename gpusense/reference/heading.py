@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.reference.error_free import Pair, pair_product, two_sum
 
-# Up to this heading the counts of quarter turns have 20 bits.
-LIMIT = 1048576.0
 TWO_OVER_PI = 0.6366197723675814
 # 1.5 * 2^52: a sum with it is rounded to an integer.
 ROUNDER = 6755399441055744.0
@@ -39,7 +38,7 @@ WORDS = np.array([
 
 
 def reduce_ordinary(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
-    """Reduce headings of at most LIMIT to quarter turns modulo 4 and the sum of two numbers."""
+    """Reduce headings of at most LARGEST_HEADING to quarter turns modulo 4 and the sum of two numbers."""
     count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
     # The first product and difference are exact, and so are the next two products.
     rest, lost_1 = two_sum(theta - count * QUARTER_1, -(count * QUARTER_2))
@@ -49,7 +48,7 @@ def reduce_ordinary(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
 
 
 def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
-    """Reduce headings above LIMIT, up to the largest number, as :func:`reduce_ordinary` does."""
+    """Reduce headings above LARGEST_HEADING, up to the largest number, as :func:`reduce_ordinary` does."""
     bits = np.abs(theta).view(np.uint64)
     mantissa = (bits & np.uint64(0xFFFFFFFFFFFFF)) | np.uint64(0x10000000000000)
     low_half, high_half = mantissa & np.uint64(0xFFFFFFFF), mantissa >> np.uint64(32)
@@ -84,7 +83,7 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
 
 def cos_sin(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return cosines and sines of float64 headings; where one is not finite they have no meaning but are not NaN."""
-    huge = ~(np.abs(theta) <= LIMIT)
+    huge = ~(np.abs(theta) <= LARGEST_HEADING)
     any_huge = huge.any()
     quadrant, (r, low) = reduce_ordinary(np.where(huge, 0.0, theta) if any_huge else theta)
     if any_huge:

@@ -9,15 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.landmarks import (
-    AXIS,
-    FARTHEST,
-    HOLE,
-    RADIUS,
-    REACH,
-    at_places,
-    log_detection,
-)
+from gpusense.interface.feature_layout import AXIS, FARTHEST, HOLE, RADIUS, REACH
+from gpusense.reference.landmarks import at_places, log_detection
 from gpusense.reference.offsets import Quad, offset
 
 # Pairs of a particle and a landmark that are evaluated at once.

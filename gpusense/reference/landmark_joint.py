@@ -9,15 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE, RADIUS
 from gpusense.reference.landmark_grid import near
-from gpusense.reference.landmarks import (
-    FALSE_POSITIVE,
-    FEATURE,
-    RADIUS,
-    direction,
-    log_detection,
-    sensor_place,
-)
+from gpusense.reference.landmarks import direction, log_detection, sensor_place
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
 

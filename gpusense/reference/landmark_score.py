@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.error_free import BLOCK_TERMS, add_term
+from gpusense.interface.constants import BLOCK_TERMS
+from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE
+from gpusense.reference.error_free import add_term
 from gpusense.reference.landmark_grid import search
-from gpusense.reference.landmarks import (
-    FALSE_POSITIVE,
-    FEATURE,
-    direction,
-    log_detection,
-    sensor_place,
-)
+from gpusense.reference.landmarks import direction, log_detection, sensor_place
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
 

@@ -23,7 +23,8 @@ import math
 
 import numpy as np
 
-from gpusense.reference.error_free import BLOCK_TERMS, add_term
+from gpusense.interface.constants import BLOCK_TERMS
+from gpusense.reference.error_free import add_term
 from gpusense.reference.mixture import hit_mass, log_hit, log_short, short_factor
 
 ROOT_2PI = math.sqrt(2 * math.pi)

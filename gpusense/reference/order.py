@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface.constants import ALL_BINS, BINS
 from gpusense.reference.ray import turn_of
 
 # Sampled particles; bins per axis (rows, columns, headings); bins per work-item of order_starts; units of a turn.
 SAMPLES = 256
-BINS = 32
-ALL_BINS = BINS**3
-STRETCH = 16
 TURN = 65536
 
 

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface.constants import FARTHEST, LARGEST_HEADING
 from gpusense.reference.error_free import Pair, pair_sum, two_sum, where_pair
-from gpusense.reference.heading import LIMIT, QUARTER, QUARTER_LOW, cos_sin, reduce_huge, reduce_ordinary
-
-# Coordinates are clamped to this; its square is finite in float32.
-FARTHEST = float(1 << 60)
+from gpusense.reference.heading import QUARTER, QUARTER_LOW, cos_sin, reduce_huge, reduce_ordinary
 
 
 def wrapped_difference(theta: np.ndarray, target: Pair | tuple[float, float]) -> Pair:
     """Return ``theta - target`` in [-pi, pi]; the target is in that interval."""
-    huge = np.abs(theta) > LIMIT
+    huge = np.abs(theta) > LARGEST_HEADING
     quadrant, rest = reduce_ordinary(np.where(huge, 0.0, theta))
     if huge.any():
         quadrant[huge], (rest[0][huge], rest[1][huge]) = reduce_huge(theta[huge])

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.reference.placement import place_poses
-
-# Max readings are left out, part of the constant term, or evaluated like others.
-MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
 
 
 def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:

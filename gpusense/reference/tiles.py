@@ -2,7 +2,3 @@
 
 With spread = s a tile of particles has 2^s groups, each with every 2^s-th tile of rays: few particles fill a device.
 """
-
-TILE_RAYS = 4
-TILE_PARTICLES = 16
-TILE = TILE_RAYS * TILE_PARTICLES

@@ -61,7 +61,7 @@ def test_demo_as_text(tmp_path, monkeypatch, capsys):
     assert "particles  400: half over all free cells" in out
     rows = [line for line in out.splitlines() if line.startswith("numpy ")]
     assert len(rows) == 2
-    assert out.count("What was left out and why: ") == 2
+    assert out.count("Specialisation of the kernels: ") == 2
     assert list(tmp_path.iterdir()) == []
 
 
@@ -90,14 +90,14 @@ def test_demo_checks_its_default_output_before_it_works(tmp_path, monkeypatch, c
 
 def test_demo_goes_on_without_a_device_that_was_not_asked_for(needs, monkeypatch, capsys):
     needs("opencl")
-    score = demo.score
+    score = demo.score_scene
 
     def fail(scene, name, backend, reference):
         if backend.info.backend == "opencl":
             raise RuntimeError("the compiler crashed")
         return score(scene, name, backend, reference)
 
-    monkeypatch.setattr(demo, "score", fail)
+    monkeypatch.setattr(demo, "score_scene", fail)
     assert cli.main([*SMALL, "--no-plot", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert {result["backend"] for result in report["results"]} >= {"numpy"}

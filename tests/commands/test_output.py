@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpusense._util import files
 from gpusense._util.progress import progress
-from gpusense.commands import common
+from gpusense.commands import output
 
 
 def test_write_whole_replaces_or_leaves_as_it_was(tmp_path):
     path = tmp_path / "report.csv"
-    common.write_whole(path, lambda stream: stream.write(b"first"))
+    files.write_whole(path, lambda stream: stream.write(b"first"))
     assert path.read_bytes() == b"first"
 
     def fail(stream):
@@ -23,9 +24,9 @@ def test_write_whole_replaces_or_leaves_as_it_was(tmp_path):
         raise RuntimeError("stopped")
 
     with pytest.raises(RuntimeError, match="stopped"):
-        common.write_whole(path, fail)
+        files.write_whole(path, fail)
     assert path.read_bytes() == b"first"
-    common.write_whole(path, lambda stream: stream.write(b"second"))
+    files.write_whole(path, lambda stream: stream.write(b"second"))
     assert path.read_bytes() == b"second"
     assert [file.name for file in tmp_path.iterdir()] == ["report.csv"]
 
@@ -35,30 +36,30 @@ def test_write_whole_follows_a_link(tmp_path):
     target, link = tmp_path / "target.csv", tmp_path / "link.csv"
     target.write_bytes(b"old")
     link.symlink_to(target)
-    common.write_whole(link, lambda stream: stream.write(b"new"))
+    files.write_whole(link, lambda stream: stream.write(b"new"))
     assert link.is_symlink() and target.read_bytes() == b"new"
 
 
 def test_write_whole_refuses_what_is_no_regular_file(tmp_path):
     with pytest.raises(ValueError, match="must be a regular file"):
-        common.write_whole(tmp_path, lambda stream: stream.write(b""))
+        files.write_whole(tmp_path, lambda stream: stream.write(b""))
 
 
 def test_json_has_no_numbers_that_json_does_not_know(capsys):
     values = {"a": np.float32(np.inf), "b": [float("nan"), 1], "c": np.array([1.5, -np.inf]), "d": Path("x"), "e": None}
-    common.print_json(values)
+    output.print_json(values)
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [None, 1], "c": [1.5, None], "d": "x", "e": None}
 
 
 def test_plain_table_is_aligned():
-    lines = common.table_lines(["name", "s"], [["numpy", "1.25"], ["a", "10.50"]], right=["s"])
+    lines = output.table_lines(["name", "s"], [["numpy", "1.25"], ["a", "10.50"]], right=["s"])
     assert lines == ["name       s", "-----  -----", "numpy   1.25", "a      10.50"]
 
 
 def test_terminal_gets_a_table_and_a_progress_bar(monkeypatch, capsys):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    common.print_table(["name", "s"], [["[bold]numpy", "1.25"]], right=["s"])
+    output.print_table(["name", "s"], [["[bold]numpy", "1.25"]], right=["s"])
     with progress(2) as step:
         step("one")
         step("two")

@@ -11,7 +11,7 @@ import yaml
 
 import gpusense as gs
 from gpusense.commands.cli import main
-from gpusense.evaluation import scoring
+from gpusense.evaluation import agreement, scoring
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
 
 
@@ -57,28 +57,28 @@ def test_only_impossible_particles_are_flagged_and_nothing_is_nan():
 
 
 def test_ranks_share_places_and_correlation_is_spearmans():
-    assert scoring.ranks(np.array([3.0, 1.0, 3.0, -np.inf])).tolist() == [3.5, 2, 3.5, 1]
+    assert agreement.ranks(np.array([3.0, 1.0, 3.0, -np.inf])).tolist() == [3.5, 2, 3.5, 1]
     a, b = np.random.default_rng(0).normal(size=(2, 50)).round(1)
     from scipy.stats import spearmanr
 
-    assert scoring.correlation(scoring.ranks(a), scoring.ranks(b)) == pytest.approx(spearmanr(a, b).statistic)
-    assert scoring.correlation(np.ones(3), np.ones(3)) == 1
+    assert agreement.correlation(agreement.ranks(a), agreement.ranks(b)) == pytest.approx(spearmanr(a, b).statistic)
+    assert agreement.correlation(np.ones(3), np.ones(3)) == 1
 
 
 def test_gap_is_the_largest_difference_of_particles_that_change_places():
     left = np.array([0.0, -1.0, -2.0, -3.0])
-    assert scoring.largest_gap(left, left) == 0
-    assert scoring.largest_gap(left, np.array([0.0, -1.5, -1.25, -3.0])) == 0.25
-    assert scoring.largest_gap(left, np.array([-3.0, -2.0, -1.0, 0.0])) == 3
+    assert agreement.largest_gap(left, left) == 0
+    assert agreement.largest_gap(left, np.array([0.0, -1.5, -1.25, -3.0])) == 0.25
+    assert agreement.largest_gap(left, np.array([-3.0, -2.0, -1.0, 0.0])) == 3
     # Equal on the left: any order on the right is one that the left allows.
-    assert scoring.largest_gap(np.zeros(4), left) == 0
-    assert scoring.largest_gap(np.full(2, -np.inf), np.full(2, -np.inf)) == 0
-    assert scoring.largest_gap(left, np.array([-np.inf, 0, -1, -2])) == np.inf
+    assert agreement.largest_gap(np.zeros(4), left) == 0
+    assert agreement.largest_gap(np.full(2, -np.inf), np.full(2, -np.inf)) == 0
+    assert agreement.largest_gap(left, np.array([-np.inf, 0, -1, -2])) == np.inf
 
 
 def test_cloud_is_the_pose_its_surroundings_and_the_free_cells():
     grid = building(1)
-    cloud = scoring.Cloud(1001, 0.5, 0.25, seed=3)
+    cloud = scoring.ParticleSampler(1001, 0.5, 0.25, seed=3)
     poses = cloud.draw(5, (8.0, 9.0, 1.0), grid)
     assert poses.shape == (1001, 3)
     assert poses[0].tolist() == [8, 9, 1]

@@ -303,7 +303,7 @@ def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
         monkeypatch.setattr(module, kernel, wrong)
     whole = selftest.built_in_scene()
     scene = dataclasses.replace(whole, poses=whole.poses[::9])
-    _, checks = selftest.own_results(backend, scene)
+    _, checks = selftest.evaluate_backend(backend, scene)
     failed = {check.quantity for check in checks if not check.passed}
     assert ("float32 beam model, scans alone" in failed) == (kernel is not None)
     assert failed <= {check.quantity for check in checks if check.quantity.endswith("alone")}

@@ -57,10 +57,10 @@ def test_density_grid_against_60_digits(backend, precision):
     assert len(truth) >= 2500
     np.testing.assert_array_equal(grid.z, same.z)
     np.testing.assert_array_equal(grid.expected, same.expected)
-    errors = stiff.error_in_eps(grid.found, truth, precision)
+    errors = stiff.error_in_eps(grid.log_p, truth, precision)
     worst = int(np.argmax(errors))
     where = {name: column[worst] for name, column in grid.parameters.items()}
-    assert errors[worst] <= BOUND[precision], (grid.z[worst], grid.expected[worst], where, grid.found[worst])
+    assert errors[worst] <= BOUND[precision], (grid.z[worst], grid.expected[worst], where, grid.log_p[worst])
     # The truth that users' machines have instead of mpmath.
     assert stiff.error_in_eps(grid.truth(), truth, "float64").max() <= 16
 
@@ -94,15 +94,15 @@ def test_every_row_is_ok(backend, precision):
 
 
 def test_rows_can_fail(monkeypatch):
-    broken = replace(numpy_grid("float32"), found=numpy_grid("float32").naive())
+    broken = replace(numpy_grid("float32"), log_p=numpy_grid("float32").naive())
     monkeypatch.setattr(stiff, "density_grid", lambda backend, precision: broken)
     row, textbook = stiff._grid_rows(get_backend("numpy"), "float32")
     assert not row.ok
     assert row.nonfinite > 0
     assert textbook.ok
-    exact = replace(broken, found=broken.truth().astype(np.float32))
+    exact = replace(broken, log_p=broken.truth().astype(np.float32))
     monkeypatch.setattr(stiff, "density_grid", lambda backend, precision: exact)
-    monkeypatch.setattr(type(exact), "naive", lambda self: self.found)
+    monkeypatch.setattr(type(exact), "naive", lambda self: self.log_p)
     row, textbook = stiff._grid_rows(get_backend("numpy"), "float32")
     assert row.ok
     assert not textbook.ok

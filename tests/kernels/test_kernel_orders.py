@@ -7,7 +7,7 @@ import pytest
 from support.kernel_scenes import PRECISIONS, scene_flags
 
 from gpusense.backends import Backend, get_backend
-from gpusense.reference.order import ALL_BINS, STRETCH
+from gpusense.interface.constants import ALL_BINS, STRETCH
 
 
 def clouds() -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -45,8 +45,8 @@ from support.score_scenes import (
 
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.tolerances import differing, per_beam
-from gpusense.reference.error_free import BLOCK_TERMS, strand_sums, strands_in
-from gpusense.reference.tiles import TILE
+from gpusense.interface.constants import BLOCK_TERMS, TILE, strands_in
+from gpusense.reference.error_free import strand_sums
 
 SPREADS = range(6)
 COUNTS = (1, 15, 16, 17, 777)

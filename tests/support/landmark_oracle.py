@@ -14,7 +14,7 @@ import mpmath as mp
 import numpy as np
 
 import gpusense as gs
-from gpusense.reference import landmarks as at
+from gpusense.interface import feature_layout as at
 from gpusense.world.frames import place_poses
 
 mp.mp.dps = 36

@@ -13,9 +13,8 @@ from support.kernel_scenes import (
     with_low_parts,
 )
 
-from gpusense.models.scan.field import _GUARD
-from gpusense.reference.error_free import BLOCK_TERMS
-from gpusense.reference.tiles import TILE, TILE_PARTICLES
+from gpusense.interface.constants import BLOCK_TERMS, TILE, TILE_PARTICLES
+from gpusense.models.scan.field_pipeline import _GUARD
 from gpusense.world.frames import split
 
 # Weights and shapes of mixtures: z_hit, z_short, z_rand, sigma_hit and lambda_short in metres.

@@ -1,7 +1,7 @@
-"""What a point gave up: errors of ranges, of log-likelihoods and of the posterior, against the float64 truth.
+"""Compute a point's errors of ranges, of log-likelihoods and of the posterior, against the float64 truth.
 
-The truth is the exact caster and the models in float64, on the fastest device here that has float64. A test holds it to
-the NumPy reference.
+The truth is the exact caster and the models in float64, on the fastest device present with float64. A test compares it
+with the NumPy reference.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from gpusense.world.scanner import Reading, Scanner, classify
 Floats = NDArray[np.float64]
 
 SHARING = 0.1
-"""The share of the particles that is to carry the weight in the tempered posterior."""
+"""Effective sample size of the tempered posterior, as a share of the particles."""
 _HALVINGS = 60
 
-# Particles of one piece in which ranges are scored on the host.
+# Particles per piece when the host scores ranges.
 _PIECE = 256
 
 
 class UnstableError(ValueError):
-    """A result that is not finite, or of the wrong shape."""
+    """Raised for a result that is not finite, or of the wrong shape."""
 
 
 def truth_device() -> Backend:
-    """The fastest device with float64, NumPy in the worst case; simulators are left alone."""
+    """Open the fastest device with float64, NumPy if there is no other; simulators are excluded."""
     best, rank = get_backend("numpy"), len(SPEED_CLASSES)
     for device in devices():
         place = SPEED_CLASSES.index((device.backend, device.kind)) if device.kind != "simulator" else rank
@@ -49,12 +49,12 @@ def truth_device() -> Backend:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is right for the first particles of a cloud.
+    """Exact results for the first particles of a cloud.
 
     Attributes:
         scene: The scene.
         poses: (M, 3) the particles that are checked.
-        device: Where it is computed.
+        device: The device that computes the results.
     """
 
     scene: Scene
@@ -63,39 +63,39 @@ class Truth:
 
     @functools.cached_property
     def ranges(self) -> Floats:
-        """(M, K) exact expected ranges."""
+        """Compute (M, K) exact expected ranges [m]."""
         caster = RayCaster(self.scene.grid, self.scene.scanner.range_max, backend=self.device, precision="float64")
         return caster.cast(self.poses, self.scene.scanner.bearings)
 
     @functools.cached_property
     def beam(self) -> Floats:
-        """(M,) log-likelihoods of the beam model."""
+        """Compute (M,) log-likelihoods of the beam model."""
         scene = self.scene
         model = BeamModel(scene.grid, scene.scanner, scene.beam, backend=self.device, precision="float64")
         return model.log_likelihood(self.poses, scene.readings)
 
     @functools.cached_property
     def field(self) -> Floats:
-        """(M,) log-likelihoods of the likelihood field."""
+        """Compute (M,) log-likelihoods of the likelihood field."""
         scene = self.scene
         model = LikelihoodFieldModel(scene.grid, scene.scanner, scene.field, backend=self.device, precision="float64")
         return model.log_likelihood(self.poses, scene.readings)
 
     def log_p(self, problem: str) -> Floats:
-        """(M,) log-likelihoods that belong to a problem: those of the beam model for ranges too."""
+        """Return (M,) log-likelihoods of a problem's model; the problem ``"ranges"`` has those of the beam model."""
         return self.field if problem == "field" else self.beam
 
     @functools.cached_property
     def temperatures(self) -> dict[str, float]:
-        """By problem: what makes a tenth of the particles share in the truth's weight; see ``temperature_of``."""
+        """Compute the temperature of each problem's tempered posterior; see :func:`temperature_of`."""
         beam = temperature_of(self.beam)
         return {"ranges": beam, "beam": beam, "field": temperature_of(self.field)}
 
 
 def temperature_of(log_p: Floats) -> float:
-    """The factor in (0, 1] of log-likelihoods at which the effective sample size is a tenth of the particles.
+    """Find the factor of log-likelihoods, in (0, 1], at which the effective sample size is a tenth of the particles.
 
-    With the plain product over beams nearly all weight lies on one particle, and a posterior says little of errors.
+    With the plain product over beams nearly all weight lies on one particle, and its posterior hides most errors.
 
     Args:
         log_p: (M,) log-likelihoods, finite.
@@ -116,50 +116,56 @@ def temperature_of(log_p: Floats) -> float:
 def errors(
     truth: Truth, problem: str, *, ranges: NDArray[np.floating] | None, log_p: NDArray[np.floating] | None
 ) -> dict[str, dict[str, float]]:
-    """All errors of a point.
+    """Compute all errors of a point.
 
     Args:
-        truth: What is right.
+        truth: The exact results.
         problem: ``"ranges"``, ``"beam"`` or ``"field"``.
-        ranges: (M, K) what the candidate found, if it finds ranges.
-        log_p: (M,) its log-likelihoods; those that follow from its ranges, by the float64 mixture, if None.
+        ranges: (M, K) the candidate's ranges [m], or None.
+        log_p: (M,) the candidate's log-likelihoods; if None, the float64 mixture computes them from the ranges.
 
     Returns:
-        ``"ranges"`` where there are some, ``"log_p"``, ``"posterior"`` and ``"tempered"``, the posterior at the
-        temperature of ``Truth.temperatures``.
+        Errors by kind: ``"ranges"`` if ranges are passed, ``"log_p"``, ``"posterior"`` and ``"tempered"``, the
+        posterior at the temperature of ``Truth.temperatures``.
 
     Raises:
         UnstableError: a value is not finite, or an array has the wrong shape.
     """
-    scene, found = truth.scene, {}
+    scene, kinds = truth.scene, {}
     if ranges is not None:
-        found["ranges"] = range_errors(_checked("ranges", ranges, truth.ranges), truth.ranges, scene.grid.resolution)
+        kinds["ranges"] = range_errors(_checked("ranges", ranges, truth.ranges), truth.ranges, scene.grid.resolution)
         if log_p is None:
             log_p = score_ranges(ranges, scene.readings, scene.scanner, scene.beam)
     if log_p is None:
         raise UnstableError("nothing was computed")
     right = truth.log_p(problem)
     scores = _checked("log-likelihoods", log_p, right)
-    found["log_p"] = log_p_errors(scores, right)
-    found["posterior"] = posterior_errors(scores, right, truth.poses)
+    kinds["log_p"] = log_p_errors(scores, right)
+    kinds["posterior"] = posterior_errors(scores, right, truth.poses)
     factor = truth.temperatures[problem]
-    found["tempered"] = posterior_errors(factor * scores, factor * right, truth.poses)
-    return found
+    kinds["tempered"] = posterior_errors(factor * scores, factor * right, truth.poses)
+    return kinds
 
 
-def _checked(what: str, found: NDArray[np.floating], right: Floats) -> Floats:
-    values = np.asarray(found, np.float64)
+def _checked(quantity: str, computed: NDArray[np.floating], right: Floats) -> Floats:
+    values = np.asarray(computed, np.float64)
     if values.shape != right.shape:
-        raise UnstableError(f"{what} have the shape {values.shape}, must have {right.shape}")
+        raise UnstableError(f"{quantity} have the shape {values.shape}, must have {right.shape}")
     wrong = int(np.count_nonzero(~np.isfinite(values)))
     if wrong:
-        raise UnstableError(f"{wrong} of {values.size} {what} are not finite")
+        raise UnstableError(f"{wrong} of {values.size} {quantity} are not finite")
     return values
 
 
-def range_errors(found: Floats, right: Floats, resolution: float) -> dict[str, float]:
-    """Errors of ranges in cells: median, p99, max, mean, and the shares wrong by more than one and two cells."""
-    apart = np.abs(found - right) / resolution
+def range_errors(computed: Floats, right: Floats, resolution: float) -> dict[str, float]:
+    """Compute errors of ranges in cells: median, p99, max, mean, and the shares wrong by more than one and two cells.
+
+    Args:
+        computed: The ranges [m].
+        right: The exact ranges, of the same shape [m].
+        resolution: The side of a cell [m].
+    """
+    apart = np.abs(computed - right) / resolution
     if apart.size == 0:
         return dict.fromkeys(("median", "p99", "max", "mean", "wrong_1", "wrong_2"), 0.0)
     return {
@@ -172,31 +178,31 @@ def range_errors(found: Floats, right: Floats, resolution: float) -> dict[str, f
     }
 
 
-def log_p_errors(found: Floats, right: Floats) -> dict[str, float]:
-    """Largest and root-mean-square error of log-likelihoods [nats]."""
-    apart = np.abs(found - right)
+def log_p_errors(computed: Floats, right: Floats) -> dict[str, float]:
+    """Compute the largest and the root-mean-square error of log-likelihoods [nats]."""
+    apart = np.abs(computed - right)
     return {"max": float(apart.max(initial=0.0)), "rms": math.sqrt(float(np.sum(apart * apart)) / max(len(apart), 1))}
 
 
-def posterior_errors(found: Floats, right: Floats, poses: Floats) -> dict[str, float]:
-    """How far the normalised weights are from the right ones.
+def posterior_errors(computed: Floats, right: Floats, poses: Floats) -> dict[str, float]:
+    """Compare the normalised weights with the exact ones.
 
     Args:
-        found: (M,) log-likelihoods, finite; M > 0.
-        right: (M,) the right ones, finite.
+        computed: (M,) log-likelihoods, finite; M > 0.
+        right: (M,) exact log-likelihoods, finite.
         poses: (M, 3) the particles [m, m, rad].
 
     Returns:
-        ``kl``: the Kullback-Leibler divergence ``sum p log(p / q)`` of the weights found, q, from the right ones, p
-        [nats]; ``tv``: their total variation ``sum |p - q| / 2``; ``shift_m`` and ``shift_rad``: how far the weighted
-        mean of the poses moves.
+        ``kl``: the Kullback-Leibler divergence ``sum p log(p / q)`` of the computed weights q from the exact weights p
+        [nats]; ``tv``: their total variation ``sum |p - q| / 2``; ``shift_m`` and ``shift_rad``: the shift of the
+        weighted mean pose.
     """
-    p, q = normalize_weights(right).weights, normalize_weights(found).weights
-    log_p, log_q = (values - _log_sum(values) for values in (right, found))
+    p, q = normalize_weights(right).weights, normalize_weights(computed).weights
+    log_p, log_q = (values - _log_sum(values) for values in (right, computed))
     mean_p, mean_q = mean_pose(poses, p), mean_pose(poses, q)
     turn = math.remainder(mean_q[2] - mean_p[2], 2 * math.pi)
     return {
-        # It cannot be negative; the rounding of its terms can.
+        # The divergence is never negative; rounding of its terms may make the sum so.
         "kl": max(float(np.sum(p * (log_p - log_q))), 0.0),
         "tv": float(0.5 * np.sum(np.abs(p - q))),
         "shift_m": math.hypot(mean_q[0] - mean_p[0], mean_q[1] - mean_p[1]),
@@ -210,8 +216,8 @@ def _log_sum(values: Floats) -> float:
 
 
 def mean_pose(poses: Floats, weights: Floats) -> tuple[float, float, float]:
-    """Weighted mean of x and y, and the direction of the weighted mean of the headings [m, m, rad]."""
-    # From the first particle on: far from the origin a sum would lose digits.
+    """Return the weighted mean of x and y, and the weighted circular mean of the headings [m, m, rad]."""
+    # Relative to the first particle: far from the origin a sum would lose digits.
     x, y = poses[0, :2] + weights @ (poses[:, :2] - poses[0, :2])
     theta = math.atan2(float(weights @ np.sin(poses[:, 2])), float(weights @ np.cos(poses[:, 2])))
     return float(x), float(y), theta
@@ -220,7 +226,7 @@ def mean_pose(poses: Floats, weights: Floats) -> tuple[float, float, float]:
 def score_ranges(
     ranges: NDArray[np.floating], readings: Floats, scanner: Scanner, parameters: BeamParameters
 ) -> Floats:
-    """The beam model's log-likelihoods that follow from expected ranges, in float64 on the host.
+    """Score expected ranges with the beam model, in float64 on the host.
 
     Args:
         ranges: (M, K) expected ranges, clipped to [0, range_max] here [m].

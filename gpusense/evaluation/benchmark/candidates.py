@@ -1,6 +1,6 @@
-"""What is compared: the one list of methods with their variants and knobs, and how each is made for a scene.
+"""List the candidates: methods with their variants and knobs, and how to make each for a scene.
 
-For another caster or another value of a knob add a line to :data:`CURVES`.
+To add a caster or a value of a knob, add a line to :data:`CURVES`.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from gpusense.world.scanner import Scanner
 PROBLEMS = ("ranges", "beam", "field")
 """Expected ranges; log-likelihoods of the beam model; log-likelihoods of the likelihood field."""
 
-# Makes a runner of a scene for a device and a precision; outside candidates are given None for the device.
+# Makes a runner from a scene, a device (None for outside candidates) and a precision.
 Make = Callable[[Scene, Any, str], Runner]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to solve one problem.
+    """A method with its parameters for one problem.
 
     Attributes:
         problem: One of ``PROBLEMS``.
-        method: Its name.
-        make: Makes it.
-        variant: What sets it apart from the method's other curves.
-        knob: What traces its curve; empty where nothing does.
+        method: Name of the method.
+        make: Makes a runner for a scene.
+        variant: Difference from the method's other curves.
+        knob: Parameter that traces the curve; empty without one.
         value: The knob's value; None without a knob.
         exact: Whether it computes the exact ranges or the model itself, up to rounding.
-        precision: Of an outside candidate, for the report.
-        outside: Version and threads of what is not this package; empty for its own.
-        missing: Why it cannot run here; such a candidate is listed and not measured.
-        table_rays: How many rays it takes to build the table of a scene's map; None where none are cast.
+        precision: Precision of an outside candidate, for the report.
+        outside: Version and threads of an outside candidate; empty for this package's.
+        missing: Reason why it cannot run here; such a candidate is listed and not measured.
+        table_rays: Number of rays that build the table of a scene's map; None for tables built without rays.
     """
 
     problem: str
@@ -60,7 +60,7 @@ class Candidate:
 
     @property
     def label(self) -> str:
-        """Method, variant and knob in words."""
+        """Describe method, variant and knob in words."""
         words = [self.method, self.variant, f"{self.knob} = {self.value:g}" if self.value is not None else ""]
         return ", ".join(word for word in words if word)
 
@@ -71,11 +71,11 @@ class Curve:
 
     Attributes:
         method: A name of ``RayCaster.methods()``.
-        variant: What sets it apart from the method's other curves.
-        knob: The field of the caster that is turned; empty for none.
-        values: The knob's values, from rough to fine.
+        variant: Difference from the method's other curves.
+        knob: The caster's field that varies; empty for none.
+        values: The knob's values, from coarse to fine.
         options: The caster's other fields.
-        quick: Positions in ``values`` of those that a quick run measures, and that the beam model is measured with.
+        quick: Indices of ``values`` for quick runs and for the beam model.
     """
 
     method: str
@@ -90,7 +90,7 @@ CURVES = (
     Curve("exact"),
     Curve("dda"),
     Curve("march", "safe", "tolerance", (2.0, 1.0, 0.5, 0.1, 0.01), {"rule": "safe"}, (1, 3)),
-    # Below a cell nothing changes: the distance between the centres of two cells is at least 1.
+    # No tolerance below 1 cell: the distance between the centres of two cells is at least 1.
     Curve("march", "centre", "tolerance", (4.0, 2.0, 1.0), {"rule": "centre"}, (2,)),
     Curve("bresenham"),
     Curve("cddt", "", "bins", (54, 108, 216, 720), {"pruned": False}, (1,)),
@@ -102,77 +102,82 @@ CURVES = (
 BIN_WIDTHS = (0.5, 0.2, 0.1, 0.05, 0.02)
 """Bin widths [m] of the tabulated beam mixture."""
 SHARES = (8, 4, 2)
-"""Every so many-th beam is used."""
+"""Strides of the beams of thinned scans."""
 COMPAT = ("amcl", "beluga")
-"""Other packages whose formulas a model may reproduce."""
+"""Other packages whose formulas a model can reproduce."""
 
 
 def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidate]:
-    """All candidates of this package, exact ones first."""
-    found = []
+    """List this package's candidates for some problems, exact ones first.
+
+    Args:
+        problems: Problems, out of ``PROBLEMS``.
+        quick: Whether only a few values of each knob are listed.
+    """
+    listed = []
     for curve in CURVES:
         values: tuple[float | None, ...] = curve.values or (None,)
         few = tuple(curve.values[i] for i in curve.quick) if curve.values else values
         for value in few if quick else values:
             caster = caster_of(curve, value)
             rays = _table_rays(value) if curve.method == "lookup" and value else None
-            found += [
+            listed += [
                 Candidate(
                     problem, curve.method, make(caster), curve.variant, curve.knob, value, exact=caster.exact,
                     table_rays=rays,
                 )
                 for problem, make in (("ranges", _ranges), ("beam", _beam))
-                # What a caster costs and gives up shows in its ranges; the model is measured with some of them.
+                # The problem "ranges" shows a caster's cost and error; the model is measured with a few values only.
                 if problem == "ranges" or value in few
             ]  # fmt: skip
     exact = CASTERS["exact"]()
-    found.append(Candidate("field", "field", _field(), exact=True))
+    listed.append(Candidate("field", "field", _field(), exact=True))
     for share in SHARES[1:2] if quick else SHARES:
-        found.append(Candidate("beam", "exact", _beam(exact, share), "fewer beams", "every", share))
-        found.append(Candidate("field", "field", _field(share), "fewer beams", "every", share))
+        listed.append(Candidate("beam", "exact", _beam(exact, share), "fewer beams", "every", share))
+        listed.append(Candidate("field", "field", _field(share), "fewer beams", "every", share))
     for width in BIN_WIDTHS[2:3] if quick else BIN_WIDTHS:
-        found.append(Candidate("beam", "exact", _beam(exact, sensor_table=width), "sensor table", "bin width", width))
+        listed.append(Candidate("beam", "exact", _beam(exact, sensor_table=width), "sensor table", "bin width", width))
     for name in COMPAT:
         if _reproduces(BeamModel, name):
-            found.append(Candidate("beam", f"compat {name}", _beam(exact, compat=name)))
+            listed.append(Candidate("beam", f"compat {name}", _beam(exact, compat=name)))
         if _reproduces(LikelihoodFieldModel, name):
-            found.append(Candidate("field", f"compat {name}", _field(compat=name)))
-    return [candidate for candidate in found if candidate.problem in problems]
+            listed.append(Candidate("field", f"compat {name}", _field(compat=name)))
+    return [candidate for candidate in listed if candidate.problem in problems]
 
 
 def caster_of(curve: Curve, value: float | None) -> Caster:
-    """The caster of a curve with its knob at a value."""
+    """Make a curve's caster with its knob at a value."""
     options = dict(curve.options)
     if value is not None:
         options[curve.knob] = int(value) if curve.knob == "bins" else value
     return CASTERS[curve.method](**options)
 
 
-class _Made:
-    """A runner of this package: its model or caster, and what it says of its tables."""
+class _ModelRunner:
+    """A runner of this package's model or caster."""
 
     def __init__(self, model: Any, run: Callable[[np.ndarray], np.ndarray]) -> None:
         self._model, self._run = model, run
-        for own, name in (("prepare", "prepare"), ("ranges", "expected_ranges")):
-            if hasattr(model, name):
-                setattr(self, own, getattr(model, name))
+        for method, model_method in (("prepare", "prepare"), ("ranges", "expected_ranges")):
+            if hasattr(model, model_method):
+                setattr(self, method, getattr(model, model_method))
 
     def run(self, poses: np.ndarray) -> np.ndarray:
-        """(N, K) ranges or (N,) log-likelihoods of (N, 3) poses."""
+        """Compute (N, K) ranges or (N,) log-likelihoods of (N, 3) poses."""
         return self._run(poses)
 
     @property
     def table_bytes(self) -> int | None:
-        """Bytes of the map's tables on the device, once they are made."""
-        given = getattr(self._model, "table_bytes", None)
-        return None if given is None else int(given)
+        """Return the bytes of the map's tables on the device once they are built, else None."""
+        size = getattr(self._model, "table_bytes", None)
+        return None if size is None else int(size)
 
 
 def _ranges(method: Caster) -> Make:
     def make(scene: Scene, backend: Backend, precision: str) -> Runner:
         limit, bearings = scene.scanner.range_max, scene.scanner.bearings
         caster = RayCaster(scene.grid, limit, method=method, backend=backend, precision=precision)
-        return _Made(caster, lambda poses: caster.cast(poses, bearings))
+        return _ModelRunner(caster, lambda poses: caster.cast(poses, bearings))
 
     return make
 
@@ -183,7 +188,7 @@ def _beam(method: Caster, share: int = 1, **options: Any) -> Make:
             scene.grid, scene.scanner, scene.beam, backend=backend, precision=precision, caster=method,
             beams=_beams(scene, share), **options,
         )  # fmt: skip
-        return _Made(model, lambda poses: model.log_likelihood(poses, scene.readings))
+        return _ModelRunner(model, lambda poses: model.log_likelihood(poses, scene.readings))
 
     return make
 
@@ -194,7 +199,7 @@ def _field(share: int = 1, **options: Any) -> Make:
             scene.grid, scene.scanner, scene.field, backend=backend, precision=precision, beams=_beams(scene, share),
             **options,
         )  # fmt: skip
-        return _Made(model, lambda poses: model.log_likelihood(poses, scene.readings))
+        return _ModelRunner(model, lambda poses: model.log_likelihood(poses, scene.readings))
 
     return make
 
@@ -208,7 +213,7 @@ def _table_rays(bins: float) -> Callable[[Scene], float]:
 
 
 def _reproduces(model: Any, name: str) -> bool:
-    """Whether a model knows another package's formulas."""
+    """Return whether a model can reproduce another package's formulas."""
     grid, scanner = OccupancyGrid(np.zeros((1, 1), np.int8)), Scanner([0.0], 1.0)
     try:
         model(grid, scanner, backend="numpy", compat=name)

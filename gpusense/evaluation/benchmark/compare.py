@@ -1,4 +1,4 @@
-"""Two reports of the same scenes: what got slower, and what got less exact."""
+"""Compare two reports of the same scenes: points that became slower or less exact."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gpusense.evaluation.benchmark.profiles import error_of, label, setting, tim
 from gpusense.evaluation.benchmark.report import SCHEMA
 
 SLOWER = 1.3
-"""A point is slower when the least and the median of its times both grew by more than this factor."""
+"""A point is slower when both minimum and median of its times grew by more than this factor."""
 _LESS_EXACT = 1.05
 _KINDS = {
     "ranges": ("median", "p99", "max", "mean", "wrong_1", "wrong_2"), "log_p": ("max", "rms"),
@@ -27,15 +27,15 @@ _IDENTITY = ("scene", "cloud", "problem", "backend", "method", "variant", "knob"
 
 @dataclass
 class Comparison:
-    """What changed from an old report to a new one: a line for each, and how much could be compared.
+    """Changes from an old report to a new one, a line of text for each.
 
     Attributes:
         slower: Points whose times grew.
-        faster: Points whose times shrank by as much.
-        less_exact: Points an error of which grew, or that no longer work.
-        untimed: Points whose times are not comparable: another device or number of particles.
-        compared: Points in both.
-        gone: Points of the old report that the new one lacks.
+        faster: Points whose times fell by the same factor.
+        less_exact: Points with an error that grew, and points that no longer work.
+        untimed: Number of points whose times are not comparable: another device or number of particles.
+        compared: Number of points in both reports.
+        gone: Number of points of the old report that the new one lacks.
         others: Scenes of one name whose map, scan or particles differ; their points are not compared.
     """
 
@@ -49,10 +49,10 @@ class Comparison:
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """A report that ``gpusense bench`` wrote.
+    """Read a report of ``gpusense bench``.
 
     Raises:
-        OSError, ValueError: there is no such file, or it is no such report.
+        OSError, ValueError: the file is missing, or is no report.
     """
     try:
         report = json.loads(existing_file(path).read_text(encoding="utf-8"))
@@ -76,38 +76,38 @@ def compare(old: Mapping[str, Any], new: Mapping[str, Any], slower: float = SLOW
         new: A later one.
         slower: The factor above which a point counts as slower, > 1.
     """
-    found = Comparison()
+    result = Comparison()
     before = {scene["name"]: scene["fingerprint"] for scene in old["scenes"]}
-    found.others = [s["name"] for s in new["scenes"] if before.get(s["name"], s["fingerprint"]) != s["fingerprint"]]
+    result.others = [s["name"] for s in new["scenes"] if before.get(s["name"], s["fingerprint"]) != s["fingerprint"]]
     known = {_identity(point): point for point in new["points"]}
     same_machine = old["machine"].get("processor") == new["machine"].get("processor")
     for point in old["points"]:
-        if point["scene"] in found.others or point["status"] == "left out":
+        if point["scene"] in result.others or point["status"] == "left out":
             continue
         now = known.get(_identity(point))
         if now is None or now["status"] == "left out":
-            found.gone += 1
+            result.gone += 1
             continue
-        found.compared += 1
-        found.less_exact += _less_exact(point, now)
+        result.compared += 1
+        result.less_exact += _less_exact(point, now)
         if same_machine and all(point[name] == now[name] for name in ("device", "particles", "beams")):
-            _compare_times(found, point, now, slower)
+            _compare_times(result, point, now, slower)
         else:
-            found.untimed += 1
-    return found
+            result.untimed += 1
+    return result
 
 
-def _compare_times(found: Comparison, old: Mapping[str, Any], new: Mapping[str, Any], slower: float) -> None:
+def _compare_times(result: Comparison, old: Mapping[str, Any], new: Mapping[str, Any], slower: float) -> None:
     before, now = time_of(old, "call"), time_of(new, "call")
     if before is None or now is None:
         return
-    # On a shared machine either of the two alone is chance.
+    # On a shared machine one of the two may grow by chance.
     growths = [new["time"][name] / old["time"][name] for name in ("call_min_s", "call_median_s")]
     line = f"{name_of(new)}: {before * 1e3:.4g} ms, now {now * 1e3:.4g} ms ({now / before:.2f} times)"
     if min(growths) > slower:
-        found.slower.append(line)
+        result.slower.append(line)
     elif max(growths) < 1 / slower:
-        found.faster.append(line)
+        result.faster.append(line)
 
 
 def _less_exact(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
@@ -127,22 +127,22 @@ def _identity(point: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def name_of(point: Mapping[str, Any]) -> str:
-    """A point in words."""
+    """Describe a point in words."""
     words = (point["scene"], point["cloud"], point["problem"], point["backend"], point["precision"], label(point))
     return ", ".join(word for word in (*words, setting(point)) if word)
 
 
-def lines_of(found: Comparison, slower: float = SLOWER) -> list[str]:
-    """The comparison for reading."""
-    lines = [f"{found.compared} points compared, {found.gone} of the old report not measured now"]
-    if found.others:
-        lines.append(f"not comparable, another map, scan or cloud: {', '.join(found.others)}")
-    if found.untimed:
-        lines.append(f"{found.untimed} points with another device or size: their times are not compared")
+def lines_of(comparison: Comparison, slower: float = SLOWER) -> list[str]:
+    """Format a comparison as lines of text."""
+    lines = [f"{comparison.compared} points compared, {comparison.gone} of the old report not measured now"]
+    if comparison.others:
+        lines.append(f"not comparable, another map, scan or cloud: {', '.join(comparison.others)}")
+    if comparison.untimed:
+        lines.append(f"{comparison.untimed} points with another device or size: their times are not compared")
     for title, entries in (
-        (f"slower by more than {slower:g} times", found.slower),
-        (f"faster by more than {slower:g} times", found.faster),
-        ("less exact", found.less_exact),
+        (f"slower by more than {slower:g} times", comparison.slower),
+        (f"faster by more than {slower:g} times", comparison.faster),
+        ("less exact", comparison.less_exact),
     ):
         lines += ["", f"{title}: {len(entries) or 'none'}", *(f"  {entry}" for entry in entries)]
     return lines

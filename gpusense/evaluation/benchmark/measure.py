@@ -1,4 +1,4 @@
-"""What a point costs: first call, building, steady calls, launches alone, transfers, and memory on the device."""
+"""Measure a point's cost: first call, building, steady calls, launches alone, transfers, and memory on the device."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer, Launcher, Proxy
 
 LONG = 2.0
-"""A single call of more seconds is not repeated."""
+"""Duration of a call above which it is not repeated [s]."""
 SLOW_TO_MAKE = 2.0
-"""What takes more seconds to make is made once: its compiling and building are then told apart by no second one."""
-# Launches alone are repeated until so many seconds are over: on a processor they take as long as calls.
+"""Duration of a first call above which no second runner is made, so that building includes compiling [s]."""
+# Time to repeat launches alone for [s]; on a processor they take as long as calls.
 _LAUNCH_SECONDS, _FEWEST_LAUNCHES = {"gpu": 1.0, "cpu": 0.1}, 3
 
 
@@ -26,18 +26,18 @@ class Runner(Protocol):
     """A candidate made for a scene; it may also have ``prepare(poses)``, ``ranges(poses)`` and ``table_bytes``."""
 
     def run(self, poses: np.ndarray) -> np.ndarray:
-        """(N, K) ranges or (N,) log-likelihoods of (N, 3) poses."""
+        """Compute (N, K) ranges or (N,) log-likelihoods of (N, 3) poses."""
 
 
-# What getrefcount says of an object that only a list holds: versions of Python differ.
+# Reference count of an object that only a list holds; it depends on the version of Python.
 _LIST = [object()]
 _ALONE = sys.getrefcount(_LIST[0])
 
 
 class Meter(Proxy):
-    """A backend that passes everything on, and on the way counts bytes, sums seconds and remembers launches.
+    """A backend that forwards every call to another one, counts bytes, sums seconds and records launches.
 
-    Give it to a model as ``backend=``. Seconds and launches are taken between :meth:`begin` and :meth:`end` only.
+    Pass it to a model as ``backend=``. Seconds and launches are recorded between :meth:`begin` and :meth:`end` only.
     """
 
     def __init__(self, backend: Backend) -> None:
@@ -51,8 +51,8 @@ class Meter(Proxy):
 
     @property
     def live(self) -> int:
-        """Bytes of the buffers that are alive."""
-        # A buffer that only this list still holds has been let go of; drivers' buffers take no weak references.
+        """Return the bytes of the buffers that are alive."""
+        # A buffer that only this list holds is free; drivers' buffers do not support weak references.
         kept = [i for i in range(len(self._held)) if sys.getrefcount(self._held[i]) > _ALONE]
         self._held, self._bytes = [self._held[i] for i in kept], [self._bytes[i] for i in kept]
         return sum(self._bytes)
@@ -81,7 +81,7 @@ class Meter(Proxy):
         return buffer
 
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """See Backend.download; while it measures, this one always waits."""
+        """See Backend.download; while the meter measures, this method always waits."""
         if not self._on:
             return self._backend.download(buffer, out, wait=wait)
         begin = time.perf_counter()
@@ -115,40 +115,40 @@ class Meter(Proxy):
 
     @property
     def gathers(self) -> bool:
-        """See Backend.gathers; while it measures, every copy and launch is seen by itself."""
+        """See Backend.gathers; False while the meter measures, so that it sees every copy and launch."""
         return not self._on and super().gathers
 
     def begin(self) -> None:
-        """Take seconds and launches from now on."""
+        """Start to record seconds and launches."""
         self._on = True
 
     def end(self) -> None:
-        """Take no more."""
+        """Stop recording."""
         self._on = False
 
     def _room(self, size: int) -> None:
-        """Let go of what nobody else holds before something new is made, as without this meter."""
+        """Release unused buffers before an allocation, as without this meter, and update the peak."""
         self.peak = max(self.peak, self.live + size)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What was measured, in seconds and bytes; None where it could not be.
+    """Measured times [s] and sizes [bytes]; None where a measurement is not possible.
 
     Attributes:
-        first_s: Making the candidate and its first call, with compiling.
-        build_s: What a second one, compiled already, takes before its steady state: the tables of the map. Where the
-            first took more than ``SLOW_TO_MAKE`` seconds there is no second, and compiling is in here.
-        compile_s: How much longer the first took than the second: compiling, or loading kernels from a cache on disk.
-            Kernels that this process has compiled already cost nothing here. None without a second.
+        first_s: Making the runner and its first call, compiling included.
+        build_s: Time that a second runner, with compiled kernels, takes before its steady state: building the map's
+            tables. Where the first took more than ``SLOW_TO_MAKE`` there is no second, and compiling is included.
+        compile_s: First time minus second time: compiling, or loading kernels from a cache on disk. Kernels that this
+            process compiled before add nothing. None without a second runner.
         call_min_s, call_median_s: A call with NumPy arrays in and out.
-        calls: How many were measured, after a warm-up; 1 where a call takes more than two seconds.
-        launch_min_s, launch_median_s: Its launches alone, everything on the device.
-        launches: How many times they were measured; 0 for what does not run on a backend.
+        calls: Number of timed calls after a warm-up; 1 where a call takes more than two seconds.
+        launch_min_s, launch_median_s: Launches of a call alone, with all arrays on the device.
+        launches: Number of timed repetitions of the launches; 0 for a candidate without a backend.
         upload_s, download_s: Transfers of one call.
         table_bytes: Tables of the map on the device.
         device_bytes: All buffers that are alive after a call.
-        peak_bytes: The most that were alive at a time.
+        peak_bytes: Largest size of all buffers alive at a time.
     """
 
     first_s: float
@@ -170,13 +170,13 @@ class Cost:
 def measure(
     make: Callable[[Any], Runner], backend: Backend | None, poses: np.ndarray, repeats: int
 ) -> tuple[Cost, Runner]:
-    """Measure a candidate, and return it with its tables made.
+    """Measure a candidate, and return its runner with built tables.
 
     Args:
-        make: Makes it for a backend.
-        backend: The device; None for what does not run on a backend.
+        make: Makes a runner for a backend.
+        backend: The device; None for a candidate without a backend.
         poses: (N, 3) particles of a call.
-        repeats: How many calls are timed.
+        repeats: Number of timed calls.
     """
     meter = None if backend is None else Meter(backend)
     begin = time.perf_counter()
@@ -184,14 +184,14 @@ def measure(
     runner.run(poses)
     first = time.perf_counter() - begin
     calls = series(lambda: runner.run(poses), repeats)
-    found: dict[str, Any] = {}
+    on_device: dict[str, Any] = {}
     if meter is not None:
-        found = {"device_bytes": meter.live, "peak_bytes": meter.peak, **_apart(meter, runner, poses, repeats)}
+        on_device = {"device_bytes": meter.live, "peak_bytes": meter.peak, **_apart(meter, runner, poses, repeats)}
         meter.launches.clear()
     table = getattr(runner, "table_bytes", None)
     compiling = None
     if first - min(calls) < SLOW_TO_MAKE:
-        # Its memory is given back before the second one is made.
+        # Free the first runner's memory before the second one is made.
         del runner, meter
         begin = time.perf_counter()
         runner, built = _prepared(make, backend, poses)
@@ -203,13 +203,13 @@ def measure(
         built = first - min(calls)
     cost = Cost(
         first_s=first, build_s=built, compile_s=compiling, call_min_s=min(calls),
-        call_median_s=statistics.median(calls), calls=len(calls), table_bytes=table, **found,
+        call_median_s=statistics.median(calls), calls=len(calls), table_bytes=table, **on_device,
     )  # fmt: skip
     return cost, runner
 
 
 def _prepared(make: Callable[[Any], Runner], backend: Any, poses: np.ndarray) -> tuple[Runner, float | None]:
-    """A candidate, and how long making it and its tables took, if it can make them apart from a call."""
+    """Make a runner; return it with the time to make it and its tables [s], or None if it has no ``prepare``."""
     begin = time.perf_counter()
     runner = make(backend)
     prepare = getattr(runner, "prepare", None)
@@ -222,13 +222,13 @@ def _prepared(make: Callable[[Any], Runner], backend: Any, poses: np.ndarray) ->
 
 
 def series(run: Callable[[], object], repeats: int, fewest: int = 1, seconds: float = float("inf")) -> list[float]:
-    """Seconds of each call after one warm-up; the warm-up itself if it takes more than ``LONG`` seconds.
+    """Time calls after one warm-up; return their seconds, or the warm-up's if it takes more than ``LONG``.
 
     Args:
-        run: What is timed.
-        repeats: How often.
-        fewest: How often in any case.
-        seconds: No more than ``fewest`` once so much time is over.
+        run: The call.
+        repeats: Largest number of timed calls.
+        fewest: Least number of timed calls.
+        seconds: Total time after which no call beyond ``fewest`` begins.
     """
     warm = _seconds(run)
     if warm > LONG:
@@ -246,19 +246,19 @@ def _seconds(run: Callable[[], object]) -> float:
 
 
 def _apart(meter: Meter, runner: Runner, poses: np.ndarray, repeats: int) -> dict[str, Any]:
-    """Transfers of one call, and its launches alone with everything left on the device."""
+    """Time the transfers of one call, and its launches alone with all arrays on the device."""
     meter.begin()
     runner.run(poses)
     meter.end()
     launches, backend = meter.launches, meter._backend
 
     def launch() -> None:
-        for again in launches:
-            again()
+        for replay in launches:
+            replay()
         backend.synchronize()
 
-    found: dict[str, Any] = {"upload_s": meter.seconds["upload"], "download_s": meter.seconds["download"]}
+    times: dict[str, Any] = {"upload_s": meter.seconds["upload"], "download_s": meter.seconds["download"]}
     if launches:
-        times = series(launch, repeats, _FEWEST_LAUNCHES, _LAUNCH_SECONDS[backend.info.kind])
-        found |= {"launch_min_s": min(times), "launch_median_s": statistics.median(times), "launches": len(times)}
-    return found
+        each = series(launch, repeats, _FEWEST_LAUNCHES, _LAUNCH_SECONDS[backend.info.kind])
+        times |= {"launch_min_s": min(each), "launch_median_s": statistics.median(each), "launches": len(each)}
+    return times

@@ -1,8 +1,8 @@
-"""Outside candidates: other implementations, measured in the same run.
+"""Load outside candidates: other implementations, measured in the same run.
 
-They live in a Python file that is no part of the package: ``bench/speed/baselines.py`` of a checkout, or one that the
-user names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set;
-their ``make`` is called with the scene, None and the candidate's precision.
+A Python file outside the package defines them: ``bench/speed/baselines.py`` of a checkout, or a file that the user
+names. Its function ``candidates()`` returns ``Candidate`` objects (see ``candidates.py``) with ``outside`` set; their
+``make`` is called with the scene, None and the candidate's precision.
 """
 
 from __future__ import annotations
@@ -21,24 +21,28 @@ _MODULE = "gpusense_bench_peers"
 
 
 def checkout() -> Path | None:
-    """The checkout that this package is imported from; None for an installed one."""
+    """Return the checkout that this package is imported from; None for an installed package."""
     root = Path(gpusense.__file__).resolve().parents[1]
     return root if (root / "pyproject.toml").is_file() and (root / "gpusense").is_dir() else None
 
 
 def default_file() -> Path | None:
-    """The checkout's own file of outside candidates, if there is one."""
+    """Return the checkout's file of outside candidates, or None."""
     root = checkout()
     file = None if root is None else root / FILE
     return file if file is not None and file.is_file() else None
 
 
 def load(file: Path, problems: Sequence[str]) -> list[Candidate]:
-    """Execute a file and ask it for its candidates.
+    """Execute a file and return its candidates for some problems.
+
+    Args:
+        file: The Python file.
+        problems: The problems, out of ``PROBLEMS``.
 
     Raises:
-        OSError, ValueError: there is no such file, it does not run, or has no ``candidates()`` that returns a list of
-            outside candidates with one of the known problems.
+        OSError, ValueError: the file is missing, does not run, or has no ``candidates()`` that returns a list of
+            outside candidates with known problems.
     """
     existing_file(file)
     spec = importlib.util.spec_from_file_location(_MODULE, file)
@@ -48,11 +52,11 @@ def load(file: Path, problems: Sequence[str]) -> list[Candidate]:
     module = sys.modules[_MODULE] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-        found = list(module.candidates())
+        candidates = list(module.candidates())
     except Exception as error:
-        what = f"{type(error).__name__}: {error}"
-        raise ValueError(f"peers: {file} must run and have candidates(), got {what}") from error
-    for candidate in found:
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"peers: {file} must run and have candidates(), got {reason}") from error
+    for candidate in candidates:
         if not (isinstance(candidate, Candidate) and candidate.outside and candidate.problem in PROBLEMS):
             raise ValueError(f"peers: {file} must return Candidate objects with outside= set, got {candidate!r:.100}")
-    return [candidate for candidate in found if candidate.problem in problems]
+    return [candidate for candidate in candidates if candidate.problem in problems]

@@ -1,4 +1,4 @@
-"""Which of many are worth having: Pareto fronts, and the performance profiles of Dolan and More (2002)."""
+"""Rank candidates: Pareto fronts, and the performance profiles of Dolan and More (2002)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 Key = tuple[str, str, str]
 
 LIMITS = {"ranges": ("ranges", "wrong_1", 0.01), "beam": ("tempered", "kl", 0.01), "field": ("tempered", "kl", 0.01)}
-"""What solves a problem: the kind of error, its name, and the largest that is allowed."""
+"""By problem: kind and name of the error that decides whether a point solves it, and the largest error allowed."""
 LIMIT_TEXT = {
     "ranges": "at most 1 % of the rays wrong by more than one cell",
     "beam": "tempered posterior within 0.01 nats (Kullback-Leibler) of the exact one",
@@ -18,13 +18,13 @@ LIMIT_TEXT = {
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """The points that no other beats: none is at most as large in both and smaller in one.
+    """Find the points that no other point dominates, that is, is no larger in both and smaller in one.
 
     Args:
-        points: (error, time) of each.
+        points: (error, time) of each point.
 
     Returns:
-        Their indices by rising error; of equal points the first.
+        Indices of these points by rising error; of equal points the first.
     """
     front: list[int] = []
     fastest = math.inf
@@ -36,14 +36,14 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def performance_profile(times: Mapping[Any, Sequence[float | None]]) -> dict[Any, list[tuple[float, float]]]:
-    """Share of the problems that each solver solves within a factor tau of the fastest solver of that problem.
+    """Compute the share of problems that each solver solves within a factor tau of the fastest solver.
 
     Args:
         times: For each solver its time on every problem, > 0, or None where it does not solve it; all of one length.
 
     Returns:
         For each solver the steps (tau, share) of its profile by rising tau; from each tau on the share holds. A solver
-        that solves nothing has no steps. Problems that nobody solves count among all.
+        that solves no problem has no steps. Problems without a solver count in the denominator.
     """
     count = max((len(values) for values in times.values()), default=0)
     best = [min((v[i] or math.inf for v in times.values()), default=math.inf) for i in range(count)]
@@ -60,16 +60,16 @@ def performance_profile(times: Mapping[Any, Sequence[float | None]]) -> dict[Any
 
 
 def profiles_of(points: Sequence[Mapping[str, Any]], timing: str = "call") -> list[dict[str, Any]]:
-    """The profiles of a report, one for each problem and kind of device: times are never compared across hardware.
+    """Compute the profiles of a report, one per problem and kind of device; times are not compared across hardware.
 
-    A solver is a method with a fixed knob on one backend in one precision. Of the knobs of one method the one is shown
-    that solves most problems, and of those the one with the least geometric mean of its ratios to the fastest.
+    A solver is a method with a fixed knob on one backend in one precision. Of a method's knobs the profile shows the
+    one that solves most problems; of several, the one with the least geometric mean of its ratios to the fastest.
 
     Args:
         points: Points of a report.
         timing: ``"call"`` or ``"launch"``.
     """
-    found = []
+    profiles = []
     for problem, (kind, name, limit) in LIMITS.items():
         for hardware in ("gpu", "cpu"):
             chosen = [p for p in points if p["problem"] == problem and p["kind"] == hardware]
@@ -88,18 +88,18 @@ def profiles_of(points: Sequence[Mapping[str, Any]], timing: str = "call") -> li
                 for solver in _best_settings(steps)
                 for (backend, method, precision), at in (solver,)
             ]
-            found.append({
+            profiles.append({
                 "problem": problem, "kind": hardware, "timing": timing, "limit": LIMIT_TEXT[problem],
                 "problems": [f"{scene}, {cloud}" for scene, cloud in places], "curves": curves,
             })  # fmt: skip
-    return found
+    return profiles
 
 
 def _best_settings(steps: Mapping[tuple[Key, str], list[tuple[float, float]]]) -> list[tuple[Key, str]]:
     best: dict[Key, tuple[tuple[float, float], str]] = {}
-    for (curve, at), own in steps.items():
+    for (curve, at), profile in steps.items():
         before, mean = 0.0, 0.0
-        for ratio, share in own:
+        for ratio, share in profile:
             mean += (share - before) * math.log(ratio)
             before = share
         rank = (-before, mean / before)
@@ -118,22 +118,22 @@ def _curve(point: Mapping[str, Any]) -> Key:
 
 
 def label(point: Mapping[str, Any]) -> str:
-    """A method with its variant."""
+    """Name a point's method with its variant."""
     return f"{point['method']}, {point['variant']}" if point["variant"] else str(point["method"])
 
 
 def setting(point: Mapping[str, Any]) -> str:
-    """A knob with its value; empty where there is none."""
+    """Format a point's knob with its value; empty without a knob."""
     return f"{point['knob']} = {point['value']:g}" if point["knob"] else ""
 
 
 def error_of(point: Mapping[str, Any], kind: str, name: str) -> float | None:
-    """An error of a point; None where it failed or has none of that kind."""
+    """Return an error of a point; None where the point failed or lacks that kind."""
     value = ((point.get("errors") or {}).get(kind) or {}).get(name)
     return None if value is None or point["status"] != "ok" else float(value)
 
 
 def time_of(point: Mapping[str, Any], timing: str) -> float | None:
-    """Least seconds of a point's calls, or of its launches; None where it was not measured."""
+    """Return the least time of a point's calls or launches [s]; None where it was not measured."""
     value = (point.get("time") or {}).get(f"{timing}_min_s")
     return float(value) if value else None

@@ -1,4 +1,4 @@
-"""The report of a run: one JSON document, and the same as Markdown."""
+"""Write the report of a run as one JSON document and as Markdown."""
 
 from __future__ import annotations
 
@@ -16,32 +16,38 @@ from gpusense.evaluation.benchmark.profiles import label, profiles_of, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 1
-"""Raised when a field changes its meaning or goes; ``--compare`` takes reports of its own schema only."""
+"""Version of the report's fields; ``--compare`` accepts reports of this version only."""
 
 _DIGITS = 6
 
 _READING = """\
-Times are nanoseconds per particle-beam: a ray for *ranges*, a reading that is a range for *beam* and *field*, whose
-scans are scored. *call* is a call with NumPy arrays in and out, the least and the median of the calls after a warm-up;
-a star marks a single call, as those of more than two seconds are. *launch* is the least of the launches alone, with
-everything left on the device. *build* is what the tables of the map take, *compile* how much longer the first call in
-this process took (kernels may come from a cache on disk, and later rows find them compiled; where building takes more
-than five seconds, it holds compiling). *table* and *device* are bytes on the device: of the map's tables, and of
-everything that is alive after a call.
+Times are nanoseconds per particle-beam: a ray for *ranges*, an evaluated reading for *beam* and *field*. *call* is a
+call with NumPy arrays in and out: minimum and median of the calls after a warm-up. A star marks a single call, of more
+than two seconds. *launch* is the minimum of the launches alone, with all arrays on the device. *build* is the time to
+build the map's tables. *compile* is the additional time of the first call in this process: kernels may come from a
+cache on disk, and later rows reuse compiled kernels; where the first call takes long, *build* includes it. *table* and
+*device* are bytes on the device: of the map's tables, and of all buffers that are alive after a call.
 
-Errors are against the exact caster and the models in float64. Of ranges: median, 99th percentile and largest in cells,
-and the shares wrong by more than one and two cells. Of the scan's log-likelihood: root mean square and largest, in
-nats; for *ranges* it follows from them by the float64 mixture. Of the posterior, the normalised weights: KL, the
-Kullback-Leibler divergence from the right ones in nats; TV, their total variation; and how far the weighted mean of the
-poses moves. *tempered* is the posterior at the temperature where a tenth of the particles share in the weight, as a
-filter that works would have it. *fewer beams* and *compat* compute something else than the book's model on all beams,
-and are shown as what they are."""
+Errors are against the exact caster and the models in float64. For ranges: median, 99th percentile and maximum in cells,
+and the shares wrong by more than one and two cells. For the scan's log-likelihood: root mean square and maximum in
+nats; for *ranges* it follows from the ranges by the float64 mixture. For the posterior, the normalised weights: KL, the
+Kullback-Leibler divergence from the exact weights in nats; TV, the total variation; and the shift of the weighted mean
+pose. *tempered* is the posterior at the temperature where a tenth of the particles share the weight, as in a working
+filter. *fewer beams* and *compat* compute another model than the book's on all beams; they are shown for comparison."""
 
 
 def document(
     plan: Plan, outcome: Outcome, arguments: Mapping[str, Any], machine: Mapping[str, Any], absent: Sequence[str]
 ) -> dict[str, Any]:
-    """The report as plain values; non-finite numbers are None."""
+    """Build the report from plain values; non-finite numbers become None.
+
+    Args:
+        plan: The plan.
+        outcome: The measurements.
+        arguments: Arguments of the command.
+        machine: Description of the machine.
+        absent: Devices and candidates that are absent, with reasons.
+    """
     value = {
         "schema": SCHEMA,
         "date": time.strftime("%Y-%m-%d"),
@@ -59,7 +65,7 @@ def document(
 
 
 def plain(value: Any) -> Any:
-    """A value in JSON's own types; numbers are rounded to six digits, those that are not finite become None."""
+    """Convert a value to JSON's types; round numbers to six digits and replace non-finite ones by None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -70,7 +76,7 @@ def plain(value: Any) -> Any:
 
 
 def to_json(report: Mapping[str, Any]) -> str:
-    """The JSON document: every element of a list on a line of its own, so that two reports can be diffed."""
+    """Format a report as JSON with one line per list element, so that two reports can be diffed."""
     parts = []
     for key, value in report.items():
         if isinstance(value, list) and value:
@@ -82,7 +88,7 @@ def to_json(report: Mapping[str, Any]) -> str:
 
 
 def commit() -> str | None:
-    """The commit of the checkout that the package is imported from, with a plus if files differ; None elsewhere."""
+    """Return the commit of the package's checkout, with a plus if files differ; None outside a checkout."""
     root = peers.checkout()
     if root is None:
         return None
@@ -97,10 +103,10 @@ def commit() -> str | None:
 
 
 def markdown(report: Mapping[str, Any], images: Sequence[tuple[str, str]] = ()) -> str:
-    """The report for reading.
+    """Format a report as Markdown.
 
     Args:
-        report: What ``document`` returned.
+        report: A report of :func:`document`.
         images: Title and file name of each diagram.
     """
     machine, truth = report["machine"], report["truth"]
@@ -123,13 +129,13 @@ def markdown(report: Mapping[str, Any], images: Sequence[tuple[str, str]] = ()) 
         lines += _reasons(title, [point for point in points if point["status"] == status])
     groups = dict.fromkeys((p["problem"], p["scene"], p["cloud"]) for p in points)
     for problem, scene, cloud in groups:
-        own = [p for p in points if (p["problem"], p["scene"], p["cloud"]) == (problem, scene, cloud)]
-        lines += [f"## {problem}: {scene}, {cloud}", "", *_point_table(own, problem), ""]
+        group = [p for p in points if (p["problem"], p["scene"], p["cloud"]) == (problem, scene, cloud)]
+        lines += [f"## {problem}: {scene}, {cloud}", "", *_point_table(group, problem), ""]
     return "\n".join(lines)
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int) -> list[str]:
-    """Lines of a Markdown table whose columns from ``numbers`` on are aligned to the right."""
+    """Format the lines of a Markdown table; columns from ``numbers`` on are right-aligned."""
     rule = [" --- " if i < numbers else " ---: " for i in range(len(columns))]
     cells = [columns, *([text.replace("|", "\\|") for text in row] for row in rows)]
     lines = [f"| {' | '.join(row)} |" for row in cells]
@@ -152,7 +158,7 @@ def _scene_table(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _profile_table(profiles: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Where each curve of the performance profiles begins and ends."""
+    """Format where each curve of the performance profiles begins and ends."""
     lines = []
     for profile in profiles:
         rows = []
@@ -193,7 +199,7 @@ def _point_table(points: Sequence[Mapping[str, Any]], problem: str) -> list[str]
 
 
 def row(point: Mapping[str, Any], *, extra: bool) -> list[str]:
-    """A point's cells of ``COLUMNS``, with those of ``RANGE_COLUMNS`` in between where ``extra`` is True."""
+    """Format a point's cells of ``COLUMNS``; ``extra`` inserts those of ``RANGE_COLUMNS``."""
     time_s, memory, errors = (point[name] or {} for name in ("time", "memory", "errors"))
     backend = f"{point['backend']}: {point['device']}" if point["outside"] else point["backend"]
     name = f"**{label(point)}**" if point["exact"] else label(point)

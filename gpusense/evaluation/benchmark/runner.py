@@ -1,4 +1,4 @@
-"""The run: every candidate in every cloud of every scene on every device, failures included."""
+"""Run every candidate in every cloud of every scene on every device, and record failures."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from gpusense.localization.weights import normalize_weights
 
 PRECISIONS = ("float32", "float64")
 
-# Particles of a call where none are asked for: enough for the device to show its pace.
+# Default number of particles of a call: enough to fill the device.
 PARTICLES = {"gpu": 4096, "cpu": 1024}
-# The NumPy reference is written for reading: it gets fewer.
+# Divisor of that number for the NumPy reference, which is slower.
 NUMPY_SHARE = 8
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run.
+    """Plan of a run.
 
     Attributes:
         sources: Maps.
         backends: Devices.
-        candidates: This package's, and outside ones.
-        precisions: Of this package's candidates.
-        particles: N of a timed call; None for a number that suits the device.
-        checked: Particles whose results are checked, at most.
-        beams: K.
-        repeats: Calls that are timed.
-        seed: Of everything random.
-        build_limit: A table that would take longer to build is left out [s].
-        deadline: What has not begun after so many seconds of measuring, compiling not counted, is left out.
+        candidates: Candidates of this package and outside ones.
+        precisions: Precisions of this package's candidates.
+        particles: N of a timed call; None for the device's default.
+        checked: Largest number of particles whose results are checked.
+        beams: K of the scanner.
+        repeats: Timed calls per point.
+        seed: Seed of all random numbers.
+        build_limit: Longest time to build a table [s]; a point above it is left out.
+        deadline: Measuring time, without compiling, after which no further point begins [s].
     """
 
     sources: Sequence[MapSource]
@@ -55,7 +55,7 @@ class Plan:
     deadline: float = float("inf")
 
     def particles_on(self, backend: Backend | None) -> int:
-        """N of a timed call on a device."""
+        """Return N of a timed call on a device; None stands for an outside candidate."""
         kind = "cpu" if backend is None else backend.info.kind
         count = PARTICLES[kind] if self.particles is None else self.particles
         numpy = backend is not None and backend.info.backend == "numpy"
@@ -63,7 +63,7 @@ class Plan:
 
     @property
     def cloud(self) -> int:
-        """Particles of a cloud: enough for every device and for the check."""
+        """Return the particles of a cloud: enough for every device and for the check."""
         return max([self.checked, *(self.particles_on(backend) for backend in (None, *self.backends))])
 
 
@@ -78,12 +78,12 @@ class Job:
 
 @dataclass
 class Outcome:
-    """What a run found.
+    """Result of a run.
 
     Attributes:
         scenes: Descriptions of the scenes.
-        points: One for each scene, cloud and job: see ``point_of``.
-        truth: The device of the truth.
+        points: One point per scene, cloud and job; see :func:`point_of`.
+        truth: Description of the truth and its device.
     """
 
     scenes: list[dict[str, Any]]
@@ -92,29 +92,29 @@ class Outcome:
 
 
 def jobs(plan: Plan) -> list[Job]:
-    """What is measured in every cloud, devices innermost, so that each candidate meets them under the same load."""
-    found = []
+    """List the jobs of a cloud, devices innermost, so that a candidate runs on all devices under the same load."""
+    listed = []
     for candidate in plan.candidates:
         if candidate.outside:
-            found.append(Job(candidate, None, candidate.precision))
+            listed.append(Job(candidate, None, candidate.precision))
             continue
         for precision in plan.precisions:
             able = (b for b in plan.backends if precision == "float32" or b.info.float64)
-            found += [Job(candidate, backend, precision) for backend in able]
-    return found
+            listed += [Job(candidate, backend, precision) for backend in able]
+    return listed
 
 
 def steps(plan: Plan) -> int:
-    """How many points the plan has."""
+    """Count the points of a plan."""
     return len(plan.sources) * len(CLOUDS) * len(jobs(plan))
 
 
 def run(plan: Plan, step: Callable[[str], None] = lambda text: None) -> Outcome:
-    """Measure everything.
+    """Measure all points of a plan.
 
     Args:
-        plan: What.
-        step: Gets a text before each point.
+        plan: The plan.
+        step: Called with a text before each point.
 
     Raises:
         OSError, ValueError: a map cannot be read, or has no room for a robot.
@@ -139,7 +139,7 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None) -> Outcome:
                 outcome.points.append(point)
                 spent += time.perf_counter() - begin
                 if point["time"]:
-                    # A run that must compile its kernels measures about as many points as the next one.
+                    # Compiling does not count, so a first run measures about as many points as the next one.
                     spent -= point["time"]["compile_s"] or 0.0
                     built[*_place(job), job.candidate.label] = point["time"]["build_s"]
                     if job.candidate.method == "exact" and job.candidate.problem == "ranges":
@@ -148,11 +148,18 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None) -> Outcome:
 
 
 def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -> dict[str, Any]:
-    """Measure one point; whatever goes wrong becomes its status and reason.
+    """Measure one point; a failure becomes its status and reason.
+
+    Args:
+        plan: The plan.
+        job: Candidate, device and precision.
+        truth: The exact results of the cloud.
+        cloud: Name of the cloud.
+        reason: Reason to leave the point out; empty to measure it.
 
     Returns:
-        Plain values. ``status`` is ``"ok"``; ``"failed"`` after an exception; ``"unstable"`` for results that are not
-        finite; ``"left out"`` for what was not tried. ``reason`` says why.
+        Plain values. ``status`` is ``"ok"``, ``"failed"`` after an exception, ``"unstable"`` for results that are not
+        finite, or ``"left out"`` for a point that was not tried. ``reason`` explains the status.
     """
     scene, candidate, backend = truth.scene, job.candidate, job.backend
     particles = plan.particles_on(backend)
@@ -187,12 +194,12 @@ def _errors(truth: Truth, problem: str, runner: Runner) -> dict[str, dict[str, f
     result = runner.run(truth.poses)
     if problem == "ranges":
         return errors(truth, problem, ranges=result, log_p=None)
-    find = getattr(runner, "ranges", None) if problem == "beam" else None
-    return errors(truth, problem, ranges=None if find is None else find(truth.poses), log_p=result)
+    cast = getattr(runner, "ranges", None) if problem == "beam" else None
+    return errors(truth, problem, ranges=None if cast is None else cast(truth.poses), log_p=result)
 
 
 def _split(cost: Cost) -> dict[str, dict[str, Any]]:
-    """Seconds and bytes apart."""
+    """Split a cost into seconds and bytes."""
     values = asdict(cost)
     memory = {name: values.pop(name) for name in list(values) if name.endswith("_bytes")}
     return {"time": values, "memory": memory}
@@ -210,7 +217,16 @@ def _left_out(
     built: Mapping[tuple[str, ...], float],
     spent: float,
 ) -> str:
-    """Why a point is not tried; empty if it is. ``built`` says what tables have taken in this scene."""
+    """Return why a point is left out; empty if it is measured.
+
+    Args:
+        plan: The plan.
+        job: Candidate, device and precision.
+        scene: The scene.
+        paces: Rays per second of the exact caster, by device and precision.
+        built: Seconds that tables took to build in this scene, by device, precision and candidate.
+        spent: Measuring time so far [s].
+    """
     if job.candidate.missing:
         return job.candidate.missing
     if spent > plan.deadline:
@@ -237,7 +253,7 @@ def _description(scene: Scene) -> dict[str, Any]:
 
 
 def _cloud_description(truth: Truth) -> dict[str, Any]:
-    """What the truth says of a cloud: how many rays end in the map, and how many particles share in the weight."""
+    """Describe a cloud by the truth: share of rays that hit, mean range, effective sample sizes, temperatures."""
     ranges = truth.ranges
     return {
         "checked": len(truth.poses),

@@ -1,4 +1,4 @@
-"""Scenes of the benchmark: a map, a scanner, a true pose, a scan simulated there, and two clouds of particles."""
+"""Make scenes: a map, a scanner, a true pose, a scan simulated at that pose, and two clouds of particles."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gpusense.world.scanner import Reading, Scanner, classify
 Floats = NDArray[np.float64]
 
 CLOUDS = ("global", "tracking")
-"""Uniform over the free cells and all headings; normal around the true pose, cut to free space."""
+"""Uniform over the free cells and all headings; normal around the true pose, restricted to free space."""
 SIGMA_POSITION, SIGMA_HEADING = 0.5, 0.25  # of the tracking cloud [m, rad]
 RANGE_MAX = 30.0
 
@@ -36,25 +36,25 @@ RECORDED = {
     "willow": "ros_maps/willow-full.yaml",
     "intel": "carmen_logs/derived_maps/intel_even_05cm.yaml",
 }
-"""Maps of real places, by the name of their scene: files below the folder that GPUSENSE_DATA names."""
+"""Recorded maps by the name of their scene: files below the folder in the variable GPUSENSE_DATA."""
 
 # Width and height of the generated maps [m], and those of a quick run.
 _SIZES = {"building": (50.0, 50.0), "clutter": (50.0, 50.0)}
 _QUICK_SIZES = {"building": (20.0, 14.0), "clutter": (15.0, 15.0)}
 GENERATED = tuple(_SIZES)
 _RESOLUTION = 0.05
-_CLEARANCE = 0.4  # from the true pose to anything that is not free [m]
+_CLEARANCE = 0.4  # from the true pose to the nearest cell that is not free [m]
 _TRIED_POSES = 32
 _MOST_ROUNDS = 1000
 
 
 @dataclass(frozen=True)
 class MapSource:
-    """Where the map of a scene comes from.
+    """Source of a scene's map.
 
     Attributes:
         name: The scene's name.
-        origin: How the map is generated, or its file's name.
+        origin: Description of a generated map, or the name of the map's file.
         path: The map_server YAML; None for a generated map.
         size: Width and height of a generated map [m].
     """
@@ -65,7 +65,7 @@ class MapSource:
     size: tuple[float, float] = (0.0, 0.0)
 
     def grid(self, seed: int) -> OccupancyGrid:
-        """The map; generated ones follow from the seed."""
+        """Read the map, or generate it from the seed."""
         if self.path is not None:
             return read_map(self.path)
         make = {"building": building, "clutter": clutter}[self.name]
@@ -74,17 +74,17 @@ class MapSource:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is computed: all candidates get the same.
+    """The inputs that all candidates share.
 
     Attributes:
-        name: Its name.
-        origin: How its map is generated, or the map's file name.
-        grid: The map; unknown cells and what lies outside are free.
-        scanner: K beams all around.
-        pose: (3,) where the scan was taken [m, m, rad].
+        name: Name of the scene.
+        origin: Description of a generated map, or the name of the map's file.
+        grid: The map; unknown cells and the surroundings of the map are free.
+        scanner: K beams over 360 degrees.
+        pose: (3,) true pose of the scan [m, m, rad].
         readings: (K,) the scan, drawn from the beam model [m]; +inf where there is no return.
         clouds: (N, 3) particles by the cloud's name [m, m, rad].
-        beam: Parameters of the beam model, also those that the scan was drawn with.
+        beam: Parameters of the beam model and of the simulated scan.
         field: Parameters of the likelihood field.
     """
 
@@ -100,12 +100,12 @@ class Scene:
 
     @functools.cached_property
     def hits(self) -> int:
-        """How many readings are ranges: those that a model evaluates for each particle."""
+        """Count the readings that are ranges, which a model evaluates for each particle."""
         return int(np.count_nonzero(classify(self.readings, self.scanner) == Reading.HIT))
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """Sixteen digits that tell whether two reports speak of the same map, scan and particles."""
+        """Return 16 hexadecimal digits of a hash over map, scan and particles; equal scenes have equal digits."""
         digest = hashlib.sha256()
         grid = self.grid
         placed = (grid.resolution, *grid.origin, float(grid.occupied_threshold), self.scanner.range_max)
@@ -116,15 +116,15 @@ class Scene:
 
 
 def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, quick: bool = False) -> list[MapSource]:
-    """The maps of a run.
+    """List the maps of a run.
 
     Args:
-        names: Names of scenes; None for all that are here, or, where maps are given, for those maps alone.
+        names: Names of scenes; None for all available scenes, or for ``maps`` alone if there are some.
         maps: map_server YAML files of further scenes, named by their stems.
-        quick: Small generated maps, and no recorded ones unless they are named.
+        quick: Whether generated maps are small, and recorded maps included only by name.
 
     Raises:
-        ValueError: a name is no scene's, or not here; two scenes would have one name.
+        ValueError: a scene is unknown or not available, or two scenes have the same name.
     """
     sizes = _QUICK_SIZES if quick else _SIZES
     known = {name: MapSource(name, f"generated, {w:g} x {h:g} m", None, (w, h)) for name, (w, h) in sizes.items()}
@@ -150,14 +150,14 @@ def sources(names: Sequence[str] | None = None, maps: Sequence[Path] = (), *, qu
 
 
 def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int, seed: int) -> Scene:
-    """The scene of a map; the same arguments make the same scene, whatever others are made.
+    """Make the scene of a map; it depends on these arguments alone.
 
     Args:
         source: The map.
-        device: Where the beams of the scan are cast, in its best precision.
-        beams: K.
+        device: Device that casts the beams of the scan, in its best precision.
+        beams: K of the scanner.
         particles: N of each cloud.
-        seed: Of map, pose, scan and clouds.
+        seed: Seed of map, pose, scan and clouds.
 
     Raises:
         ValueError: the map has no room for a robot.
@@ -171,7 +171,7 @@ def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int
     key = zlib.crc32(source.name.encode())
     rng = {name: np.random.default_rng([seed, key, i]) for i, name in enumerate(names)}
     pose, expected = _true_pose(source.name, grid, scanner, device, rng["pose"])
-    # A tenth of a millimetre, as scanners give them: the same on every device that casts them.
+    # Rounded to a tenth of a millimetre, so that the readings are equal on every device that casts them.
     readings = np.round(sample_readings(expected, RANGE_MAX, BeamParameters(), rng["scan"]), 4)
     clouds = {
         "global": cloud_uniform(grid, particles, rng["global"]),
@@ -185,7 +185,7 @@ def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int
 def _true_pose(
     name: str, grid: OccupancyGrid, scanner: Scanner, device: Backend, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """A pose away from walls at which most beams meet something, and its expected ranges."""
+    """Draw a pose away from walls at which most beams hit; return it with its expected ranges."""
     from scipy.ndimage import distance_transform_edt
 
     wanted = _CLEARANCE / grid.resolution + math.sqrt(2)
@@ -198,13 +198,13 @@ def _true_pose(
     caster = RayCaster(grid, scanner.range_max, backend=device, precision=precision)
     expected = np.minimum(caster.cast(poses, scanner.bearings).astype(np.float64), scanner.range_max)
     seen = np.count_nonzero(expected < scanner.range_max, axis=1)
-    # The first that is good enough: the best would always stand in the smallest room.
+    # The first pose with enough hits: the one with most hits would always be in the smallest room.
     chosen = int(np.argmax(seen >= min(2 * scanner.count / 3, seen.max())))
     return poses[chosen], expected[chosen]
 
 
 def _cloud_in_free_space(grid: OccupancyGrid, pose: Floats, n: int, rng: np.random.Generator) -> Floats:
-    """(n, 3) particles of the tracking cloud: those that fall on other than free cells are drawn again."""
+    """Draw (n, 3) particles of the tracking cloud; particles outside free cells are drawn again."""
     kept, count = [np.empty((0, 3))], 0
     for _ in range(_MOST_ROUNDS):
         if count >= n:
@@ -216,7 +216,7 @@ def _cloud_in_free_space(grid: OccupancyGrid, pose: Floats, n: int, rng: np.rand
 
 
 def is_free(grid: OccupancyGrid, poses: Floats) -> NDArray[np.bool]:
-    """(N,) whether each of (N, 3) poses stands on a free cell."""
+    """Return (N,) whether each of (N, 3) poses lies in a free cell."""
     col, row = np.floor(grid.world_to_cells(poses[:, :2])).astype(np.int64).T
     rows, cols = grid.shape
     inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
@@ -225,10 +225,10 @@ def is_free(grid: OccupancyGrid, poses: Floats) -> NDArray[np.bool]:
 
 
 def clutter(seed: int = 0, size: tuple[float, float] = (50.0, 50.0), resolution: float = 0.05) -> OccupancyGrid:
-    """A walled hall full of boxes: a few shelves, some crates, and many small things no larger than a few cells.
+    """Generate a walled hall full of boxes: a few shelves, some crates, and many objects of at most 4 cells.
 
     Args:
-        seed: The same seed makes the same hall.
+        seed: Seed of the random numbers: the same seed generates the same hall.
         size: (W, H) of the grid along x and y [m].
         resolution: The side of a cell [m].
 

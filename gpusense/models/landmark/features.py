@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.reference import landmarks as at
+from gpusense.interface import feature_layout as at
 from gpusense.world.frames import Mount, split
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters

@@ -9,8 +9,8 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface.feature_layout import ARCS
 from gpusense.models.landmark.features import Sensor, full_circle, signature_mass
-from gpusense.reference.landmarks import ARCS
 from gpusense.world.frames import split
 from gpusense.world.landmarks import Buckets, LandmarkMap
 from gpusense.world.parameters import LandmarkParameters

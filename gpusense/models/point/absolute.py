@@ -11,13 +11,13 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import MISSING, PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.models.poses import Part, Poses
-from gpusense.reference.absolute import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 

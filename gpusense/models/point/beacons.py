@@ -11,14 +11,13 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.constants import BEACON, BEACON_TERMS, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.models.poses import Part, Poses
-from gpusense.reference.beacons import BEACON, NORMAL, STUDENT_T, TERMS, TWO_NORMALS
-from gpusense.reference.relative import FARTHEST
 from gpusense.world.sensor_parameters import BeaconParameters
 
 
@@ -171,7 +170,7 @@ class BeaconModel(PointModel):
                     rest = [*two_parts(heavy, real), 0.0, 0.0]
                 first = two_parts(_normal(p.sigma_range, total(log_of(p.z_hit), log_of(share))), real)
         terms = np.array([*first, random, p.range_max, p.bias, *rest], real)
-        assert len(terms) == TERMS
+        assert len(terms) == BEACON_TERMS
         return kind, terms, series.astype(real)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import BLOCK_TERMS, strands_in
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.models.poses import PlacedPoses
@@ -18,7 +19,6 @@ from gpusense.models.scan.mixture import Mixture
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
-from gpusense.reference.error_free import BLOCK_TERMS, strands_in
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import ray_vectors
 
@@ -140,7 +140,7 @@ class BeamPipeline(ScanPipeline):
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""
         if "STRANDED" in flags:
-            return int(strands_in(readings.readings)), 1
+            return strands_in(readings.readings), 1
         return readings.readings, BLOCK_TERMS
 
     def score_launches(self, scoring: Scoring) -> Program:

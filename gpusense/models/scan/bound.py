@@ -17,12 +17,12 @@ import numpy as np
 from gpusense.backends import arrays
 from gpusense.backends.base import Adopted, Buffer, Recording
 from gpusense.backends.workspace import POSE_STATUS, Workspace
+from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings
-from gpusense.reference.error_free import BLOCK_TERMS
 
 _INT = np.dtype(np.int32)
 

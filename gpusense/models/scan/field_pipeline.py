@@ -8,6 +8,7 @@ import numpy as np
 
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
@@ -16,7 +17,6 @@ from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
-from gpusense.reference.error_free import BLOCK_TERMS
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import split
@@ -67,7 +67,7 @@ class FieldPipeline(ScanPipeline):
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.mend
+            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.refresh
         )
 
     @property
@@ -78,8 +78,8 @@ class FieldPipeline(ScanPipeline):
     @property
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before there is one."""
-        region = self._map.region
-        return 0 if region is None else self.real.itemsize * (region.rows + 2 * RING) * (region.cols + 2 * RING)
+        window = self._map.window
+        return 0 if window is None else self.real.itemsize * (window.rows + 2 * RING) * (window.cols + 2 * RING)
 
     def _mixture(
         self, p: LikelihoodFieldParameters, *, bilinear: bool, cubes: bool

@@ -10,11 +10,10 @@ import numpy as np
 
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.interface.launches import Program, launch
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import Beams
-from gpusense.reference.error_free import BLOCK_TERMS
-from gpusense.reference.scan import MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)

@@ -8,11 +8,9 @@ import numpy as np
 
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import ALL_BINS, BLOCK_TERMS, STRETCH, TILE, TILE_PARTICLES, TILE_RAYS
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.models.poses import PlacedPoses
-from gpusense.reference.error_free import BLOCK_TERMS
-from gpusense.reference.order import ALL_BINS, STRETCH
-from gpusense.reference.tiles import TILE, TILE_PARTICLES, TILE_RAYS
 from gpusense.world.windows import extent
 
 _INT = np.dtype(np.int32)

@@ -29,9 +29,10 @@ lanes log_field_lanes(global const real *table, const Particles *particle, const
     lanes rest_x, rest_y, to_next_x, to_next_y;
     const LanePair x = careful_offset_lanes(particle->x, particle->x_low, particle->cos, particle->cos_low, p,
                                             particle->sin, particle->sin_low, q, -1);
+    const ilanes to_col = whole_cells_lanes(x, &rest_x, &to_next_x);
     const LanePair y = careful_offset_lanes(particle->y, particle->y_low, particle->sin, particle->sin_low, p,
                                             particle->cos, particle->cos_low, q, 1);
-    const ilanes to_col = whole_cells_lanes(x, &rest_x, &to_next_x), to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
+    const ilanes to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
     const ilanes c = within_lanes(particle->col + to_col, stride - 2);
     const ilanes r = within_lanes(particle->row + to_row, rows + 2 * FIELD_RING - 2);
     const ilanes index = r * stride + c;

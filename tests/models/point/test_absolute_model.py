@@ -8,7 +8,7 @@ from support import absolute_oracle as oracle
 from support.absolute_scenes import GRID, NAN, models, poses_around
 
 import gpusense as gs
-from gpusense.reference.absolute import WRAPS
+from gpusense.interface.constants import WRAPS
 
 INF = float("inf")
 POSES = poses_around(GRID, 40)

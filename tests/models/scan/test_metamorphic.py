@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import TOLERANCES, per_beam
-from gpusense.reference.error_free import BLOCK_TERMS
+from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.heading import cos_sin
 
 CELL, MARGIN, RANGE, CAP, MOUNT = 0.25, 6, 6.0, 1.0, (0.2, -0.1, 0.3)

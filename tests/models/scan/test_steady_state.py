@@ -8,9 +8,9 @@ from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
+from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.models import run
 from gpusense.models.scan import tiles
-from gpusense.reference.error_free import BLOCK_TERMS
 
 BEAMS, COUNT, RANGE = 21, 300, 5.0
 BLOCKS = -(-BEAMS // BLOCK_TERMS)

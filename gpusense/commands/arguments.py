@@ -1,0 +1,135 @@
+"""Arguments that the commands share: options, types of values, and the backends that ``--backend`` selects."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gpusense._util.files import check_writable
+
+if TYPE_CHECKING:
+    from gpusense.backends import Backend
+
+BACKEND_HELP = (
+    "device: auto (the fastest one present), numpy, opencl, opencl:<part of a device's or driver's name>, "
+    "opencl:<platform>:<device>, warp:cpu or warp:cuda:<number>; 'gpusense devices' lists the devices"
+)
+
+
+def add_backend(parser: argparse.ArgumentParser, *, default: str = "auto") -> None:
+    """Add ``--backend``, one selection string; the library checks it on use."""
+    parser.add_argument("--backend", default=default, metavar="DEVICE", help=f"{BACKEND_HELP} (default: %(default)s)")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON document, and nothing else, on standard output"
+    )
+
+
+def add_seed(parser: argparse.ArgumentParser) -> None:
+    """Add ``--seed``, an integer >= 0 for ``numpy.random.default_rng``."""
+    parser.add_argument(
+        "--seed", type=whole_number(low=0), default=0, metavar="N",
+        help="seed of the random numbers: the same seed gives the same run (default: %(default)s)",
+    )  # fmt: skip
+
+
+def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list[str]]:
+    """Open the backends of selection strings, or all devices present except simulators.
+
+    Args:
+        selections: Selection strings, or None.
+
+    Returns:
+        Backends, each once, and the errors of devices that were not selected by name.
+
+    Raises:
+        ValueError: a selection names no device that is present.
+    """
+    from gpusense.backends import devices, get_backend
+
+    if selections is not None:
+        return list({backend.info.selection: backend for backend in map(get_backend, selections)}.values()), []
+    opened, failures = [], []
+    for device in devices():
+        if device.available and device.kind != "simulator":
+            try:
+                opened.append(get_backend(device.selection))
+            except Exception as error:
+                failures.append(f"{device.selection}: {type(error).__name__}: {error}")
+    return opened, failures
+
+
+def whole_number(*, low: int, high: int | None = None) -> Callable[[str], int]:
+    """Make a type for ``add_argument``: an integer from ``low`` to ``high``, both included."""
+    rule = f"must be an integer >= {low}" if high is None else f"must be an integer from {low} to {high}"
+
+    def convert(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{rule}, got {text!r}") from None
+        if number < low or (high is not None and number > high):
+            raise argparse.ArgumentTypeError(f"{rule}, got {text}")
+        return number
+
+    return convert
+
+
+def positive_number(text: str) -> float:
+    """Convert an argument to a finite number above 0."""
+    number = _finite(text)
+    if not number > 0:
+        raise argparse.ArgumentTypeError(f"must be a finite number > 0, got {text!r}")
+    return number
+
+
+def not_negative_number(text: str) -> float:
+    """Convert an argument to a finite number of at least 0."""
+    number = _finite(text)
+    if not number >= 0:
+        raise argparse.ArgumentTypeError(f"must be a finite number >= 0, got {text!r}")
+    return number
+
+
+def number(text: str) -> float:
+    """Convert an argument to a number."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from None
+
+
+def _finite(text: str) -> float:
+    """Convert a text to a finite number; NaN if it is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+def output_path(*suffixes: str) -> Callable[[str], Path]:
+    """Make a type for ``add_argument``: a file that can be written, which is checked before any work is done.
+
+    Args:
+        suffixes: Allowed endings, such as ``".png"``; none allows every ending.
+    """
+
+    def convert(text: str) -> Path:
+        path = Path(text)
+        if suffixes and path.suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(f"must end in {' or '.join(suffixes)}, got {text!r}")
+        try:
+            check_writable(path)
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            raise argparse.ArgumentTypeError(f"must be a file that can be written, got {text!r}: {reason}") from None
+        return path
+
+    return convert

@@ -1,0 +1,85 @@
+"""Output of the commands: JSON, tables, and texts of numbers and drivers."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from gpusense._util.progress import is_terminal
+
+if TYPE_CHECKING:
+    from gpusense.backends import BackendInfo, Device
+
+
+def print_json(document: dict[str, Any]) -> None:
+    """Print one JSON document; NaN and infinities become null."""
+    print(json.dumps(_plain(document), indent=2, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    """Convert a value to JSON's types; NumPy's scalars and arrays become numbers and lists."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, os.PathLike) else value
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
+    """Print a table: by rich on a terminal, as plain text elsewhere.
+
+    Args:
+        columns: Names of the columns.
+        rows: Cells of each row.
+        right: Names of the columns that are right-aligned.
+    """
+    if not is_terminal(sys.stdout):
+        for line in table_lines(columns, rows, right=right):
+            print(line)
+        return
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(text) for text in row))
+    Console().print(table)
+
+
+def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> list[str]:
+    """Format the lines of a plain table, with two spaces between columns."""
+    widths = [max(len(text) for text in texts) for texts in zip(columns, *rows, strict=True)]
+    lines = []
+    for row in (columns, ["-" * width for width in widths], *rows):
+        cells = [
+            text.rjust(width) if column in right else text.ljust(width)
+            for text, width, column in zip(row, widths, columns, strict=True)
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def grouped(number: int) -> str:
+    """Format a number with spaces between its thousands."""
+    return f"{number:,}".replace(",", " ")
+
+
+def driver_text(device: Device | BackendInfo) -> str:
+    """Describe a device's compiler: driver, lanes and target, such as ``PoCL 3.0, 16 lanes, skylake-avx512``."""
+    from gpusense.backends import short_driver
+
+    lanes = f"{device.lanes} lanes" if device.lanes > 1 else ""
+    absent = "" if device.float64 or not device.driver else "no float64"
+    return ", ".join(part for part in (short_driver(device.driver), lanes, device.target, absent) if part) or "-"

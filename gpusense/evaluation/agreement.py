@@ -1,0 +1,106 @@
+"""Compare how two backends rank the same particles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.evaluation.tolerances import scan_tolerance
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.field import LikelihoodFieldModel
+
+Array = NDArray[Any]
+Floats = NDArray[np.float64]
+Model = BeamModel | LikelihoodFieldModel
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of two backends about the ranks of the same particles, over all scans.
+
+    Attributes:
+        left, right: Selection strings of the backends.
+        scans: Number of scans compared.
+        same_rank: Number of scans in which the logged pose has the same rank.
+        same_order: Number of scans in which no two particles change places; ties on one side may differ on the other.
+        spearman: Smallest rank correlation of all particles.
+        difference: Largest difference of log-likelihoods [nats].
+        gap: Largest difference in log-likelihood between two particles that change places [nats].
+        allowed: Largest difference that rounding explains [nats].
+    """
+
+    left: str
+    right: str
+    scans: int
+    same_rank: int
+    same_order: int
+    spearman: float
+    difference: float
+    gap: float
+    allowed: float
+
+    @property
+    def same(self) -> bool:
+        """Return whether particles change places only where rounding explains it."""
+        return self.gap <= self.allowed
+
+
+def ranks(values: Array) -> Floats:
+    """Return ranks from the smallest value on; ties have their mean rank."""
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(counts)
+    return (last - (counts - 1) / 2)[inverse]
+
+
+def correlation(left: Floats, right: Floats) -> float:
+    """Return Pearson's correlation, for ranks Spearman's; where a side is constant, 1 if both are equal, else 0."""
+    a, b = left - left.mean(), right - right.mean()
+    size = math.sqrt(float(a @ a) * float(b @ b))
+    return float(a @ b) / size if size else float(np.array_equal(left, right))
+
+
+def largest_gap(left: Array, right: Array) -> float:
+    """Return the largest lead, in the right scores, of a particle over one that the left scores rank before it."""
+    order = np.lexsort((-right, -left))
+    b = right[order].astype(np.float64)
+    lowest = np.minimum.accumulate(b)
+    with np.errstate(invalid="ignore"):
+        return float(np.max(np.where(b == lowest, 0.0, b - lowest), initial=0.0))
+
+
+class Comparison:
+    """Running comparison of the same model on two backends, scan by scan."""
+
+    def __init__(self, left: Model, right: Model) -> None:
+        self._models = left, right
+        self._scans = self._same_rank = self._same_order = 0
+        self._spearman, self._difference, self._gap, self._allowed = 1.0, 0.0, 0.0, 0.0
+
+    def add(self, left: Array, right: Array) -> None:
+        """Add the log-likelihoods of one scan's particles; the first particle is the logged pose."""
+        self._scans += 1
+        a, b = ranks(left), ranks(right)
+        self._same_rank += int(a[0] == b[0])
+        gap = max(largest_gap(left, right), largest_gap(right, left))
+        self._same_order += int(gap == 0)
+        self._spearman = min(self._spearman, correlation(a, b))
+        with np.errstate(invalid="ignore"):
+            apart = np.where(left == right, 0.0, np.abs(left.astype(np.float64) - right))
+        self._difference = max(self._difference, float(np.max(apart, initial=0.0)))
+        self._gap = max(self._gap, gap)
+        largest = float(np.max(np.abs(left), initial=0.0, where=np.isfinite(left)))
+        tolerances = [scan_tolerance(m.precision, min(m.scanner.count, 10_000)) for m in self._models]
+        allowed = sum(t.value * (1.0 if t.unit == "nats" else 1.0 + largest) for t in tolerances)
+        self._allowed = max(self._allowed, allowed)
+
+    def result(self) -> Agreement:
+        """Return the agreement over all scans added."""
+        left, right = (model.device.selection for model in self._models)
+        return Agreement(
+            left, right, self._scans, self._same_rank, self._same_order, self._spearman, self._difference, self._gap,
+            self._allowed,
+        )  # fmt: skip

@@ -1,0 +1,35 @@
+"""Constants of kernels that the host needs: the kernel files hold the same numbers."""
+
+from __future__ import annotations
+
+# Kernel file error_free: terms of a block of a compensated sum, and strands that are summed side by side in a block.
+BLOCK_TERMS, STRANDS = 16, 4
+# Kernel file tiles: rays and particles of a tile.
+TILE_RAYS, TILE_PARTICLES = 4, 16
+TILE = TILE_RAYS * TILE_PARTICLES
+# Kernel file order: bins of an axis and of all three, and bins that a work-item of order_starts sums.
+BINS = 32
+ALL_BINS = BINS**3
+STRETCH = 16
+# Kernel file heading: up to this heading [rad] the counts of quarter turns have 20 bits.
+LARGEST_HEADING = 1048576.0
+# Kernel file scan: max readings are left out, part of the constant term, or evaluated like others.
+MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
+# Kernel file end_point: cells around a field's window that hold the outside.
+FIELD_RING = 2
+# Kernel file relative: coordinates are clamped to this [m]; its square is finite in float32.
+FARTHEST = float(1 << 60)
+# Kernel file absolute: distributions of a heading (a sum of normals, its Fourier series, von Mises); turns on either
+# side and waves that are summed; exp(-NEGLIGIBLE) is below half an eps.
+NEARBY, SERIES, VON_MISES = 0, 1, 2
+WRAPS, WAVES = 3, 6
+NEGLIGIBLE = 40.0
+# Kernel file beacons: distributions of a range; numbers of a beacon: its place (x, its low part, y, its low part), and
+# the reading minus the bias with its low part; numbers of the mixture.
+NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
+BEACON, BEACON_TERMS = 6, 13
+
+
+def strands_in(terms: int) -> int:
+    """Return the strands of a number of terms: STRANDS of each whole block, and at most as many of the rest."""
+    return terms // BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS)

@@ -1,0 +1,44 @@
+"""Draw the scores of a log: logged and estimated poses on the map, and how percentiles and errors are distributed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gpusense.evaluation.scoring import BackendScore
+from gpusense.plots.drawing import draw_map, new_figure
+from gpusense.world.grid import OccupancyGrid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LOGGED, MEAN, PERCENTILE = "#8fa3b8", "#e4572e", "#4c78a8"
+
+
+def scores_figure(grid: OccupancyGrid, score: BackendScore) -> Figure:
+    """Draw the map with logged poses and weighted means, and histograms of percentiles and errors.
+
+    Args:
+        grid: The map.
+        score: Scores of one backend.
+    """
+    figure = new_figure(11.0, 6.0)
+    axes = figure.subplot_mosaic([["map", "percentile"], ["map", "error"]], width_ratios=(1.6, 1.0))
+    ax, upper, lower = (axes[name] for name in ("map", "percentile", "error"))
+    draw_map(ax, grid)
+    logged = [scan.pose for scan in score.scans]
+    ax.plot([p[0] for p in logged], [p[1] for p in logged], ".-", color=LOGGED, lw=0.6, ms=3, label="logged pose")
+    pairs = [(scan.pose, scan.mean) for scan in score.scans if scan.mean is not None]
+    for pose, mean in pairs:
+        ax.plot([pose[0], mean[0]], [pose[1], mean[1]], color=MEAN, lw=0.8)
+    means = [mean for _, mean in pairs]
+    ax.plot([p[0] for p in means], [p[1] for p in means], "o", color=MEAN, ms=3, mew=0, label="weighted mean")
+    ax.legend(loc="best", fontsize="small")
+    upper.hist([scan.percentile for scan in score.scans], bins=30, color=PERCENTILE)
+    upper.set(xlabel="percentile of the logged pose", ylabel="scans")
+    errors = [scan.error_position for scan in score.scans if scan.error_position is not None]
+    top = max(errors, default=0.0) or 1.0
+    low = max(min(errors, default=1e-3), 1e-3, top * 1e-6)
+    bins = [low * (top / low) ** (i / 30) for i in range(31)] if low < top else 30
+    lower.hist(errors, bins=bins, color=MEAN)
+    lower.set(xscale="log", xlabel="error of the weighted mean [m]", ylabel="scans")
+    return figure

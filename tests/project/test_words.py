@@ -1,0 +1,131 @@
+"""Docstrings, comments, messages and pages use plain words; CONTRIBUTING.md has the rules."""
+
+from __future__ import annotations
+
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = next(folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file())
+
+SCANNED = ("gpusense", "kernels", "docs", "README.md", "CHANGELOG.md", "CONTRIBUTING.md")
+# Rooms that are being rewritten: remove a line when its room is done.
+PENDING = (
+    "gpusense/_util",
+    "gpusense/backends",
+    "gpusense/interface",
+    "gpusense/learning",
+    "gpusense/localization",
+    "gpusense/logs",
+    "gpusense/models",
+    "gpusense/positions",
+    "gpusense/reference",
+    "gpusense/tables",
+    "gpusense/world",
+    "kernels",
+    "docs/architecture.md",
+    "docs/internals.md",
+)
+
+BANNED = re.compile(r"\b(told|mend|mends|mended|mending|so\s+many|nobody)\b", re.IGNORECASE)
+# Sentences with a clause as their subject; a question may begin so.
+CLAUSE = re.compile(r"(What|Who|That\s+of|Of\s+which)\b")
+END = re.compile(r"[.!?:|](?=\s|[\"']|$)|\n\s*\n|\n\s*(?:[-*]|#+|\d+\.)\s")
+# Quotes, prefixes of strings, list items and headings before a sentence's first word.
+BEFORE = " \t\n\"'`*#|-_()"
+
+
+def python_passages(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the first line and the text of each string and of each comment, whose lines are one passage."""
+    comment: list[str] = []
+    last = 0
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        kind = tokenize.tok_name[token.type]
+        if kind == "COMMENT":
+            if comment and token.start[0] != last + 1:
+                yield last - len(comment) + 1, "\n".join(comment)
+                comment = []
+            last = token.start[0]
+            comment.append(token.string.removeprefix("#"))
+        elif kind in ("STRING", "FSTRING_MIDDLE"):
+            yield token.start[0], token.string
+    if comment:
+        yield last - len(comment) + 1, "\n".join(comment)
+
+
+def opencl_passages(text: str) -> Iterator[tuple[int, str]]:
+    """Yield the first line and the text of each comment, whose lines are one passage."""
+    for match in re.finditer(r"/\*.*?\*/|//[^\n]*(?:\n[ \t]*//[^\n]*)*", text, re.DOTALL):
+        yield text.count("\n", 0, match.start()) + 1, re.sub(r"//|/\*|\*/", "", match.group())
+
+
+def page_passages(text: str) -> Iterator[tuple[int, str]]:
+    """Yield a page without its blocks of code."""
+    yield 1, re.sub(r"(?ms)^```.*?^```$", lambda match: "\n" * match.group().count("\n"), text)
+
+
+PASSAGES = {".py": python_passages, ".cl": opencl_passages, ".md": page_passages}
+
+
+def sentences(passage: str) -> Iterator[tuple[int, str, str]]:
+    """Yield where each sentence begins, the sentence, and the sign that ends it."""
+    begin = 0
+    for end in [*END.finditer(passage), None]:
+        stop = len(passage) if end is None else end.start()
+        sentence = passage[begin:stop]
+        text = sentence.lstrip(BEFORE)
+        yield begin + len(sentence) - len(text), text, "" if end is None else end.group().strip()
+        begin = stop if end is None else end.end()
+
+
+def findings(passage: str) -> Iterator[tuple[int, str]]:
+    """Yield the offset and the text of each banned word and sentence."""
+    for match in BANNED.finditer(passage):
+        yield match.start(), " ".join(match.group().split())
+    for begin, text, end in sentences(passage):
+        if end != "?" and CLAUSE.match(text):
+            yield begin, " ".join(text.split())[:50]
+
+
+def scanned_files() -> list[Path]:
+    """Return the files of the finished rooms."""
+    files = []
+    for name in SCANNED:
+        path = ROOT / name
+        files += [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.suffix in PASSAGES]
+    relative = [(file, file.relative_to(ROOT).as_posix()) for file in files]
+    return [file for file, name in relative if not name.startswith(PENDING)]
+
+
+def test_prose_has_no_banned_words():
+    found = [
+        f"{file.relative_to(ROOT).as_posix()}:{line + passage.count(chr(10), 0, offset)}: {text}"
+        for file in scanned_files()
+        for line, passage in PASSAGES[file.suffix](file.read_text(encoding="utf-8"))
+        for offset, text in findings(passage)
+    ]
+    assert not found, "\n".join(["banned words, see CONTRIBUTING.md:", *found])
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text", "expected"),
+    [
+        (".py", '"""Return.\n\n    What is told."""\n', [(3, "What is told"), (3, "told")]),
+        (".py", 'x = f"{a} of so\\\n many"\n# Of which\n# some.\n', [(3, "Of which some")]),
+        (".py", '"""What is it? Mended."""\n', [(1, "Mended")]),
+        (".cl", "int a; // One.\n// That of b.\nfloat told;\n", [(2, "That of b")]),
+        (".md", "# What is here\n\n```\nnobody\n```\n- So many.\n- What now?\n", [(1, "What is here"), (6, "So many")]),
+        (".md", "A mendable amendment; what is here is what one sees. untold\n", []),
+    ],
+)
+def test_scan(suffix, text, expected):
+    found = [
+        (line + passage.count("\n", 0, offset), word)
+        for line, passage in PASSAGES[suffix](text)
+        for offset, word in findings(passage)
+    ]
+    assert sorted(found) == sorted(expected)

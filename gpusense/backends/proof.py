@@ -1,11 +1,11 @@
 """Verdicts on devices: a child compiles and runs kernels of each family on a device before this process trusts it.
 
-A compiler that does not know a processor aborts, hangs or makes wrong code, and it does so in the process that calls it.
-So the first time that a device, its driver, the processor and this version of gpusense are met, a child computes a
-small scene and compares it with NumPy. A family of kernels that fails is not used: vectors give way to narrower ones
-and then to scalar kernels, float64 is called absent, and where scalar kernels fail the device is unusable. The verdict
-is kept in the cache, and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver.
-Where no child can be started, a device without a kept verdict is trusted, and the log says so.
+A compiler that does not know a processor aborts, hangs or makes wrong code, in the process that calls it. So the first
+time that a device, its driver, the processor and this version of gpusense are met, a child computes a small scene and
+compares it with NumPy. A family of kernels that fails is not used: vectors give way to narrower ones and then to scalar
+kernels, float64 is called absent, and where scalar kernels fail the device is unusable. The verdict is kept in the
+cache, and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver. Where no child can
+be started, a device without a kept verdict is trusted, and the log says so.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Launches on the processor that several threads share.
 
 Warp runs a launch on the processor in the calling thread. So large launches over particles are cut into pieces, each
-with its part of the arrays, which several threads run side by side: Warp releases Python's lock while a kernel runs, and
-its kernels keep no state. A particle's result does not depend on the piece.
+with its part of the arrays, which several threads run side by side: Warp releases Python's lock while a kernel runs,
+and its kernels keep no state. A particle's result does not depend on the piece.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import os
 import threading
 from typing import Any
 
-from gpusense.backends.warp.launch import Launch, LaunchStep, slice_of
 from gpusense.backends.warp.graphs import HELPERS
+from gpusense.backends.warp.launch import Launch, LaunchStep, slice_of
 from gpusense.interface.signatures import Argument, Kernel
 
 # The axes of a launch that threads may share, and the argument that counts each.
@@ -106,7 +106,7 @@ class SharedLaunch:
         try:
             pieces()
         finally:
-            # No thread may write any more when this returns, even after an error: pieces that have not begun are dropped.
+            # No thread may write any more when this returns, not even after an error: further pieces are dropped.
             with lock:
                 begins = iter(())
             _finish(helpers)

@@ -305,7 +305,8 @@ class _Scorer:
         placed, table = pipeline.place(request.poses, piece.part, space)
         with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
-            key = (scoring.flags, placed.key, readings.key)
+            reach = readings.rounded_reach if scoring.tiles is None else None
+            key = (scoring.flags, placed.key, readings.key, reach)
             flags = space.run(
                 key, (placed.source, log_p, table), lambda: pipeline.program(scoring), version=pipeline.map.version,
                 lasting=not request.poses.on_device,

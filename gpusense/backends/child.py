@@ -29,11 +29,11 @@ _NOISE = re.compile(r"^(\s*$|Stack dump|PLEASE submit|\s*#?\d+[.\s]|\d+ warnings
 
 @dataclass(frozen=True)
 class Outcome:
-    """The reports of a child process, and how it ended.
+    """The reports and the end of a child process.
 
     Attributes:
-        said: What it reported, in order.
-        failure: How it failed, in one line; empty where it ended well.
+        said: Its reports, in order.
+        failure: The failure in one line; empty where it ended well.
         conclusive: False where something else than the driver may have ended it.
         started: False where the system started no child.
     """
@@ -84,7 +84,7 @@ def run(job: dict[str, Any]) -> Outcome:
 
     Args:
         job: ``do`` is the name of a function ``module:name``, which is called with the job and a function that reports
-            a dictionary; the rest is the function's own.
+            a dictionary; the rest belongs to the function.
     """
     path = [os.path.abspath(entry) for entry in sys.path]
     return run_text(["-P", "-W", "ignore", "-c", _START], {**job, "path": path})
@@ -94,7 +94,7 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
     """Run the interpreter in a child.
 
     Args:
-        arguments: The interpreter's own.
+        arguments: The interpreter's arguments.
         job: The program reads it from standard input, as one line of JSON.
         variables: Further variables of its environment.
     """

@@ -17,13 +17,13 @@ class Device:
 
     Attributes:
         backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
-        name: The device's own name, or what is absent.
+        name: The name of the device, or of the absent part.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.
         reason: Why not, with the remedy; empty where it is available. Where only some kernels can run, why the others
             cannot.
-        selection: What to pass as ``backend=``; empty where it is absent.
-        driver: The name and version of what compiles for it; empty where nothing does.
+        selection: The value of ``backend=``; empty where it is absent.
+        driver: The name and version of the compiler's driver; empty where kernels are not compiled.
         lanes: Particles or beams that one work-item computes at once; 1 leaves that to the compiler.
         target: The processor for which the driver compiles; empty where it is not known.
         float64: Whether models with ``precision="float64"`` can run on it.
@@ -53,7 +53,7 @@ def devices(*, anew: bool = False) -> list[Device]:
     A device that was not met before is proved first, which takes some seconds; see :mod:`gpusense.backends.proof`.
 
     Args:
-        anew: Load all drivers and prove all devices again, as after a change that the verdicts' keys do not hold.
+        anew: Load all drivers and prove all devices again, as after a change that the keys of verdicts do not show.
 
     Example:
         >>> import gpusense as gs

@@ -1,6 +1,6 @@
 """The table of backends: one entry and one folder for each.
 
-An entry says what is known of a backend before its library is loaded. The module that it names holds ``LIBRARY``, a
+An entry holds the facts about a backend before its library is loaded. The module that it names holds ``LIBRARY``, a
 :class:`Library`, through which devices are listed, proved and opened. Nothing else names a backend.
 """
 
@@ -147,7 +147,7 @@ class Library(ABC):
     # ---- children that prove devices
 
     def child_setup(self) -> Any:
-        """Return what a child needs to list the same devices; JSON carries it."""
+        """Return the data with which a child lists the same devices; JSON carries it."""
         return None
 
     def set_up_child(self, setup: Any) -> None:  # noqa: B027

@@ -2,8 +2,8 @@
 
 Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (platform and device number),
 ``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``. A queue of pyopencl
-selects its device, and a backend that works on that queue. ``"auto"`` is what ``$GPUSENSE_BACKEND`` says, and else the
-fastest device that is proved (see :mod:`gpusense.backends.proof`).
+selects its device, and a backend that works on that queue. ``"auto"`` is the value of ``$GPUSENSE_BACKEND``, and else
+the fastest device that is proved (see :mod:`gpusense.backends.proof`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Selection: TypeAlias = "str | Backend | pyopencl.CommandQueue"
 
 # The factor by which a device must be faster than one of its class that is listed before it, to be chosen instead.
 NOTICED = 1.1
-# The environment variable that says what "auto" means.
+# The environment variable that holds the meaning of "auto".
 VARIABLE = "GPUSENSE_BACKEND"
 
 _LOCK = threading.Lock()

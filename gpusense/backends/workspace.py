@@ -79,20 +79,20 @@ class Workspace:
             backend.run(program)
             return flags_of(program)
         key = (records, key, *[0 if buffer is None else backend.address(buffer) for buffer in buffers])
-        kept = self._programs.get(key)
-        if kept is None:
+        entry = self._programs.get(key)
+        if entry is None:
             program = make()
             # A recording keeps no buffer alive; addresses of buffers are in its key.
             work: Any = backend.record(program) if records else program
-            kept = work, flags_of(program)
+            entry = work, flags_of(program)
             if len(self._programs) >= _MOST_KEPT:
                 del self._programs[next(iter(self._programs))]
-            self._programs[key] = kept
+            self._programs[key] = entry
         if records:
-            backend.replay(kept[0])
+            backend.replay(entry[0])
         else:
-            backend.run(kept[0])
-        return kept[1]
+            backend.run(entry[0])
+        return entry[1]
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost.

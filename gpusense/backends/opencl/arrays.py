@@ -38,7 +38,7 @@ def part_of(buffer: cl.Buffer, first: int, size: int, alignment: int) -> cl.Buff
     """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy.
 
     Raises:
-        ValueError: the device cannot begin there.
+        ValueError: parts cannot begin at this byte.
     """
     if first == 0 or size == 0:
         return buffer

@@ -1,7 +1,7 @@
 """Kernels that PoCL has compiled: kept between processes, with checksums.
 
 PoCL keeps a program's kernels in files below ``<folder>/XX/YYY...``, named by a hash of the source and the options, and
-loads whatever lies there. Its folder is one of this process. The folder of a program is copied there from an entry of
+loads them without a check. Its folder is one of this process. The folder of a program is copied there from an entry of
 the cache before the program is built, and back into an entry after its kernels have run.
 """
 

@@ -6,7 +6,6 @@ A method of an ability that it lacks does nothing, where that is correct, or rai
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,69 +13,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gpusense.backends.info import BackendInfo
+from gpusense.backends.recording import Recording, counted
 from gpusense.interface.launches import Program
 
 Buffer = Any
-
-
-@dataclass(frozen=True)
-class BackendInfo:
-    """A device as a model sees it.
-
-    Attributes:
-        selection: The selection string of this device, such as ``"opencl:0:0"``.
-        backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
-        name: The device's own name.
-        kind: ``"cpu"`` or ``"gpu"``.
-        driver: Version of the driver or library that compiles for it.
-        memory: Bytes of device memory.
-        max_buffer: Bytes of the largest buffer.
-        float64: Whether float64 kernels exist on it.
-        lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
-        vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
-        target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
-        graphs: Whether the launches and copies of a call are gathered, and replayed as one graph once they repeat.
-
-    Example:
-        >>> from gpusense.backends import get_backend
-        >>> info = get_backend("numpy").info
-        >>> info.selection, info.kind, info.float64, info.graphs
-        ('numpy', 'cpu', True, False)
-    """
-
-    selection: str
-    backend: str
-    name: str
-    kind: str
-    driver: str
-    memory: int
-    max_buffer: int
-    float64: bool
-    lanes: int = 1
-    vector_loops: bool = False
-    target: str = ""
-    graphs: bool = False
-
-
-class ProcessBound:
-    """A device that is bound to the process that opened it: drivers do not survive a fork."""
-
-    info: BackendInfo
-
-    def __init__(self) -> None:
-        self._process = os.getpid()
-
-    def check_process(self) -> None:
-        """Refuse a forked child, where the driver would hang or corrupt memory.
-
-        Raises:
-            RuntimeError: this process is not the one that opened the device.
-        """
-        if os.getpid() != self._process:
-            raise RuntimeError(
-                f"{self.info.selection} was opened by process {self._process} and does not survive a fork: start "
-                "workers with multiprocessing.get_context('spawn') and make their models there"
-            )
 
 
 class Launcher(Protocol):
@@ -107,29 +48,6 @@ class Adopted:
     contiguous: bool
     to_host: Callable[[], np.ndarray]
     owner: object
-
-
-class Recording(ABC):
-    """A program whose arguments are bound: it is started repeatedly with the same memory and numbers."""
-
-    @abstractmethod
-    def __call__(self, stream: Any = None) -> None:
-        """Start it on a stream of the device, or on its current one."""
-
-    @abstractmethod
-    def wait(self) -> None:
-        """Wait until all starts have ended."""
-
-    @abstractmethod
-    def explain(self) -> str:
-        """Return in one line how it is started: as one graph, or one by one, with the reason."""
-
-
-def counted(number: int, noun: str) -> str:
-    """Return a number of launches or copies in words: ``"3 launches"``."""
-    if number == 1:
-        return f"1 {noun}"
-    return f"{number} {noun[:-1]}ies" if noun.endswith("y") else f"{number} {noun}es"
 
 
 class Backend(ABC):

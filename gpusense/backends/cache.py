@@ -24,7 +24,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 from gpusense._version import __version__
-from gpusense.backends.base import BackendInfo
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import fingerprint
 
 MAX_BYTES = 256 << 20

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from gpusense.backends import proof, registry
-from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.base import Backend
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.proof import Verdict
 from gpusense.backends.registry import BY_NAME, ENTRIES, Entry, Library
 

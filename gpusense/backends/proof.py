@@ -20,8 +20,8 @@ from typing import Any
 
 from gpusense._version import __version__
 from gpusense.backends import child
-from gpusense.backends.base import BackendInfo
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import fingerprint
 
 # Families of kernels.

@@ -14,7 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.base import Backend
+from gpusense.backends.info import BackendInfo
 
 
 @dataclass(frozen=True)

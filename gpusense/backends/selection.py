@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from gpusense._util.checks import show
 from gpusense.backends import listing, proof, registry
-from gpusense.backends.base import Backend, ProcessBound
+from gpusense.backends.base import Backend
+from gpusense.backends.info import ProcessBound
 from gpusense.backends.listing import Device, short_driver
 from gpusense.backends.proof import Verdict
 from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry, Library

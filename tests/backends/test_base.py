@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from gpusense.backends import Backend, get_backend
-from gpusense.backends.base import Proxy, Recording, counted
+from gpusense.backends.base import Proxy
+from gpusense.backends.recording import Recording, counted
 from gpusense.interface.launches import Launch
 
 INT, REAL = np.dtype(np.int32), np.dtype(np.float32)

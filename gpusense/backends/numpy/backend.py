@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import Backend, BackendInfo, Launcher
+from gpusense.backends.base import Backend, Launcher
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import host_memory
 from gpusense.interface.signatures import KERNELS
 

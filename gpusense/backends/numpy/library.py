@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.base import Backend
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.numpy.backend import NumpyBackend, describe
 from gpusense.backends.registry import Library
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, ProcessBound
+from gpusense.backends.base import Adopted, Backend, Buffer
 from gpusense.backends.cache import ProgramCache
+from gpusense.backends.info import BackendInfo, ProcessBound
 from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.devices import shares_memory

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pyopencl as cl
 
-from gpusense.backends.base import BackendInfo
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.opencl import drivers, pocl, pocl_kernels
 
 

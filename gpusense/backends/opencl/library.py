@@ -7,7 +7,8 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.base import Backend
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.opencl import devices, drivers
 from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.backend import OpenCLBackend

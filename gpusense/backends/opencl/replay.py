@@ -10,9 +10,9 @@ from typing import Any
 import pyopencl as cl
 
 from gpusense._util.checks import show
-from gpusense.backends.base import Recording, counted
 from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.memory import driver_errors
+from gpusense.backends.recording import Recording, counted
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from gpusense.backends.base import Adopted, Backend, BackendInfo, ProcessBound, Recording
+from gpusense.backends.base import Adopted, Backend
+from gpusense.backends.info import BackendInfo, ProcessBound
+from gpusense.backends.recording import Recording
 from gpusense.backends.warp.arrays import adopted, has_protocol
 from gpusense.backends.warp.graphs import GraphCache
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from gpusense.backends.base import BackendInfo
+from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import host_memory
 from gpusense.backends.warp.settings import initialize
 

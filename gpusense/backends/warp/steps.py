@@ -7,7 +7,7 @@ from collections.abc import Hashable, Sequence
 
 import warp as wp
 
-from gpusense.backends.base import counted
+from gpusense.backends.recording import counted
 
 
 class Step(ABC):

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import arrays
-from gpusense.backends.base import Adopted, Buffer, Recording
+from gpusense.backends.base import Adopted, Buffer
+from gpusense.backends.recording import Recording
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from gpusense.learning.beam.fit import fit_beam_parameters
     from gpusense.learning.beam.incidence import IncidenceFit, fit_incidence_parameters
     from gpusense.learning.beam.result import BeamFit
-    from gpusense.learning.discrete.table import DiscreteBeamModel, DiscreteCauses, DiscreteFit
+    from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
+    from gpusense.learning.discrete.table import DiscreteBeamModel
     from gpusense.learning.landmark.fit import fit_landmark_parameters
     from gpusense.learning.landmark.result import LandmarkFit
     from gpusense.learning.landmark.suspicious import suspicious_landmarks
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.models.scan.several import log_likelihoods
     from gpusense.positions.bearings import triangulate, triangulate_triangle
-    from gpusense.positions.both import locate
     from gpusense.positions.fix import PositionFix
+    from gpusense.positions.locate import locate
     from gpusense.positions.ranges import trilaterate
     from gpusense.tables.distances import distance_transform
     from gpusense.tables.normals import surface_normals
@@ -67,8 +68,8 @@ _HOME = {
     "CasterMethod": "gpusense.models.scan.caster",
     "Device": "gpusense.backends",
     "DiscreteBeamModel": "gpusense.learning.discrete.table",
-    "DiscreteCauses": "gpusense.learning.discrete.table",
-    "DiscreteFit": "gpusense.learning.discrete.table",
+    "DiscreteCauses": "gpusense.learning.discrete.causes",
+    "DiscreteFit": "gpusense.learning.discrete.causes",
     "HeadingModel": "gpusense.models.point.absolute",
     "HeadingParameters": "gpusense.world.sensor_parameters",
     "IncidenceFit": "gpusense.learning.beam.incidence",
@@ -95,7 +96,7 @@ _HOME = {
     "fit_beam_parameters": "gpusense.learning.beam.fit",
     "fit_incidence_parameters": "gpusense.learning.beam.incidence",
     "fit_landmark_parameters": "gpusense.learning.landmark.fit",
-    "locate": "gpusense.positions.both",
+    "locate": "gpusense.positions.locate",
     "log_likelihoods": "gpusense.models.scan.several",
     "normalize_weights": "gpusense.localization.weights",
     "read_log": "gpusense.logs",

@@ -209,8 +209,8 @@ def maps(backend: str, precision: str, arguments: argparse.Namespace) -> Iterato
                     yield {**row, "outcome": f"{type(error).__name__}: {error}"}
                     continue
                 seconds, made, bits, worst = time.perf_counter() - begin, weighed(log_p), 0, 0.0
-                region = model._pipeline.map.region
-                part = "the whole map" if region.cells == side * side else f"cropped to {region.rows} x {region.cols}"
+                window = model._pipeline.map.window
+                part = "the whole map" if window.cells == side * side else f"cropped to {window.rows} x {window.cols}"
                 for pose, found in zip(poses[:20, None], log_p[:20], strict=True):
                     small = kind(cut(grid, pose[0]), scanner, parameters, backend="numpy", precision=precision)
                     worst = max(worst, abs(float(found - small.log_likelihood(pose, ranges)[0])))

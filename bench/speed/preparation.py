@@ -27,7 +27,9 @@ from gpusense.backends import Backend, get_backend
 from gpusense.backends.base import Proxy
 from gpusense.evaluation.selftest import scipy_squares
 from gpusense.evaluation.worlds import building
-from gpusense.tables.distances import empty_rectangles, packed, squared_distances
+from gpusense.tables.cells import packed
+from gpusense.tables.distances import squared_distances
+from gpusense.tables.rectangles import empty_rectangles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

@@ -58,7 +58,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.tables.distances import sectors_of
+from gpusense.tables.rectangles import sectors_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

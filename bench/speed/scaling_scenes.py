@@ -11,7 +11,7 @@ import numpy as np
 import gpusense as gs
 from gpusense.evaluation.worlds import building, cloud_around, free_pose
 from gpusense.reference import raycast
-from gpusense.tables.distances import empty_rectangles, sectors_of
+from gpusense.tables.rectangles import empty_rectangles, sectors_of
 from gpusense.world.frames import place_poses, ray_vectors
 
 RANGE_MAX, RESOLUTION, LARGEST_BUILDING = 30.0, 0.05, 2000

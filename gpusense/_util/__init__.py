@@ -1,1 +1,1 @@
-"""Check arguments, write files whole, show progress; no domain."""
+"""Checks of arguments, atomic file writes and progress bars; nothing of the domain."""

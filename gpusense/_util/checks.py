@@ -1,4 +1,4 @@
-"""Checks of arguments. Every message reads ``{argument}: {rule}, got {value}``."""
+"""Check arguments and convert them. Every message reads ``{argument}: {rule}, got {value}``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _REPR.maxstring = _REPR.maxother = 120
 
 
 def show(value: object) -> str:
-    """A value as a message shows it: short and on one line."""
+    """Return a value as text for a message: on one line, at most 120 characters."""
     try:
         text = str(value) if isinstance(value, (numbers.Real, np.bool)) else _REPR.repr(value)
     except ValueError:  # an integer of more than 4300 digits
@@ -28,7 +28,7 @@ def show(value: object) -> str:
 
 
 def shape_text(shape: Sequence[int | str]) -> str:
-    """A shape as a message shows it: ``("N", 3)`` becomes ``(N, 3)``."""
+    """Return a shape as text for a message: ``("N", 3)`` becomes ``(N, 3)``."""
     return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
 
 
@@ -41,19 +41,19 @@ def real(
     below: float | None = None,
     high: float | None = None,
 ) -> float:
-    """A finite real number within the limits that are given.
+    """Return ``value`` as a float after checking that it is a finite real number within limits.
 
     Args:
-        name: the argument's name.
-        value: what the caller passed.
-        above: the number must be greater than this.
-        low: the number must be at least this.
-        below: the number must be less than this.
-        high: the number must be at most this.
+        name: Name of the argument.
+        value: The caller's value.
+        above: Exclusive lower limit.
+        low: Inclusive lower limit.
+        below: Exclusive upper limit.
+        high: Inclusive upper limit.
 
     Raises:
-        TypeError: the value is not a real number (a bool is not).
-        ValueError: it is not finite, or breaks a limit.
+        TypeError: The value is not a real number; a bool is not one.
+        ValueError: The value is not finite, or breaks a limit.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(f"{name}: must be a real number, got {show(value)}")
@@ -62,25 +62,25 @@ def real(
     except OverflowError:
         number = math.inf
     limits = ((">", above), (">=", low), ("<", below), ("<=", high))
-    kept = (
+    within = (
         math.isfinite(number)
         and (above is None or number > above)
         and (low is None or number >= low)
         and (below is None or number < below)
         and (high is None or number <= high)
     )
-    if not kept:
+    if not within:
         rule = " and ".join(["finite", *(f"{sign} {limit}" for sign, limit in limits if limit is not None)])
         raise ValueError(f"{name}: must be {rule}, got {show(value)}")
     return number
 
 
 def integer(name: str, value: object, *, low: int | None = None, high: int | None = None) -> int:
-    """An integer within the limits (inclusive) that are given.
+    """Return ``value`` as an int after checking that it is an integer from ``low`` to ``high``, both included.
 
     Raises:
-        TypeError: the value is not an integer (a bool or 2.0 is not).
-        ValueError: it breaks a limit.
+        TypeError: The value is not an integer; neither a bool nor 2.0 is one.
+        ValueError: The value breaks a limit.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
         raise TypeError(f"{name}: must be an integer, got {show(value)}")
@@ -93,11 +93,11 @@ def integer(name: str, value: object, *, low: int | None = None, high: int | Non
 
 
 def choice(name: str, value: object, options: Sequence[str]) -> str:
-    """One of a few words.
+    """Return ``value`` after checking that it is one of ``options``.
 
     Raises:
-        TypeError: the value is not a string.
-        ValueError: it is none of the options.
+        TypeError: The value is not a string.
+        ValueError: The value is none of the options.
     """
     rule = f"must be one of {', '.join(map(repr, options))}"
     if not isinstance(value, str):
@@ -108,10 +108,10 @@ def choice(name: str, value: object, options: Sequence[str]) -> str:
 
 
 def as_array(name: str, value: object) -> NDArray[Any]:
-    """``numpy.asarray`` of a value, whatever its dtype.
+    """Return ``numpy.asarray(value)`` of any dtype.
 
     Raises:
-        ValueError: the value is a ragged sequence.
+        ValueError: The value is a ragged sequence.
     """
     try:
         return np.asarray(cast("ArrayLike", value))
@@ -127,40 +127,44 @@ def array(
     finite: bool = True,
     dtype: DTypeLike | None = np.float64,
 ) -> NDArray[Any]:
-    """An array of real numbers from anything that ``numpy.asarray`` takes.
+    """Return ``value`` as an array of real numbers.
 
     Args:
-        name: the argument's name.
-        value: what the caller passed; it is copied only where its dtype differs.
-        shape: an integer is an exact length, a letter any length; None leaves the shape unchecked.
-        finite: refuse NaN and infinities.
-        dtype: the result's dtype. An integer dtype accepts integers only. None keeps a floating
-            dtype as it is (in the machine's byte order) and turns integers into float64.
+        name: Name of the argument.
+        value: Anything that ``numpy.asarray`` accepts; copied only if its dtype differs from ``dtype``.
+        shape: Required shape; an integer is an exact length, a letter any length. None skips this check.
+        finite: Whether to refuse NaN and infinities.
+        dtype: Dtype of the result. An integer dtype accepts integers only. None keeps a floating dtype (in the
+            machine's byte order) and converts integers to float64.
 
     Raises:
-        TypeError: the dtype is object, complex, string, bool or another that holds no real numbers,
-            or is not an integer one where integers are asked for.
-        ValueError: the shape or a value breaks the rule.
+        TypeError: The dtype holds no real numbers (object, complex, string, bool), or no integers where ``dtype``
+            requires them.
+        ValueError: The shape or a value breaks the rule.
     """
-    given = as_array(name, value)
+    values = as_array(name, value)
     kinds, rule = "fiu", "must hold real numbers"
     if dtype is not None and np.dtype(dtype).kind in "iu":
         kinds, rule = "iu", "must hold integers"
-    if given.dtype.kind not in kinds and not (given.size == 0 and given.dtype.kind == "f"):
-        raise TypeError(f"{name}: {rule}, got dtype {given.dtype}")
-    if shape is not None and not _fits(given.shape, shape):
-        raise ValueError(f"{name}: shape must be {shape_text(shape)}, got {shape_text(given.shape)}")
+    if values.dtype.kind not in kinds and not (values.size == 0 and values.dtype.kind == "f"):
+        raise TypeError(f"{name}: {rule}, got dtype {values.dtype}")
+    if shape is not None and not _fits(values.shape, shape):
+        raise ValueError(f"{name}: shape must be {shape_text(shape)}, got {shape_text(values.shape)}")
     if dtype is None:
-        dtype = given.dtype.newbyteorder("=") if given.dtype.kind == "f" else np.float64
-    if finite and given.dtype.kind == "f" and not np.isfinite(given).all():
-        index = np.unravel_index(int(np.argmin(np.isfinite(given))), given.shape)
-        where = "" if given.ndim == 0 else f" at index {_index_text(index)}"
-        raise ValueError(f"{name}: every value must be finite, got {show(given[index])}{where}")
-    return given.astype(dtype, copy=False)
+        dtype = values.dtype.newbyteorder("=") if values.dtype.kind == "f" else np.float64
+    if finite and values.dtype.kind == "f" and not np.isfinite(values).all():
+        index = np.unravel_index(int(np.argmin(np.isfinite(values))), values.shape)
+        position = "" if values.ndim == 0 else f" at index {_index_text(index)}"
+        raise ValueError(f"{name}: every value must be finite, got {show(values[index])}{position}")
+    return values.astype(dtype, copy=False)
 
 
 def check_gradients(array: object, name: str, error: Exception) -> None:
-    """Say why an array is not exported where its library records its gradients, which are not computed here."""
+    """Raise a clear error if ``array`` could not be exported because its library records its gradients.
+
+    Raises:
+        TypeError: The array requires gradients, which this package does not compute.
+    """
     if getattr(array, "requires_grad", False) is True:
         raise TypeError(
             f"{name}: must not require gradients, which are not computed here, got a "
@@ -169,11 +173,11 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
 
 
 def path(name: str, value: object) -> Path:
-    """A path from a string or path object.
+    """Return ``value``, a string or path object, as a path.
 
     Raises:
-        TypeError: the value is neither.
-        ValueError: it is empty or holds a null character.
+        TypeError: The value is neither a string nor a path object.
+        ValueError: The path is empty or holds a null character.
     """
     if not isinstance(value, (str, os.PathLike)):
         raise TypeError(f"{name}: must be a path, got {show(value)}")
@@ -186,13 +190,13 @@ def path(name: str, value: object) -> Path:
 
 
 def existing_file(file: Path) -> Path:
-    """A regular file that is there.
+    """Return ``file`` after checking that it is an existing regular file.
 
     Raises:
-        FileNotFoundError: nothing is there.
-        ValueError: it is a folder, a device or another thing than a regular file.
+        FileNotFoundError: The file does not exist.
+        ValueError: The path is a folder, a device or anything else but a regular file.
     """
-    # The functions of os.path, unlike those of Path, take an impossible name for a missing file.
+    # For an impossible name os.path reports a missing file, where Path raises another error.
     if not os.path.exists(file):
         raise FileNotFoundError(f"{file}: must exist, got no such file")
     if not os.path.isfile(file):
@@ -202,7 +206,7 @@ def existing_file(file: Path) -> Path:
 
 def _fits(shape: tuple[int, ...], rule: Sequence[int | str]) -> bool:
     return len(shape) == len(rule) and all(
-        isinstance(wanted, str) or wanted == size for size, wanted in zip(shape, rule, strict=True)
+        isinstance(length, str) or length == size for size, length in zip(shape, rule, strict=True)
     )
 
 

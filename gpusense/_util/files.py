@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and settings that are read from them."""
+"""Write files atomically and read settings from YAML files."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import Any, BinaryIO
 
 from gpusense._util import checks
 
-# Bytes: a file of settings is small.
-_LARGEST_YAML = 1 << 20
+# A file of settings is small.
+_LARGEST_YAML_BYTES = 1 << 20
 
 
 def check_writable(path: Path) -> None:
-    """See that a file can be written, leaving no trace.
+    """Check that a file can be written, and leave no trace.
 
     Raises:
-        OSError: its folder is absent or does not take files.
-        ValueError: something that is not a regular file has its name.
+        OSError: The folder is absent or not writable.
+        ValueError: The path names something else than a regular file.
     """
     if os.path.lexists(path) and not path.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
@@ -29,16 +29,16 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file so that it is there whole or, whatever happens, as it was before.
+    """Write a file atomically: it is either complete or, after any failure, as it was before.
 
     Args:
-        path: The file; it is replaced if it exists.
-        write: Writes the contents to a binary stream.
+        path: The file; replaced if it exists.
+        write: Function that writes the contents to a binary stream.
 
     Raises:
-        OSError, ValueError: as :func:`check_writable`, and what ``write`` raises.
+        OSError, ValueError: As in :func:`check_writable`, and all exceptions of ``write``.
     """
-    # A link stays a link to the file that is replaced.
+    # A symbolic link is kept; its target is replaced.
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not target.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
@@ -50,7 +50,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 @contextlib.contextmanager
 def _fresh(path: Path) -> Iterator[BinaryIO]:
-    """A new file in the folder of ``path``, gone in the end unless it was renamed."""
+    """Open a new file in the folder of ``path``; delete it afterwards unless it was renamed."""
     fresh = path.parent / f".gpusense-{secrets.token_hex(6)}.new"
     try:
         with fresh.open("xb") as stream:
@@ -62,24 +62,24 @@ def _fresh(path: Path) -> Iterator[BinaryIO]:
 
 
 def read_mapping(file: Path) -> dict[Any, Any]:
-    """The mapping in a YAML file of plain values.
+    """Read the mapping in a YAML file of plain values.
 
     Raises:
-        ValueError: it is too large, no plain YAML, or no mapping.
+        ValueError: The file is too large, is not plain YAML, or holds no mapping.
     """
     import yaml
 
     with file.open("rb") as stream:
-        text = stream.read(_LARGEST_YAML + 1)
-    if len(text) > _LARGEST_YAML:
-        raise ValueError(f"{file}: must be a YAML file of at most {_LARGEST_YAML} bytes, got a larger file")
+        text = stream.read(_LARGEST_YAML_BYTES + 1)
+    if len(text) > _LARGEST_YAML_BYTES:
+        raise ValueError(f"{file}: must be a YAML file of at most {_LARGEST_YAML_BYTES} bytes, got a larger file")
     try:
         data = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or type(error).__name__
         mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        raise ValueError(f"{file}: must be plain YAML, got an error{where}: {problem}") from error
+        line = f" in line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{file}: must be plain YAML, got an error{line}: {problem}") from error
     if not isinstance(data, dict):
         raise ValueError(f"{file}: must hold a YAML mapping, got {checks.show(data)}")
     return data

@@ -1,4 +1,4 @@
-"""Progress bars, on terminals only."""
+"""Progress bars, shown on terminals only."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import TextIO
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether a stream is there and a terminal."""
+    """Return whether ``stream`` exists and is a terminal."""
     return stream is not None and stream.isatty()
 
 
 @contextlib.contextmanager
 def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a bar of ``total`` steps on standard error where that is a terminal, and nothing elsewhere.
+    """Show a progress bar of ``total`` steps on standard error if that is a terminal.
 
     Yields:
-        What to call with a text when a step begins.
+        A function that starts the next step and shows its text.
     """
     if not is_terminal(sys.stderr):
         yield lambda text: None

@@ -17,7 +17,8 @@ from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, fr
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.tables.distances import distance_transform, empty_rectangles
+from gpusense.tables.distances import distance_transform
+from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from gpusense.interface.signatures import CASTER_FLAGS
+from gpusense.interface import casters
 
 # A kernel has no such variant with these flags, some of them of its own, or without all of some set of those.
-_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *CASTER_FLAGS}
+_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *casters.FLAGS}
 # Only sums to learn from have lanes of float64.
 _FLOAT64 = {"e_step"}
 _NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"}}

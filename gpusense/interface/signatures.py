@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from gpusense.interface import casters
+
 FLAGS = {
     "FLOAT64": "real numbers are float64",
     "ORIGINS_OUTSIDE": "some beam starts outside the grid",
@@ -26,11 +28,7 @@ FLAGS = {
     "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
     "SECTORS_2": "empty rectangles are made for 2 sectors of each quadrant's directions",
     "SECTORS_4": "empty rectangles are made for 4 of them",
-    "DDA": "rays are cast cell by cell",
-    "MARCH": "rays are cast by marching through the distance field",
-    "BRESENHAM": "rays are cast along Bresenham's lines",
-    "CDDT": "rays are cast through a compressed directional distance transform",
-    "LOOKUP": "ranges come from a look-up table",
+    **casters.FLAGS,
     "ECHO": "a sensor hears the nearest of several rays, or its angle of incidence matters",
     "INCIDENCE": "the angle of incidence chooses the mixture's terms, or says whether anything returns",
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
@@ -61,9 +59,6 @@ FLAGS = {
     "INFORMATION": "the sums of the log-likelihood's second derivatives are wanted",
     "CAREFUL": "end points need more than the working precision to fall into the right cell",
 }
-
-# The kernel file of each caster's cast_ray; without such a flag it is the exact one.
-CASTER_FLAGS = {"DDA": "dda", "MARCH": "march", "BRESENHAM": "bresenham", "CDDT": "cddt", "LOOKUP": "lookup"}
 
 _SCALARS: dict[str, np.dtype] = {
     "int": np.dtype(np.int32),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 
+from gpusense.interface import casters
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
-from gpusense.interface.signatures import CASTER_FLAGS, FLAGS
+from gpusense.interface.signatures import FLAGS
 
 _PRELUDE = """\
 #pragma OPENCL FP_CONTRACT OFF
@@ -52,7 +53,7 @@ def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
     files: list[str] = []
     for needed in _requirements(name):
         if needed == "caster":
-            needed = next((CASTER_FLAGS[flag] for flag in CASTER_FLAGS if flag in flags), "raycast")
+            needed = casters.caster_file(flags)
         files += [file for file in _with_requirements(needed, flags) if file not in files]
     return [*files, name]
 
@@ -131,7 +132,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     text = "".join(opencl_source(needed) for needed in files)
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
     if any("caster" in _requirements(needed) for needed in files):
-        words |= CASTER_FLAGS.keys()
+        words |= casters.FLAGS.keys()
     if _in_lanes(file, flags):
         words.add("WIDE")
     unknown = flags - FLAGS.keys()

@@ -1,1 +1,1 @@
-"""Localise a robot: weights of particles."""
+"""Localization of a robot: particle weights and resampling."""

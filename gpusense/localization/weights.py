@@ -1,7 +1,7 @@
-"""Log-likelihoods to particle weights, and weights to a new set of particles.
+"""Convert log-likelihoods to particle weights, and resample particles by their weights.
 
-Weights are made in float64 after the largest log-likelihood is subtracted, so a scan of 100 000 beams neither
-underflows to 0 nor overflows. Cumulative sums for resampling are integers: they are exact and end where they must.
+Weights are computed in float64 after the largest log-likelihood is subtracted, so that a scan of 100 000 beams neither
+underflows to 0 nor overflows. Cumulative sums for resampling are integers and therefore exact.
 """
 
 from __future__ import annotations
@@ -12,21 +12,25 @@ import numpy as np
 
 from gpusense._util import checks
 
-# Weights become integers of this many steps in all; the error of a weight is below one step per particle.
+# Sum of the integer weights; the error of a weight is below one step per particle.
 _STEPS = 1 << 52
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Normalised weights of particles.
+    """Normalised weights of particles, made by :func:`normalize_weights`.
 
     Attributes:
         weights: (N,) float64, >= 0, sum 1.
-        log_evidence: Logarithm of the mean likelihood, ``log(sum p / N)``: how well the cloud explains the scan; -inf
-            where no particle does.
+        log_evidence: Logarithm of the mean likelihood, ``log(sum p / N)``: a measure of how well the cloud explains the
+            scan; -inf if no particle is possible.
         effective_sample_size: ``1 / sum w^2``, from 1 to N.
-        degenerate: Every log-likelihood was -inf: the scan says that no particle is possible, and the weights are
-            uniform.
+        degenerate: Whether every log-likelihood was -inf: no particle is possible, and the weights are uniform.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.normalize_weights([-10.0, -10.0, -12.0, -13.0])
+        Weights(4 particles, effective_sample_size=2.36, log_evidence=-10.6, degenerate=False)
     """
 
     weights: np.ndarray
@@ -34,16 +38,27 @@ class Weights:
     effective_sample_size: float
     degenerate: bool
 
+    def __repr__(self) -> str:
+        return (
+            f"Weights({len(self.weights)} particles, effective_sample_size={self.effective_sample_size:.3g}, "
+            f"log_evidence={self.log_evidence:.3g}, degenerate={self.degenerate})"
+        )
+
 
 def normalize_weights(log_p: object) -> Weights:
-    """Weights proportional to ``exp(log_p)``.
+    """Compute weights proportional to ``exp(log_p)``.
 
     Args:
         log_p: (N,) log-likelihoods, N > 0; -inf for an impossible particle.
 
     Raises:
-        TypeError: not real numbers.
-        ValueError: not (N,), empty, or with NaN or +inf among them; the message names the first.
+        TypeError: ``log_p`` does not hold real numbers.
+        ValueError: The shape is not (N,), the array is empty, or it holds NaN or +inf; the message names the first.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.normalize_weights([-1000.0, -1000.0]).weights.tolist()
+        [0.5, 0.5]
     """
     values = checks.array("log_p", log_p, ("N",), finite=False)
     if values.size == 0:
@@ -62,22 +77,27 @@ def normalize_weights(log_p: object) -> Weights:
 
 
 def resample(weights: object, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of a new set of particles by systematic resampling (book table 4.4, the low-variance sampler).
+    """Draw a new set of particles by systematic resampling (book table 4.4, the low-variance sampler).
 
     Args:
         weights: (N,) weights >= 0 with a positive sum, N > 0; they need not sum to 1.
-        count: Number of particles wanted, >= 0.
-        rng: Draws one number.
+        count: Number of new particles, >= 0.
+        rng: Random generator, from which one number is drawn.
 
     Returns:
         (count,) int64 indices in ascending order; particle i appears ``floor`` or ``ceil`` of ``count * w_i`` times.
 
     Raises:
-        TypeError: an argument of the wrong kind.
-        ValueError: negative or non-finite weights, or a sum of 0.
+        TypeError: An argument has the wrong type.
+        ValueError: A weight is negative or not finite, or the sum is 0.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.resample([0.5, 0.25, 0.25], 8, np.random.default_rng(0)).tolist()
+        [0, 0, 0, 0, 1, 1, 2, 2]
     """
     values = checks.array("weights", weights, ("N",))
-    wanted = checks.integer("count", count, low=0)
+    size = checks.integer("count", count, low=0)
     if values.size == 0 or not values.max() > 0:
         raise ValueError(f"weights: must have a positive sum, got {values.sum()}")
     if values.min() < 0:
@@ -87,10 +107,10 @@ def resample(weights: object, count: int, rng: np.random.Generator) -> np.ndarra
     steps = np.floor(scaled * (_STEPS / scaled.sum())).astype(np.int64)
     ends = np.cumsum(steps)
     total = int(ends[-1])
-    if wanted == 0:
+    if size == 0:
         return np.empty(0, np.int64)
-    # The marks (k + u) / count of the unit interval as exact integers: (k total + start) // count without overflow.
-    whole, rest = divmod(total, wanted)
-    k = np.arange(wanted, dtype=np.int64)
-    marks = k * whole + (k * rest + rng.integers(0, total)) // wanted
+    # The marks (k + u) / size of the unit interval as exact integers: (k total + start) // size without overflow.
+    whole, rest = divmod(total, size)
+    k = np.arange(size, dtype=np.int64)
+    marks = k * whole + (k * rest + rng.integers(0, total)) // size
     return np.searchsorted(ends, marks, side="right")

@@ -1,4 +1,4 @@
-"""Recorded sensor data: one iterator of records, whatever the file."""
+"""Recorded sensor data: readers of log formats, and the records that they return."""
 
 from gpusense.logs.reader import read_log
 from gpusense.logs.records import LandmarkRun, Odometry, Pose, Scan

@@ -1,4 +1,4 @@
-"""Logs of the Carnegie Mellon Robot Navigation Toolkit (CARMEN): one message per line, metres and radians.
+"""Read logs of the Carnegie Mellon Robot Navigation Toolkit (CARMEN): one message per line, metres and radians.
 
 =====================  =================================================================================
 message                fields after the name
@@ -10,18 +10,17 @@ ROBOTLASER1 and 2      type, start angle, field of view, resolution, maximum ran
 ODOM                   x y theta, tv, rv, acceleration
 =====================  =================================================================================
 
-Each ends in the time of measurement, the host and the logger's time. FLASER and ROBOTLASER1 come from the
-front laser, RLASER and ROBOTLASER2 from the rear one. Every other line is skipped.
+Each message ends with the time of measurement, the host and the logger's time. FLASER and ROBOTLASER1 come from the
+front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is skipped.
 
 * ``Scan.time`` and ``Odometry.time`` are the time of measurement.
-* ``Scan.pose`` is the laser's pose. A log that went through SLAM holds the corrected pose there; in a raw one
-  it is the odometry's, and nothing in the file tells the two apart.
-* The scanner's mount is (0, 0, 0), since the poses are the laser's own.
-* FLASER and RLASER state no bearings. They start at -90 degrees, counter-clockwise, in steps of 180/n
-  degrees, or of 1, 0.5 or 0.25 degrees where that is within 1 %: 1 degree for 180 or 181 beams, 0.5 for 360
-  or 361.
-* ROBOTLASER states angles with six decimals. Where field of view and resolution agree to these, the bearings
-  are spaced by the field of view over n - 1, which multiplies no rounding error; else by the resolution.
+* ``Scan.pose`` is the laser's pose. In a log that went through SLAM it is the corrected pose; in a raw log it is the
+  odometry's. The file does not distinguish the two.
+* The scanner's mount is (0, 0, 0), since the poses are those of the laser.
+* FLASER and RLASER state no bearings. They start at -90 degrees, counter-clockwise, in steps of 180/n degrees, or of 1,
+  0.5 or 0.25 degrees if that is within 1 %: 1 degree for 180 or 181 beams, 0.5 for 360 or 361.
+* ROBOTLASER states angles with six decimals. If field of view and resolution agree to these, bearings are spaced by the
+  field of view over n - 1, which multiplies no rounding error; else by the resolution.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ _TAIL = 3  # time of measurement, host, logger's time
 
 
 def read_carmen(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
-    """The records of a CARMEN log; arguments and errors as for :func:`gpusense.logs.read_log`."""
+    """Read the records of a CARMEN log; see :func:`gpusense.read_log` for arguments and errors."""
     names = _REAR if rear else _FRONT
     scanners: dict[tuple[float, ...], Scanner] = {}
     old_range_max = range_max
@@ -77,8 +76,12 @@ def read_carmen(path: Path, *, range_max: float | None, odometry: bool, rear: bo
 
 
 def _messages(path: Path) -> Iterator[tuple[str, list[bytes]]]:
-    """Where each known message stands, ``file:line``, and its fields, the name included."""
-    found = False
+    """Read all messages of known names.
+
+    Yields:
+        The message's place ``file:line``, and its fields, name included.
+    """
+    any_message = False
     number = 0
     try:
         with path.open("rb") as plain:
@@ -93,16 +96,16 @@ def _messages(path: Path) -> Iterator[tuple[str, list[bytes]]]:
                     if line.startswith(_KNOWN):
                         fields = line.split()
                         if fields[0] in _KNOWN:
-                            found = True
+                            any_message = True
                             yield f"{path}:{number}", fields
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{path}:{number + 1}: must be a whole gzip file, got a broken one: {error}") from error
-    if not found:
+    if not any_message:
         raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, got none in {number} lines")
 
 
 def _old_laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The ranges and the six pose values of FLASER or RLASER."""
+    """Return the ranges and the six pose values of FLASER or RLASER."""
     count = _count(where, fields, 1)
     values = _message_numbers(where, fields, 1 + count + 6)
     return values[1 : 1 + count].copy(), values[1 + count :]
@@ -111,7 +114,7 @@ def _old_laser(where: str, fields: Sequence[bytes]) -> tuple[NDArray[np.float64]
 def _robot_laser(
     where: str, fields: Sequence[bytes]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The seven values of the configuration, the ranges and the six pose values of ROBOTLASER."""
+    """Return the seven configuration values, the ranges and the six pose values of ROBOTLASER."""
     count = _count(where, fields, 8)
     remissions = _count(where, fields, 9 + count)
     values = _message_numbers(where, fields, 8 + count + 1 + remissions + 11)
@@ -120,7 +123,7 @@ def _robot_laser(
 
 
 def _count(where: str, fields: Sequence[bytes], index: int) -> int:
-    """The number of values that follow ``fields[index]``, seen to be there."""
+    """Return the count in ``fields[index]`` after checking that as many values follow."""
     name = fields[0].decode()
     left = len(fields) - index - 1
     text = fields[index].decode(errors="replace") if left >= 0 else ""
@@ -132,19 +135,19 @@ def _count(where: str, fields: Sequence[bytes], index: int) -> int:
 
 
 def _message_numbers(where: str, fields: Sequence[bytes], count: int) -> NDArray[np.float64]:
-    """The ``count`` numbers between a message's name and its tail, and the times in the tail, checked."""
-    wanted = 1 + count + _TAIL
+    """Return the ``count`` numbers between a message's name and its tail; check the times in the tail."""
+    length = 1 + count + _TAIL
     name = fields[0].decode()
-    if len(fields) != wanted:
-        raise ValueError(f"{where}: {name}: must have {wanted} fields, got {len(fields)}")
+    if len(fields) != length:
+        raise ValueError(f"{where}: {name}: must have {length} fields, got {len(fields)}")
     body = fields[1 : 1 + count]
-    for index in (wanted - 3, wanted - 1):
+    for index in (length - 3, length - 1):
         _number(where, fields, index)
     try:
         values = np.fromiter(map(float, body), np.float64, count)
     except ValueError:
         values = None
-    if values is None or b"_" in b"".join(body):  # Python, but no C program, reads 1_000 as a number
+    if values is None or b"_" in b"".join(body):  # unlike C, Python reads 1_000 as a number
         return np.array([_number(where, fields, index) for index in range(1, 1 + count)])
     return values
 
@@ -175,16 +178,16 @@ def _pose(where: str, values: NDArray[np.float64]) -> Pose:
 
 
 def _old_step(count: int) -> float:
-    """The step between FLASER's bearings [rad]."""
+    """Return the step between FLASER's bearings [rad]."""
     degrees = 180.0 / max(count, 1)
-    for nice in (1.0, 0.5, 0.25):
-        if abs(degrees - nice) <= 0.01 * nice:
-            degrees = nice
+    for common in (1.0, 0.5, 0.25):
+        if abs(degrees - common) <= 0.01 * common:
+            degrees = common
     return math.radians(degrees)
 
 
 def _robot_step(view: float, step: float, count: int) -> float:
-    """The step between ROBOTLASER's bearings [rad], of which both arguments are rounded to 1e-6."""
+    """Return the step between ROBOTLASER's bearings [rad], from ``view`` and ``step``, both rounded to 1e-6."""
     finer = view / (count - 1) if count > 1 else step
     return finer if abs(finer - step) <= 1e-6 else step
 
@@ -197,7 +200,7 @@ def _scanner(where: str, start: float, step: float, count: float, range_max: flo
 
 
 def _range_max_of(path: Path, name: bytes) -> float:
-    """The limit of the readings in a log's messages of one name; see ``read_log``."""
+    """Return range_max of a log's messages of one name, from their largest reading; see ``read_log``."""
     largest, times = 0.0, 0
     for where, fields in _messages(path):
         if fields[0] == name:

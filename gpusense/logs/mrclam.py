@@ -1,19 +1,19 @@
-"""Runs in the format of the UTIAS Multi-Robot Cooperative Localization and Mapping data (Leung et al., IJRR 2011).
+"""Read runs in the format of the UTIAS Multi-Robot Cooperative Localization and Mapping data (Leung et al., IJRR 2011).
 
 ==========================  ===========================================================================
 file                        columns, separated by blanks; lines that begin with # are comments
 ==========================  ===========================================================================
-Landmark_Groundtruth.dat    subject, x, y, and their deviations [m]
+Landmark_Groundtruth.dat    subject, x, y, and their standard deviations [m]
 Barcodes.dat                subject, barcode
 RobotN_Odometry.dat         time [s], forward velocity [m/s], angular velocity [rad/s]
 RobotN_Measurement.dat      time [s], barcode, range [m], bearing [rad]
 RobotN_Groundtruth.dat      time [s], x, y [m], heading [rad]
 ==========================  ===========================================================================
 
-Each may be compressed by gzip, with .gz after its name. Measurements carry barcodes, not subjects. Subjects that are no
-landmark are the other robots; their readings, and those of barcodes that stand in no list, are left out and counted.
-Readings of one time are one scan. Logged poses and odometry are interpolated at its time, headings the short way round;
-readings before the first logged pose or after the last are left out.
+Each file may be compressed by gzip, with .gz after its name. Measurements carry barcodes, not subjects. Subjects that
+are no landmarks are other robots. Readings of other robots and of unlisted barcodes are left out and counted. Readings
+of one time form a scan. Logged poses and odometry are interpolated at this time, headings along the shorter arc.
+Readings before the first logged pose or after the last are left out.
 """
 
 from __future__ import annotations
@@ -27,56 +27,54 @@ from pathlib import Path
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.logs.records import Floats, LandmarkRun
+from gpusense.logs.records import Floats, Integers, LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 
 _MAX_LINE = 10_000
+# Indices of subjects that are no landmark: another robot, and the owner of an unlisted barcode.
+_ROBOT, _UNKNOWN = -1, -2
 
 
 def read_mrclam(
     folder: str | os.PathLike[str], robot: int, *, range_max: float | None = None, field_of_view: float | None = None
 ) -> LandmarkRun:
-    """One robot's run.
+    """Read the run of one robot.
 
     Args:
-        folder: Where the files are.
+        folder: Folder of the files.
         robot: N of the files' names, >= 1.
         range_max: Largest range of the sensor [m]; None is the next metre above the largest reading.
-        field_of_view: Angle in which it sees [rad]; None is twice the largest bearing, and a twentieth more.
+        field_of_view: Field of view of the sensor [rad]; None is 2.1 times the largest bearing.
 
     Raises:
-        FileNotFoundError: a file is missing.
-        TypeError, ValueError: an argument breaks its rule, or a line the format; the message names file and line.
+        FileNotFoundError: A file is missing.
+        TypeError, ValueError: An argument breaks its rule, or a line the format; the message names file and line.
     """
     base = checks.path("folder", folder)
     robot = checks.integer("robot", robot, low=1)
-    places, _ = _table(base / "Landmark_Groundtruth.dat", ("subject", "x", "y", "deviation", "deviation"))
+    landmarks, _ = _table(base / "Landmark_Groundtruth.dat", ("subject", "x", "y", "deviation", "deviation"))
     codes, code_lines = _table(base / "Barcodes.dat", ("subject", "barcode"))
-    readings, lines = _table(base / f"Robot{robot}_Measurement.dat", ("time", "barcode", "range", "bearing"), True)
-    driven, _ = _table(base / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular velocity"), True)
+    measurements = base / f"Robot{robot}_Measurement.dat"
+    readings, lines = _table(measurements, ("time", "barcode", "range", "bearing"), True)
+    velocities, _ = _table(base / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular velocity"), True)
     logged, _ = _table(base / f"Robot{robot}_Groundtruth.dat", ("time", "x", "y", "heading"), True)
-    subjects = places[:, 0].astype(np.int64)
-    index = {int(subject): i for i, subject in enumerate(subjects)}
-    if len(index) < len(subjects):
-        raise ValueError(f"{_file(base / 'Landmark_Groundtruth.dat')}: every subject must stand there once")
-    known: dict[int, int] = {}
-    for (subject, code), where in zip(codes, code_lines, strict=True):
-        if int(code) in known:
-            raise ValueError(f"{where}: every barcode must stand there once, got {int(code)} again")
-        known[int(code)] = index.get(int(subject), -1)
+    subjects = landmarks[:, 0].astype(np.int64)
+    if len(np.unique(subjects)) < len(subjects):
+        raise ValueError(f"{_file(base / 'Landmark_Groundtruth.dat')}: every subject must occur once")
+    known = _landmarks_by_code(subjects, codes, code_lines)
     for row, where in zip(readings, lines, strict=True):
         if row[2] < 0:
             raise ValueError(f"{where}: range must be >= 0, got {row[2]:g}")
-    ids = np.array([known.get(int(code), -2) for code in readings[:, 1]], np.int64)
+    ids = np.array([known.get(int(code), _UNKNOWN) for code in readings[:, 1]], np.int64)
     inside = (readings[:, 0] >= logged[0, 0]) & (readings[:, 0] <= logged[-1, 0])
     left_out = {
-        "other robots": int(np.sum(ids == -1)), "unknown barcodes": int(np.sum(ids == -2)),
+        "other robots": int(np.sum(ids == _ROBOT)), "unknown barcodes": int(np.sum(ids == _UNKNOWN)),
         "without a logged pose": int(np.sum((ids >= 0) & ~inside)),
     }  # fmt: skip
-    kept = (ids >= 0) & inside
-    if not kept.any():
-        raise ValueError(f"{_file(base / f'Robot{robot}_Measurement.dat')}: must hold readings of landmarks, got none")
-    readings, ids = readings[kept], ids[kept]
+    used = (ids >= 0) & inside
+    if not used.any():
+        raise ValueError(f"{_file(measurements)}: must hold readings of landmarks, got none")
+    readings, ids = readings[used], ids[used]
     time, scan = np.unique(readings[:, 0], return_inverse=True)
     features = np.column_stack([readings[:, 2], np.arctan2(np.sin(readings[:, 3]), np.cos(readings[:, 3]))])
     if range_max is None:
@@ -85,44 +83,68 @@ def read_mrclam(
     if field_of_view is None:
         field_of_view = min(2.1 * max(float(np.abs(features[:, 1]).max()), 0.1), 2 * math.pi)
     return LandmarkRun(
-        landmarks=LandmarkMap(places[:, 1:3]),
-        labels=subjects,
-        time=time,
-        odometry=_at(time, dead_reckoning(driven)),
-        truth=_at(time, logged),
-        features=features,
-        scan=scan.reshape(-1).astype(np.int64),
-        ids=ids,
-        range_max=range_max,
-        field_of_view=field_of_view,
-        left_out=left_out,
-    )
+        LandmarkMap(landmarks[:, 1:3]), subjects, time, _at(time, dead_reckoning(velocities)), _at(time, logged),
+        features, scan.reshape(-1).astype(np.int64), ids, range_max, field_of_view, left_out,
+    )  # fmt: skip
 
 
-def dead_reckoning(driven: Floats) -> Floats:
-    """(T, 4) times and poses from the origin on, of (T, 3) times, velocities and angular velocities."""
-    seconds = np.diff(driven[:, 0])
-    heading = np.concatenate([[0.0], np.cumsum(driven[:-1, 2] * seconds)])
+def _landmarks_by_code(subjects: Integers, codes: Floats, lines: list[str]) -> dict[int, int]:
+    """Return the landmark of each barcode; _ROBOT for the barcode of a robot.
+
+    Args:
+        subjects: (M,) subject of each landmark.
+        codes: Rows of subject and barcode.
+        lines: Place of each row, for messages.
+    """
+    index = {int(subject): i for i, subject in enumerate(subjects)}
+    known: dict[int, int] = {}
+    for (subject, code), where in zip(codes, lines, strict=True):
+        if int(code) in known:
+            raise ValueError(f"{where}: every barcode must occur once, got {int(code)} again")
+        known[int(code)] = index.get(int(subject), _ROBOT)
+    return known
+
+
+def dead_reckoning(velocities: Floats) -> Floats:
+    """Integrate velocities to poses.
+
+    Args:
+        velocities: (T, 3) times [s], forward velocities [m/s] and angular velocities [rad/s].
+
+    Returns:
+        (T, 4) times [s] and poses [m, m, rad], the first at the origin.
+    """
+    seconds = np.diff(velocities[:, 0])
+    heading = np.concatenate([[0.0], np.cumsum(velocities[:-1, 2] * seconds)])
     middle = (heading[:-1] + heading[1:]) / 2
-    way = driven[:-1, 1] * seconds
-    x, y = (np.concatenate([[0.0], np.cumsum(way * turn(middle))]) for turn in (np.cos, np.sin))
-    return np.column_stack([driven[:, 0], x, y, heading])
+    length = velocities[:-1, 1] * seconds
+    x, y = (np.concatenate([[0.0], np.cumsum(length * turn(middle))]) for turn in (np.cos, np.sin))
+    return np.column_stack([velocities[:, 0], x, y, heading])
 
 
 def _at(time: Floats, track: Floats) -> Floats:
-    """(S, 3) poses at times, interpolated between (T, 4) times and poses."""
+    """Interpolate (T, 4) times and poses to (S, 3) poses at (S,) times."""
     columns = (track[:, 1], track[:, 2], np.unwrap(track[:, 3]))
     return np.stack([np.interp(time, track[:, 0], column) for column in columns], axis=1)
 
 
 def _file(path: Path) -> Path:
-    """The file, or its compressed copy where it is not there."""
+    """Return the path of a file, or of its compressed copy if only that exists."""
     packed = path.with_name(f"{path.name}.gz")
     return packed if not path.exists() and packed.exists() else path
 
 
 def _table(path: Path, columns: tuple[str, ...], ordered: bool = False) -> tuple[Floats, list[str]]:
-    """The rows of a file, and where each stands; times must not fall where they are ordered."""
+    """Read the rows of a file.
+
+    Args:
+        path: The file.
+        columns: Names of the columns.
+        ordered: Whether the first column, time, must not decrease.
+
+    Returns:
+        The rows, and the place ``file:line`` of each.
+    """
     file = checks.existing_file(_file(path))
     rows: list[list[float]] = []
     where: list[str] = []

@@ -1,4 +1,4 @@
-"""``read_log``: one iterator of records, whatever the file."""
+"""Read the records of a log of any supported format."""
 
 from __future__ import annotations
 
@@ -41,26 +41,34 @@ def read_log(
 ) -> Iterator[Scan] | Iterator[Scan | Odometry]:
     """Read a log, one record at a time and in the file's order.
 
-    This version reads CARMEN logs, plain or compressed by gzip. See :mod:`gpusense.logs.carmen` for what
-    becomes of their messages.
+    This version reads CARMEN logs, plain or compressed by gzip; :mod:`gpusense.logs.carmen` describes how messages
+    become records.
 
     Args:
-        path: the file.
-        range_max: readings of at least this are "no return" [m]. None takes it from the log: what a message
-            states itself; for the old messages, which state nothing, the log's largest reading if that
-            occurs at least three times (it is then what the scanner gives for "no return"), else the next
-            float64 above it, so that every reading is a return. That takes a first pass over the file.
-        odometry: also yield :class:`Odometry` records.
-        rear: yield the scans of the rear laser instead of the front laser's.
+        path: The file.
+        range_max: Readings of at least ``range_max`` are "no return" [m]. None takes the limit from the log: the value
+            stated in each message, or, for old messages without one, the largest reading of the log. If that reading
+            occurs at least three times, it is the scanner's code for "no return"; else the limit is the next float64
+            above it, so that every reading is a return. This takes a first pass over the file.
+        odometry: Whether to yield :class:`Odometry` records, too.
+        rear: Whether to yield the scans of the rear laser instead of those of the front laser.
 
     Returns:
-        An iterator of :class:`Scan`, and :class:`Odometry` where asked for.
+        An iterator of :class:`Scan`, and of :class:`Odometry` if ``odometry``.
 
     Raises:
-        FileNotFoundError: the file is missing; raised by the call, as are the next two.
-        TypeError: an argument is not of the kind described.
+        FileNotFoundError: The file is missing; raised by the call, as are the next two.
+        TypeError: An argument has the wrong type.
         ValueError: ``range_max`` is not finite and > 0, or the file has another format.
-        ValueError: while reading, a message breaks the format; it names the file and the line.
+        ValueError: While reading, a message breaks the format; the error names the file and the line.
+
+    Example:
+        >>> import gpusense as gs, pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     log = pathlib.Path(folder, "run.clf")
+        ...     _ = log.write_text("FLASER 3 1.0 2.5 8.0 0 0 0 0 0 0 12.5 host 12.5")
+        ...     [scan.ranges.tolist() for scan in gs.read_log(log, range_max=8.0)]
+        [[1.0, 2.5, 8.0]]
     """
     file = checks.path("path", path)
     if range_max is not None:
@@ -68,11 +76,11 @@ def read_log(
     for name, flag in (("odometry", odometry), ("rear", rear)):
         if not isinstance(flag, bool):
             raise TypeError(f"{name}: must be True or False, got {checks.show(flag)}")
-    found = _OTHER_FORMATS.get(file.suffix.lower())
+    other = _OTHER_FORMATS.get(file.suffix.lower())
     if file.is_dir():
-        found = "a ROS 2 bag" if (file / "metadata.yaml").exists() else "a folder"
-    if found is not None:
-        raise ValueError(f"{file}: must be a CARMEN log, which is all that this version reads, got {found}")
+        other = "a ROS 2 bag" if (file / "metadata.yaml").exists() else "a folder"
+    if other is not None:
+        raise ValueError(f"{file}: must be a CARMEN log, which is all that this version reads, got {other}")
     checks.existing_file(file)
 
     from gpusense.logs.carmen import read_carmen

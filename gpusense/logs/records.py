@@ -1,4 +1,4 @@
-"""Records of logs: scans, odometry, runs among landmarks."""
+"""Records of logs: scans, odometry and runs among landmarks."""
 
 from __future__ import annotations
 
@@ -18,46 +18,61 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One scan of a laser range finder."""
+    """One scan of a laser range finder.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.Scan(12.5, np.ones(3), gs.Scanner([-0.5, 0, 0.5], range_max=8.0), (0.0, 0.0, 0.0), None)
+        Scan(time=12.5, 3 readings, odometry=(0.0, 0.0, 0.0), pose=None)
+    """
 
     time: float
-    """When it was measured, by the log's clock [s]."""
+    """Time of measurement by the log's clock [s]."""
     ranges: NDArray[np.float64]
-    """(K,) readings [m]; read-only. :func:`gpusense.world.scanner.classify` tells what they mean."""
+    """(K,) readings [m]; read-only. :func:`gpusense.classify` classifies them."""
     scanner: Scanner
     """The geometry; one object for all scans of the same geometry."""
     odometry: Pose
-    """The robot's pose in the odometry frame."""
+    """The robot's pose in the odometry frame [m, m, rad]."""
     pose: Pose | None
-    """The laser's corrected pose in the world, or None where the log has none."""
+    """The laser's corrected pose in the world [m, m, rad], or None if the log has none."""
+
+    def __repr__(self) -> str:
+        return f"Scan(time={self.time}, {len(self.ranges)} readings, odometry={self.odometry}, pose={self.pose})"
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """One reading of the wheel odometry."""
+    """One reading of the wheel odometry.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.Odometry(12.5, (0.1, 0.0, 0.0)).pose
+        (0.1, 0.0, 0.0)
+    """
 
     time: float
-    """When it was measured, by the log's clock [s]."""
+    """Time of measurement by the log's clock [s]."""
     pose: Pose
-    """The robot's pose in the odometry frame."""
+    """The robot's pose in the odometry frame [m, m, rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkRun:
-    """S scans with F features, in the order of time.
+    """A run among landmarks: S scans with F features, in the order of time.
 
     Attributes:
         landmarks: The map.
-        labels: (M,) what the recording calls them.
-        time: (S,) of the scans [s].
-        odometry: (S, 3) poses by odometry alone, in its own frame [m, m, rad].
-        truth: (S, 3) logged poses in the world.
+        labels: (M,) labels of the landmarks in the recording.
+        time: (S,) times of the scans [s].
+        odometry: (S, 3) poses by odometry alone, in the odometry frame [m, m, rad].
+        truth: (S, 3) logged poses in the world [m, m, rad].
         features: (F, 2) ranges [m] and bearings [rad].
-        scan: (F,) scan of each, ascending.
-        ids: (F,) landmark that the recording says each is.
-        range_max: Largest range that the sensor can have [m].
-        field_of_view: Angle in which it sees [rad].
-        left_out: Readings that are no feature of the map, by what they are.
+        scan: (F,) scan of each feature, ascending.
+        ids: (F,) landmark of each feature according to the recording.
+        range_max: Largest range of the sensor [m].
+        field_of_view: Field of view of the sensor [rad].
+        left_out: Numbers of readings that are no feature of the map, by reason.
     """
 
     landmarks: LandmarkMap
@@ -76,3 +91,6 @@ class LandmarkRun:
     def poses(self) -> Floats:
         """(F, 3) logged pose of each feature."""
         return self.truth[self.scan]
+
+    def __repr__(self) -> str:
+        return f"LandmarkRun({len(self.time)} scans, {len(self.features)} features, {len(self.landmarks)} landmarks)"

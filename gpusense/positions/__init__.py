@@ -1,1 +1,1 @@
-"""Positions from beacons without a filter: closed forms, least squares, and the covariance of what they find."""
+"""Positions from beacons without a filter: closed forms, least squares, and the covariance of their solutions."""

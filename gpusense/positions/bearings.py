@@ -1,4 +1,4 @@
-"""A position, with or without the heading, from bearings of beacons."""
+"""Triangulate: compute a position, or a pose, from bearings of beacons."""
 
 from __future__ import annotations
 
@@ -21,54 +21,61 @@ def triangulate(
     loss: str = "linear",
     loss_scale: float = 1.0,
 ) -> PositionFix:
-    """The position, and the heading where it is not known, that sees beacons at the bearings measured.
+    """Compute the position, and the heading if it is unknown, from bearings of beacons.
 
-    With a known heading two beacons are enough: their lines of sight cross in closed form. Without it three are, see
-    :func:`triangulate_triangle`. More beacons: the global minimum of ``sum of rho(weight (residual / sigma)^2)``, by
-    Gauss-Newton steps from linear solutions and from the closed forms of pairs or triples. Lines of sight are rays: a
-    beacon behind its bearing is no solution. With ``sigma``, all minima that the noise cannot tell from the best are
-    returned.
+    With a known heading two beacons suffice: their lines of sight intersect in closed form. Without it three suffice,
+    see :func:`triangulate_triangle`. With more beacons the solution is the global minimum of ``sum of rho(weight
+    (residual / sigma)^2)``, reached by Gauss-Newton steps from linear solutions and from the closed forms of pairs or
+    triples. Lines of sight are rays: a beacon behind its bearing is no solution. With ``sigma``, all minima are
+    returned whose costs the noise cannot distinguish from the best.
 
-    One measurement set a call; coordinates may be as large as UTM's.
+    A call takes one set of measurements. Coordinates may be as large as those of UTM.
 
     Args:
-        xy: (M, 2) the beacons' x and y [m].
-        bearings: (M,) directions to them in the robot's frame, counter-clockwise from straight ahead [rad], any real.
-        heading: The robot's heading in the world [rad], or None: it is looked for.
-        sigma: Standard deviation of the bearings [rad], one or (M,), > 0. None: not known; then the covariance is that
-            of sigma = 1 rad, to be multiplied with the variance.
+        xy: (M, 2) positions of the beacons [m].
+        bearings: (M,) directions to the beacons in the robot's frame, counter-clockwise from straight ahead [rad], any
+            real numbers.
+        heading: The robot's heading in the world [rad], or None if unknown.
+        sigma: Standard deviation of the bearings [rad], one or (M,), > 0. None if unknown: the covariance is then that
+            of sigma = 1 rad, to be multiplied by the variance.
         weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
-        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``. It is not
-            used where there are only as many bearings as unknowns.
-        loss_scale: Residual at which a robust loss bends [sigma, or rad where sigma is not given], > 0.
+        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``. It is ignored
+            for only as many bearings as unknowns.
+        loss_scale: Residual at which a robust loss bends [sigma, or rad without sigma], > 0.
 
     Returns:
-        Positions (S, 2) for a known heading, else poses (S, 3). Statuses: "unique", "ambiguous", "parallel", "in line",
-        "coincident", "behind" and "circle" (without solutions but for "behind" of more bearings than unknowns),
-        "at a beacon", "singular".
+        Positions (S, 2) for a known heading, else poses (S, 3). Statuses: "unique", "ambiguous", "at a beacon",
+        "singular"; without solutions "parallel", "in line", "coincident", "circle" and "behind". "behind" of more
+        bearings than unknowns has a solution.
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a shape or value breaks its rule, or too few beacons are left.
+        TypeError: An argument has the wrong type.
+        ValueError: A shape or value breaks its rule, or too few beacons are left.
 
     Source: lectures, "Bearings Only"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> fix = gs.triangulate([(4, 1), (2, 3), (0, 1)], np.radians([0, 90, 180]), heading=0.0, sigma=0.01)
+        >>> fix.status, fix.best.round(6).tolist()
+        ('unique', [2.0, 1.0])
     """
-    least, left = (3, "an arc") if heading is None else (2, "a ray")
+    least, remainder = (3, "an arc") if heading is None else (2, "a ray")
     problem = make_problem(
         xy, bearings=bearings, heading=heading, sigma_bearing=sigma, weights=weights, loss=loss, loss_scale=loss_scale,
-        least=least, reason=f", or {left} of solutions remains",
+        least=least, reason=f", or {remainder} of solutions remains",
     )  # fmt: skip
-    word = _no_solution(problem)
-    if word:
-        return problem.fix([], word)
-    chosen = subsets(len(problem.xy), least)
-    starts, rho, clarity = _rays(problem, chosen) if heading is not None else _triples(problem, chosen)
+    status = _no_solution(problem)
+    if status:
+        return problem.fix([], status)
+    sets = subsets(len(problem.xy), least)
+    starts, rho, clarity = _rays(problem, sets) if heading is not None else _triples(problem, sets)
     if len(problem.xy) == least:
         return _exact(problem, starts, rho[0], clarity[0])
     if heading is None and not (clarity > _blur(problem)).any():
         return problem.fix([], "circle")
     linear = _nearest_point(problem) if heading is not None else _linear_pose(problem)
-    states, status = pick(*minima(problem, np.vstack([linear, starts])), told=sigma is not None)
+    states, status = pick(*minima(problem, np.vstack([linear, starts])), known_sigma=sigma is not None)
     if problem.at_beacon(states[0]):
         status = "at a beacon"
     elif status == "unique" and np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
@@ -77,51 +84,57 @@ def triangulate(
 
 
 def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike | None = None) -> PositionFix:
-    """Position and heading from the bearings of exactly three beacons, in closed form.
+    """Compute position and heading from the bearings of exactly three beacons, in closed form.
 
-    The lectures solve the triangles robot-beacon-beacon by the law of cosines, D_ij^2 = z_i^2 + z_j^2 - 2 z_i z_j cos
-    (b_j - b_i). The same pose comes out here from linear equations, without iterations and without special cases for
-    beacons in line: see :func:`gpusense.positions.closed_forms.three_bearings`.
+    The lectures solve the triangles robot-beacon-beacon by the law of cosines, D_ij^2 = z_i^2 + z_j^2 - 2 z_i z_j
+    cos(b_j - b_i). This function obtains the same pose from linear equations, without iterations and without special
+    cases for beacons in line: see :func:`gpusense.positions.closed_forms.three_bearings`.
 
     Args:
-        xy: (3, 2) the beacons' x and y [m].
-        bearings: (3,) directions to them in the robot's frame, counter-clockwise from straight ahead [rad], any real.
-        sigma: Standard deviation of the bearings [rad], one or (3,), > 0. None: not known; then the covariance is that
-            of sigma = 1 rad, to be multiplied with the variance.
+        xy: (3, 2) positions of the beacons [m].
+        bearings: (3,) directions to the beacons in the robot's frame, counter-clockwise from straight ahead [rad], any
+            real numbers.
+        sigma: Standard deviation of the bearings [rad], one or (3,), > 0. None if unknown: the covariance is then that
+            of sigma = 1 rad, to be multiplied by the variance.
 
     Returns:
-        One pose (1, 3), or none: "unique", "at a beacon"; without solutions "circle", "in line", "coincident",
-        "behind".
+        One pose (1, 3) with status "unique" or "at a beacon", or no pose with status "circle", "in line", "coincident"
+        or "behind".
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a shape or value breaks its rule.
+        TypeError: An argument has the wrong type.
+        ValueError: A shape or value breaks its rule.
 
     Source: lectures, "Bearings Only".
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.triangulate_triangle([(5, 3), (3, 5), (1, 3)], np.radians([-90, 0, 90])).best.round(3).tolist()
+        [3.0, 3.0, 1.571]
     """
     problem = make_problem(xy, bearings=bearings, sigma_bearing=sigma)
     if len(problem.xy) != 3:
         raise ValueError(f"xy: must hold exactly 3 beacons, got {len(problem.xy)}")
-    word = _no_solution(problem)
-    if word:
-        return problem.fix([], word)
+    status = _no_solution(problem)
+    if status:
+        return problem.fix([], status)
     states, rho, clarity = _triples(problem, np.array([[0, 1, 2]]))
     return _exact(problem, states, rho[0], clarity[0])
 
 
 def _angle_rounding(problem: Problem) -> float:
-    """Rounding of the bearings, which were often reduced by whole turns or are differences of larger angles."""
+    """Return the rounding error of the bearings, often reduced by whole turns or differences of larger angles."""
     assert problem.bearings is not None
     return EPS * (4 * ROUNDINGS + float(np.abs(problem.bearings).max()))
 
 
 def _blur(problem: Problem) -> float:
-    """Rounding of the angles between lines of sight, and of |w| in :func:`three_bearings`, where they should be 0."""
+    """Return the rounding error of a zero angle between lines of sight, or of a zero |w| in :func:`three_bearings`."""
     return _angle_rounding(problem) + 2 * problem.noise / problem.spread
 
 
 def _no_solution(problem: Problem) -> str:
-    """The status where beacons or lines of sight leave no point or too many, "" elsewhere."""
+    """Return the status if beacons or lines of sight leave no point or infinitely many, else ""."""
     assert problem.bearings is not None
     places = np.unique(problem.xy, axis=0)
     if len(places) == 1 or (problem.heading is None and len(places) == 2):
@@ -129,7 +142,7 @@ def _no_solution(problem: Problem) -> str:
     turned = problem.bearings - problem.bearings[0]
     if np.abs(np.sin(turned)).max() > _blur(problem):
         return ""
-    # All lines of sight are parallel. They may be one and the same.
+    # All lines of sight are parallel. They may coincide.
     line = in_line(problem.xy, problem.noise)
     if problem.heading is None:
         return "behind" if line is None else "in line"
@@ -140,7 +153,7 @@ def _no_solution(problem: Problem) -> str:
 
 
 def _rays(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """Where pairs of lines of sight cross: (N, 2), distances (N, 2) and sines (N,)."""
+    """Intersect pairs of lines of sight: (N, 2) points, (N, 2) distances and (N,) sines."""
     assert problem.bearings is not None and problem.heading is not None
     angle, (i, j) = problem.bearings + problem.heading, pairs.T
     point, rho, sine = two_rays(problem.points[i], problem.points[j], angle[i], angle[j])
@@ -148,14 +161,14 @@ def _rays(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, Floats, Fl
 
 
 def _triples(problem: Problem, triples: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
-    """The poses of triples of beacons: (N, 3), distances (N, 3), and how clear they are (N,)."""
+    """Solve triples of beacons: (N, 3) poses, (N, 3) distances, and (N,) clarities of the poses."""
     assert problem.bearings is not None
     point, heading, rho, clarity = three_bearings(problem.points[triples], problem.bearings[triples])
     return np.column_stack([point.real, point.imag, heading]), rho, clarity
 
 
 def _exact(problem: Problem, states: Floats, rho: Floats, clarity: float) -> PositionFix:
-    """As many bearings as unknowns: the closed form's solution, if it is one."""
+    """Make the result for as many bearings as unknowns: the closed form's solution, if it is valid."""
     if problem.heading is None and clarity <= _blur(problem):
         return problem.fix([], "in line" if in_line(problem.xy, problem.noise) else "circle")
     if problem.at_beacon(states[0]):
@@ -164,7 +177,7 @@ def _exact(problem: Problem, states: Floats, rho: Floats, clarity: float) -> Pos
 
 
 def _nearest_point(problem: Problem) -> Floats:
-    """(1, 2) the point nearest to all lines of sight: sum of s_i^2 (n_i (p - m_i))^2 is least."""
+    """Return (1, 2) the point nearest to all lines of sight, the minimum of sum of s_i^2 (n_i (p - m_i))^2."""
     assert problem.bearings is not None and problem.heading is not None
     angle = problem.bearings + problem.heading
     normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1) * problem.scales[:, None]
@@ -172,10 +185,10 @@ def _nearest_point(problem: Problem) -> Floats:
 
 
 def _linear_pose(problem: Problem) -> Floats:
-    """(2, 3) poses, opposite in heading, from Im((m_i q - s) exp(-i b_i)) = 0 with q = exp(-i theta), s = p q.
+    """Return (2, 3) poses of opposite headings, by Im((m_i q - s) exp(-i b_i)) = 0 with q = exp(-i theta), s = p q.
 
-    The equations are linear and homogeneous in q and s; the right singular vector of the least singular value solves
-    them in least squares.
+    The equations are linear and homogeneous in q and s. The right singular vector of the least singular value is their
+    solution in least squares.
     """
     assert problem.bearings is not None
     turn, length = np.exp(-1j * problem.bearings), problem.spread

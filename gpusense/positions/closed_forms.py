@@ -1,8 +1,8 @@
-"""Where circles and lines of sight meet, in closed form; every function takes many problems at once.
+"""Intersect circles and lines of sight in closed form, many problems at once.
 
-A beacon m is seen from the position p with heading theta at the range d = |m - p| and the bearing
-b = arg(m - p) - theta. Points of the plane are complex numbers here: turning is a product, and formulas are half as
-long. All lengths are relative to an origin near the beacons, which the callers subtract.
+From the position p with heading theta, a beacon m has the range d = |m - p| and the bearing b = arg(m - p) - theta.
+Points of the plane are complex numbers: a rotation is a product, and formulas are half as long. All lengths are
+relative to an origin near the beacons, which the callers subtract.
 """
 
 from __future__ import annotations
@@ -15,38 +15,37 @@ Complexes = NDArray[np.complex128]
 Words = NDArray[np.str_]
 
 EPS = float(np.finfo(np.float64).eps)
-# Of the lengths or sines that are compared: what is equal within so many roundings is taken as equal.
+# Lengths or sines count as equal if they differ by at most this number of roundings.
 ROUNDINGS = 16
 
 
 def wrap(angle: Floats) -> Floats:
-    """Angles reduced to [-pi, pi]."""
+    """Reduce angles to [-pi, pi]."""
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
 def two_circles(
     first: Complexes, second: Complexes, d1: Floats, d2: Floats, share: Floats | float = 0.5, noise: float = 0.0
 ) -> tuple[Complexes, Words]:
-    """Where two circles meet ("Distances Only, No Uncertainty").
+    """Intersect pairs of circles ("Distances Only, No Uncertainty").
 
-    With the beacons at 0 and a on the x axis, x = (a^2 + d1^2 - d2^2) / 2a and y = +-sqrt(d1^2 - x^2). As they stand
-    these formulas lose digits where the triangle of the two beacons and the robot is flat. Here x is taken from the
-    beacon with the smaller range, as ((a - d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a,
-    with Kahan's area ("Miscalculating Area and Angles of a Needle-like Triangle", 2014), where nothing cancels but
-    the sides themselves.
+    With the beacons at 0 and a on the x axis, x = (a^2 + d1^2 - d2^2) / 2a and y = +-sqrt(d1^2 - x^2). These formulas
+    lose digits if the triangle of the two beacons and the robot is flat. Here x is measured from the beacon with the
+    smaller range, as ((a - d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a, with Kahan's area
+    ("Miscalculating Area and Angles of a Needle-like Triangle", 2014), in which only the sides themselves cancel.
 
     Args:
-        first: (N,) centres.
-        second: (N,) centres.
+        first: (N,) centres of the first circles.
+        second: (N,) centres of the second circles.
         d1: (N,) radii of the first circles, >= 0.
         d2: (N,) radii of the second circles, >= 0.
-        share: Which part of a gap between the circles belongs to the first one, 0 to 1.
-        noise: Rounding of the inputs' coordinates, a length.
+        share: Share of the gap between the circles that belongs to the first one, 0 to 1.
+        noise: Rounding error of the inputs' coordinates, a length.
 
     Returns:
-        (N, 2) points, first the one on the left of the way from ``first`` to ``second``; and (N,) how the circles lie:
-        "two" (they cross), "tangent", "disjoint", "contained" (one inside the other) or "coincident" (one centre).
-        Where they do not cross, both points are the nearest one on the line of centres (least squares); NaN for one
+        (N, 2) points, first the one to the left of the direction from ``first`` to ``second``; and (N,) statuses: "two"
+        (the circles intersect), "tangent", "disjoint", "contained" (one inside the other) or "coincident" (one centre).
+        Without an intersection both points are the nearest one on the line of centres (least squares); NaN for one
         centre.
     """
     base = second - first
@@ -63,13 +62,13 @@ def two_circles(
         x = np.where(swap, a - x, x)
         gap = a - d1 - d2
         apart = d1 + gap * share
-        # Contained: the nearest points lie beyond the centre of the smaller circle, seen from that of the larger one.
+        # Contained: seen from the larger circle's centre, the nearest points lie beyond that of the smaller circle.
         inside = np.where(swap, d1 - (d1 - d2 - a) * share, -(d1 + (d2 - d1 - a) * share))
         status = np.where(gap > tolerance, "disjoint", np.where(slack < -tolerance, "contained", "two"))
         status = np.where((status == "two") & (slack <= tolerance), "tangent", status)
         status = np.where(a <= noise, "coincident", status)
         crossing = status == "two"
-        # A tangent point is that of the nearest points, too: gap and slack are rounding.
+        # A tangent point is a nearest point, too: gap and slack are rounding errors.
         x = np.where(crossing, x, np.where(high == a, apart, inside))
         y = np.where(crossing, y, 0.0)
         along = np.where(a > noise, base / a, np.nan)
@@ -77,19 +76,19 @@ def two_circles(
 
 
 def two_rays(first: Complexes, second: Complexes, angle1: Floats, angle2: Floats) -> tuple[Complexes, Floats, Floats]:
-    """Where two lines of sight of known direction meet.
+    """Intersect pairs of lines of sight of known direction.
 
     With m_i - p = rho_i u_i, rho_1 = ((m1 - m2) x u2) / (u1 x u2) and rho_2 = ((m1 - m2) x u1) / (u1 x u2).
 
     Args:
-        first: (N,) beacons.
-        second: (N,) beacons.
+        first: (N,) first beacons.
+        second: (N,) second beacons.
         angle1: (N,) directions from the robot to the first beacons in the world [rad].
-        angle2: (N,) directions to the second ones.
+        angle2: (N,) directions from the robot to the second beacons in the world [rad].
 
     Returns:
-        (N,) points; (N, 2) distances of the beacons along the lines of sight, negative where one lies behind the robot;
-        and (N,) sines of the angles between the lines. Parallel lines have no point: inf or NaN.
+        (N,) points; (N, 2) distances of the beacons along the lines of sight, negative for a beacon behind the robot;
+        and (N,) sines of the angles between the lines. The point of parallel lines is inf or NaN.
     """
     u1, u2 = np.exp(1j * angle1), np.exp(1j * angle2)
     sine = np.sin(angle2 - angle1)
@@ -102,29 +101,29 @@ def two_rays(first: Complexes, second: Complexes, angle1: Floats, angle2: Floats
 
 
 def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Floats, Floats, Floats]:
-    """Position and heading from three bearings ("Bearings Only").
+    """Compute position and heading from three bearings ("Bearings Only").
 
     (m_i - p) exp(-i (b_i + theta)) is real and positive. With beacon 2 as origin its imaginary parts are three linear
-    equations in exp(-i theta) and p exp(-i theta); without p they leave
+    equations in exp(-i theta) and p exp(-i theta). Eliminating p leaves
 
         w = sum of m_i exp(-i b_i) sin(b_j - b_k) over the cyclic (i, j, k),   exp(i theta) = +-w / |w|,
 
-    and the position follows from the two lines of sight that cross best. Unlike laws of cosines or cotangents (Pierlot
-    and Van Droogenbroeck, "A New Three Object Triangulation Algorithm for Mobile Robot Positioning", 2014) it has no
-    special cases for beacons in line, or for a robot in line with two of them. w = 0 on the circle through the beacons.
+    and the position follows from the two lines of sight with the largest angle between them. Unlike laws of cosines or
+    cotangents (Pierlot and Van Droogenbroeck, "A New Three Object Triangulation Algorithm for Mobile Robot
+    Positioning", 2014) this form has no special cases for beacons in line, or for a robot in line with two beacons.
+    w = 0 on the circle through the beacons.
 
     Args:
         beacons: (N, 3) positions.
         bearings: (N, 3) [rad].
 
     Returns:
-        (N,) positions; (N,) headings; (N, 3) distances along the lines of sight, all > 0 for a pose that sees the
-        beacons where they are; and (N,) |w| relative to the sum of its terms' magnitudes, 0 where the bearings
-        leave more than one pose.
+        (N,) positions; (N,) headings; (N, 3) distances along the lines of sight, all > 0 for a valid pose; and (N,)
+        clarities: |w| relative to the sum of its terms' magnitudes, 0 if the bearings leave more than one pose.
     """
     terms = np.empty(beacons.shape, np.complex128)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        # The sum does not change with the origin, so that it is taken at the middle of the beacons.
+        # The sum does not depend on the origin; the middle of the beacons keeps most digits.
         terms[:, i] = (beacons[:, i] - beacons.mean(axis=1)) * np.exp(-1j * bearings[:, i])
         terms[:, i] *= np.sin(bearings[:, j] - bearings[:, k])
     w, size = terms.sum(axis=1), np.abs(terms).sum(axis=1)
@@ -139,7 +138,7 @@ def three_bearings(beacons: Complexes, bearings: Floats) -> tuple[Complexes, Flo
     point, _, _ = two_rays(beacons[row, i], beacons[row, j], angle[row, i], angle[row, j])
     with np.errstate(invalid="ignore"):
         rho = ((beacons - point[:, None]) * np.exp(-1j * angle)).real
-    # Turning round by pi changes the sign of all distances and leaves the position.
+    # A turn by pi changes the signs of all distances and keeps the position.
     turned = np.nansum(np.sign(rho), axis=1) < 0
     heading = np.where(turned, heading + np.pi, heading)
     return point, wrap(heading), np.where(turned[:, None], -rho, rho), clarity

@@ -1,4 +1,4 @@
-"""What is known of a position: the solutions, how certain they are, and what is wrong with them."""
+"""Result of a position from beacons: solutions, covariance and status."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STATUSES = {
     "at a beacon": "the robot stands at a beacon: the bearing to it, and the direction of its range, have no meaning",
     "singular": "the measurements do not fix the position: the information matrix is singular",
 }
-"""What each status means."""
+"""The meaning of each status."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +34,25 @@ class PositionFix:
     """Positions or poses that fit measurements of beacons, the best first.
 
     Attributes:
-        solutions: (S, 2) x and y [m], or (S, 3) with theta [rad] in [-pi, pi]; S is 0 where none exists or
-            infinitely many do.
-        covariance: (S, 2, 2) or (S, 3, 3) [m^2, m rad, rad^2] to first order in the noise; NaN where the
-            information matrix is singular. Where sigma was not given it is that of sigma = 1: multiply it with
-            the variance.
+        solutions: (S, 2) x and y [m], or (S, 3) with theta [rad] in [-pi, pi]; S is 0 if there are none or infinitely
+            many.
+        covariance: (S, 2, 2) or (S, 3, 3) [m^2, m rad, rad^2] to first order in the noise; NaN if the information
+            matrix is singular. Without sigma it is that of sigma = 1: multiply it by the variance.
         residuals: (S, M) measured less expected ranges [m] or bearings [rad, within +-pi]; (S, M, 2) for both.
         cost: (S,) sum of the weighted squared residuals in sigmas, under the loss; chi-squared for the linear loss.
         condition: (S,) condition number of the Jacobian in sigmas, heading in units that balance the position's; 1 is
             best, inf is singular.
         status: One of :data:`gpusense.positions.fix.STATUSES`.
-        degenerate: Whether the geometry, not the noise, keeps the best solution from being fixed: there is none, or
-            its information matrix is singular.
+        degenerate: Whether the geometry, not the noise, leaves the best solution undetermined: there is none, or its
+            information matrix is singular.
+
+    Example:
+        >>> import gpusense as gs
+        >>> fix = gs.trilaterate([(0, 0), (4, 0)], [2.5, 2.5])
+        >>> fix.solutions.tolist()
+        [[2.0, 1.5], [2.0, -1.5]]
+        >>> fix.explain()
+        'two: two circles cross: both points fit equally well'
     """
 
     solutions: Floats
@@ -57,7 +64,7 @@ class PositionFix:
     degenerate: bool
 
     def __post_init__(self) -> None:
-        """Nobody changes a result by accident."""
+        """Make the arrays read-only."""
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
@@ -68,10 +75,10 @@ class PositionFix:
 
     @property
     def best(self) -> Floats:
-        """(2,) or (3,) the solution of the lowest cost.
+        """Solution (2,) or (3,) of the lowest cost.
 
         Raises:
-            ValueError: there is no solution; the message says why.
+            ValueError: There is no solution; the message says why.
         """
         if not len(self):
             raise ValueError(f"solutions: must hold one, got none: {self.explain()}")
@@ -80,9 +87,16 @@ class PositionFix:
 
     @property
     def deviation(self) -> Floats:
-        """(S,) root of the trace of the position's covariance [m]: the dilution of precision where sigma is 1."""
+        """(S,) root of the trace of the position's covariance [m]; the dilution of precision if sigma is 1."""
         return np.sqrt(self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
 
     def explain(self) -> str:
-        """What the status means, in words."""
+        """Return the status and its meaning."""
         return f"{self.status}: {STATUSES[self.status]}"
+
+    def __repr__(self) -> str:
+        text = f"PositionFix({self.status!r}, {len(self)} solution{'s' * (len(self) != 1)}"
+        if len(self):
+            best = ", ".join(f"{value:.6g}" for value in self.solutions[0])
+            text += f", best=({best}), deviation={self.deviation[0]:.3g} m"
+        return f"{text})"

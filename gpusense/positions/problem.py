@@ -1,4 +1,4 @@
-"""Beacons and what was measured of them: residuals, their derivatives and the information they hold."""
+"""Measurements of beacons: residuals, their derivatives, costs and information."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
     "cauchy": lambda z: (np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2),
     "arctan": lambda z: (np.arctan(z), 1 / (1 + z * z), -2 * z / (1 + z * z) ** 2),
 }
-# A Jacobian is rounded to some 1e-16: a larger condition number is rounding.
+# Condition number from which a Jacobian is singular: it is rounded to about 1e-16.
 SINGULAR = 1e12
-# Nearer to a beacon, in the scene's spread, a robot stands at it: bad geometry makes that of some 1e-15 of rounding.
+# A robot nearer to a beacon than this, in the scene's spread, stands at it: rounding of 1e-15 grows in bad geometry.
 TOUCH = 1e-12
-# Subsets of the beacons of which closed forms are taken to start from.
+# Most subsets of the beacons whose closed forms are starts.
 STARTS = 300
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Measurements of M beacons that the weights leave, and what is looked for.
+    """Measurements of M beacons of positive weight, and the unknowns: a position or a pose.
 
     Attributes:
-        xy: (M, 2) beacons, relative to ``origin``.
-        origin: (2,) in the world: what keeps the digits of beacons at UTM coordinates.
-        ranges: (M,) or None.
-        bearings: (M,) or None.
-        heading: The known heading, or None.
-        sigma_range: (M,) deviations.
-        sigma_bearing: (M,) deviations.
+        xy: (M, 2) beacons relative to ``origin`` [m].
+        origin: (2,) origin in the world, which keeps the digits of beacons at UTM coordinates [m].
+        ranges: (M,) or None [m].
+        bearings: (M,) or None [rad].
+        heading: The known heading, or None [rad].
+        sigma_range: (M,) standard deviations [m].
+        sigma_bearing: (M,) standard deviations [rad].
         weights: (M,) factors > 0 of the squared residuals.
-        loss: A name out of LOSSES.
-        loss_scale: Where the loss bends, in sigmas.
-        keep: (M',) which of the beacons that the caller gave are left.
+        loss: Name of one of LOSSES.
+        loss_scale: Residual at which the loss bends [sigma].
+        used: (M',) mask of the caller's beacons that are in ``xy``.
     """
 
     xy: Floats
@@ -65,40 +65,40 @@ class Problem:
     weights: Floats
     loss: str
     loss_scale: float
-    keep: NDArray[np.bool]
+    used: NDArray[np.bool]
 
     @property
     def dimension(self) -> int:
-        """2 for a position, 3 for a pose."""
+        """Number of unknowns: 2 for a position, 3 for a pose."""
         return 2 if self.bearings is None or self.heading is not None else 3
 
     @property
     def points(self) -> Complexes:
-        """(M,) the beacons as complex numbers."""
+        """(M,) beacons as complex numbers."""
         return self.xy[:, 0] + 1j * self.xy[:, 1]
 
     @property
     def spread(self) -> float:
-        """A length of the scene: the largest distance of a beacon from their middle, or of a range."""
+        """Length scale of the scene: the largest distance of a beacon from their mean, or the largest range."""
         reach = float(np.hypot(*(self.xy - self.xy.mean(axis=0)).T).max())
         return max(reach, 0.0 if self.ranges is None else float(self.ranges.max()))
 
     @functools.cached_property
     def touch(self) -> float:
-        """Within this of a beacon the robot stands at it: the direction to it is rounding."""
+        """Distance from a beacon up to which the robot stands at it, where the direction to it is rounding error."""
         return max(TOUCH * self.spread, 4 * self.noise)
 
     def at_beacon(self, state: Floats) -> bool:
-        """Whether the robot stands at a beacon."""
+        """Return whether the robot stands at a beacon."""
         return bool(np.hypot(*(self.xy - state[:2]).T).min() <= self.touch)
 
     @property
     def noise(self) -> float:
-        """Rounding of the beacons' coordinates in the world, and of differences of them."""
+        """Rounding error of the beacons' coordinates in the world, and of their differences."""
         return 2 * EPS * float(np.abs(self.xy + self.origin).max())
 
     def residuals(self, states: Floats) -> Floats:
-        """(S, M) or, for ranges and bearings, (S, 2 M): measured less expected, at (S, d) states."""
+        """Return measured less expected values at (S, d) states: (S, M), or (S, 2 M) for ranges and bearings."""
         offset = self.xy - states[:, None, :2]
         parts = []
         if self.ranges is not None:
@@ -109,7 +109,7 @@ class Problem:
         return np.concatenate(parts, axis=1)
 
     def jacobian(self, state: Floats) -> Floats:
-        """(R, d) derivatives of the expected measurements at one state; zero where the robot stands at the beacon."""
+        """Return the (R, d) derivatives of the expected measurements at a state; zero for a robot at the beacon."""
         dx, dy = (self.xy - state[:2]).T
         rho = np.hypot(dx, dy)
         known = rho > self.touch
@@ -124,31 +124,31 @@ class Problem:
 
     @property
     def sigmas(self) -> Floats:
-        """(R,) deviations of the measurements in the order of the residuals."""
+        """(R,) standard deviations of the measurements in the order of the residuals."""
         parts = [] if self.ranges is None else [self.sigma_range]
         return np.concatenate(parts if self.bearings is None else [*parts, self.sigma_bearing])
 
     @property
     def scales(self) -> Floats:
-        """(R,) what turns residuals into those whose squares are added: sqrt(weight) / sigma."""
+        """(R,) factors sqrt(weight) / sigma of the residuals in the cost."""
         both = self.ranges is not None and self.bearings is not None
         return np.sqrt(np.tile(self.weights, 2) if both else self.weights) / self.sigmas
 
     def rho(self, scaled: Floats) -> tuple[Floats, Floats]:
-        """The loss of scaled residuals and the weight that it leaves them."""
+        """Return the losses of scaled residuals, and the weights that a robust loss leaves them."""
         value, slope, _ = LOSSES[self.loss]((scaled / self.loss_scale) ** 2)
         return value * self.loss_scale**2, slope
 
     def costs(self, states: Floats) -> Floats:
-        """(S,) sums of the losses."""
+        """Return (S,) sums of the losses at (S, d) states."""
         return self.rho(self.residuals(states) * self.scales)[0].sum(axis=1)
 
     def information(self, state: Floats) -> tuple[Floats, float]:
-        """Covariance of a solution and the condition number of its Jacobian.
+        """Return the covariance of a solution and the condition number of its Jacobian.
 
-        The estimate moves by A^-1 J^T V e for noise e in sigmas, with the weights V and A = J^T V J; so its
-        covariance is A^-1 J^T V^2 J A^-1, which for V = 1 is the inverse of the information matrix. A robust
-        loss's weights count as given.
+        Noise e in sigmas moves the estimate by A^-1 J^T V e, with the weights V and A = J^T V J. Its covariance is
+        therefore A^-1 J^T V^2 J A^-1, for V = 1 the inverse of the information matrix. The weights of a robust loss
+        count as constants.
         """
         scaled = self.residuals(state[None])[0] * self.scales
         weight = (self.scales * self.sigmas) ** 2 * self.rho(scaled)[1]
@@ -167,27 +167,27 @@ class Problem:
         return gain @ gain.T, condition
 
     def fix(self, states: Sequence[Floats] | Floats, status: str, *, flat: bool = False) -> PositionFix:
-        """The result for states in the order given.
+        """Make the result for solutions.
 
         Args:
-            states: (S, d) solutions.
-            status: Of the best; "unique" and the like become "singular" where it is.
-            flat: Whether the information is known to be singular, whatever rounding makes of it.
+            states: (S, d) solutions, the best first.
+            status: Status of the best; "unique" and the like become "singular" if its information is.
+            flat: Whether the information is known to be singular, despite rounding.
         """
-        found = np.asarray(states, np.float64).reshape(-1, self.dimension)
+        solutions = np.asarray(states, np.float64).reshape(-1, self.dimension)
         assert status in STATUSES
-        pairs = [self.information(state) for state in found]
+        pairs = [self.information(state) for state in solutions]
         if flat:
             pairs = [(np.full_like(covariance, np.nan), math.inf) for covariance, _ in pairs]
         singular = not pairs or not pairs[0][1] < SINGULAR
         if singular and status in ("unique", "two", "mirror", "ambiguous"):
             status = "singular"
-        residuals = self.residuals(found)
+        residuals = self.residuals(solutions)
         kinds = residuals.shape[1] // len(self.xy)
-        # Beacons that are left out have residuals of NaN.
-        blocks = np.full((len(found), kinds, len(self.keep)), np.nan)
-        blocks[:, :, self.keep] = residuals.reshape(len(found), kinds, len(self.xy))
-        world = found.copy()
+        # Beacons of weight 0 have residuals of NaN.
+        blocks = np.full((len(solutions), kinds, len(self.used)), np.nan)
+        blocks[:, :, self.used] = residuals.reshape(len(solutions), kinds, len(self.xy))
+        world = solutions.copy()
         world[:, :2] += self.origin
         if self.dimension == 3:
             world[:, 2] = wrap(world[:, 2])
@@ -195,7 +195,7 @@ class Problem:
             world,
             np.array([p[0] for p in pairs]).reshape(-1, self.dimension, self.dimension),
             blocks[:, 0] if kinds == 1 else blocks.swapaxes(1, 2),
-            self.costs(found),
+            self.costs(solutions),
             np.array([p[1] for p in pairs], np.float64),
             status,
             singular,
@@ -203,7 +203,11 @@ class Problem:
 
 
 def deviations(name: str, sigma: ArrayLike | None, count: int) -> Floats:
-    """(M,) deviations from one, M of them, or None, which stands for 1."""
+    """Return (M,) standard deviations from one number, M numbers, or None for 1.
+
+    Raises:
+        TypeError, ValueError: ``sigma`` breaks its rule.
+    """
     if sigma is None:
         return np.ones(count)
     values = checks.array(name, sigma)
@@ -229,53 +233,65 @@ def make_problem(
     least: int = 1,
     reason: str = "",
 ) -> Problem:
-    """A checked problem without the beacons of weight 0.
+    """Check the arguments of a public function and make a problem without the beacons of weight 0.
+
+    Args:
+        xy: (M, 2) positions of the beacons [m].
+        ranges: (M,) distances [m], or None.
+        bearings: (M,) bearings [rad], or None.
+        heading: The known heading [rad], or None.
+        sigma_range: Standard deviations of the ranges [m].
+        sigma_bearing: Standard deviations of the bearings [rad].
+        names: Names of these two arguments, for messages.
+        weights: (M,) factors of the squared residuals.
+        loss: Name of the loss.
+        loss_scale: Residual at which the loss bends.
+        least: Least number of beacons of positive weight.
+        reason: Reason of that number, for messages.
 
     Raises:
-        TypeError, ValueError: an argument breaks its rule.
+        TypeError, ValueError: An argument breaks its rule.
     """
-    places = checks.array("xy", xy, ("M", 2))
-    count = len(places)
-    values = {}
-    for name, given in (("ranges", ranges), ("bearings", bearings)):
-        values[name] = None if given is None else checks.array(name, given, (count,))
-    lengths = values["ranges"]
-    if lengths is not None and lengths.size and lengths.min() < 0:
-        index = int(np.argmin(lengths))
-        raise ValueError(f"ranges: must be >= 0, got {lengths[index]} at index {index}")
-    known = None if heading is None else checks.real("heading", heading)
+    positions = checks.array("xy", xy, ("M", 2))
+    count = len(positions)
+    distances = None if ranges is None else checks.array("ranges", ranges, (count,))
+    angles = None if bearings is None else checks.array("bearings", bearings, (count,))
+    if distances is not None and distances.size and distances.min() < 0:
+        index = int(np.argmin(distances))
+        raise ValueError(f"ranges: must be >= 0, got {distances[index]} at index {index}")
+    theta = None if heading is None else checks.real("heading", heading)
     sigma_r, sigma_b = deviations(names[0], sigma_range, count), deviations(names[1], sigma_bearing, count)
     factors = np.ones(count) if weights is None else checks.array("weights", weights, (count,))
     if factors.size and factors.min() < 0:
         raise ValueError(f"weights: must be >= 0, got {factors.min()} at index {int(np.argmin(factors))}")
-    kind = checks.choice("loss", loss, tuple(LOSSES))
-    bend = checks.real("loss_scale", loss_scale, above=0)
-    keep = factors > 0
-    if np.count_nonzero(keep) < least:
+    loss = checks.choice("loss", loss, tuple(LOSSES))
+    loss_scale = checks.real("loss_scale", loss_scale, above=0)
+    used = factors > 0
+    if np.count_nonzero(used) < least:
         noun = f"beacon{'s' * (least > 1)}"
         if count >= least:
-            raise ValueError(f"weights: must be > 0 for at least {least} {noun}{reason}, got {np.count_nonzero(keep)}")
+            raise ValueError(f"weights: must be > 0 for at least {least} {noun}{reason}, got {np.count_nonzero(used)}")
         raise ValueError(f"xy: must hold at least {least} {noun}{reason}, got {count}")
-    places, factors = places[keep], factors[keep]
-    # The middle of the box, rounded as little as the beacons are: differences of near numbers are exact.
-    origin = places.min(axis=0) / 2 + places.max(axis=0) / 2
+    positions, factors = positions[used], factors[used]
+    # The middle of the box is rounded as little as the beacons; differences of near numbers are exact.
+    origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
     return Problem(
-        places - origin,
+        positions - origin,
         origin,
-        None if lengths is None else lengths[keep],
-        None if values["bearings"] is None else values["bearings"][keep],
-        known,
-        sigma_r[keep],
-        sigma_b[keep],
+        None if distances is None else distances[used],
+        None if angles is None else angles[used],
+        theta,
+        sigma_r[used],
+        sigma_b[used],
         factors,
-        kind,
-        bend,
-        keep,
+        loss,
+        loss_scale,
+        used,
     )
 
 
 def subsets(count: int, size: int) -> NDArray[np.intp]:
-    """(N, size) index subsets of ``count`` beacons: all, or STARTS of them drawn with a fixed seed."""
+    """Return (N, size) index subsets of ``count`` beacons: all of them, or STARTS drawn with a fixed seed."""
     if math.comb(count, size) <= STARTS:
         return np.array(list(itertools.combinations(range(count), size)), np.intp).reshape(-1, size)
     rng = np.random.default_rng(0)

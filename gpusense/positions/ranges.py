@@ -1,4 +1,4 @@
-"""A position from distances to beacons."""
+"""Trilaterate: compute a position from distances to beacons."""
 
 from __future__ import annotations
 
@@ -20,35 +20,41 @@ def trilaterate(
     loss: str = "linear",
     loss_scale: float = 1.0,
 ) -> PositionFix:
-    """The position whose distances to beacons are those measured.
+    """Compute the position from distances to beacons.
 
-    Two beacons: both points where their circles cross, in closed form; where they do not, the point of least squares
-    between them. Three or more: the global minimum of ``sum of rho(weight (residual / sigma)^2)``, by Gauss-Newton
-    steps from the linearised solution and from where pairs of circles cross. Beacons in line leave the mirror image
-    too, which is returned as the second solution. With ``sigma``, all minima that the noise cannot tell from the
-    best are returned.
+    With two beacons the solutions are both intersections of their circles, in closed form; if the circles do not
+    intersect, the solution is the point of least squares between them. With three or more beacons the solution is the
+    global minimum of ``sum of rho(weight (residual / sigma)^2)``, reached by Gauss-Newton steps from the linearised
+    solution and from the intersections of pairs of circles. For beacons in line the mirror image is the second
+    solution. With ``sigma``, all minima are returned whose costs the noise cannot distinguish from the best.
 
-    One measurement set a call; coordinates may be as large as UTM's.
+    A call takes one set of measurements. Coordinates may be as large as those of UTM.
 
     Args:
-        xy: (M, 2) the beacons' x and y [m], M >= 2.
+        xy: (M, 2) positions of the beacons [m], M >= 2.
         ranges: (M,) measured distances [m], >= 0.
-        sigma: Standard deviation of the ranges [m], one or (M,), > 0. None: not known; then the covariance is that of
-            sigma = 1 m, to be multiplied with the variance.
+        sigma: Standard deviation of the ranges [m], one or (M,), > 0. None if unknown: the covariance is then that of
+            sigma = 1 m, to be multiplied by the variance.
         weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
         loss: "linear" (least squares), "soft_l1", "huber", "cauchy" or "arctan", as in
-            ``scipy.optimize.least_squares``. With two beacons nothing can be an outlier: it is not used.
-        loss_scale: Residual at which a robust loss bends [sigma, or m where sigma is not given], > 0.
+            ``scipy.optimize.least_squares``. It is ignored for two beacons, which cannot show an outlier.
+        loss_scale: Residual at which a robust loss bends [sigma, or m without sigma], > 0.
 
     Returns:
         Positions (S, 2). Statuses: "unique", "two", "mirror", "ambiguous", "tangent", "disjoint", "contained",
         "in line", "coincident" (no solution), "at a beacon", "singular".
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a shape or value breaks its rule, or fewer than two beacons are left: a circle of solutions.
+        TypeError: An argument has the wrong type.
+        ValueError: A shape or value breaks its rule, or fewer than two beacons are left: a circle of solutions.
 
     Source: lectures, "Distances Only, No Uncertainty"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> fix = gs.trilaterate([(0, 0), (4, 0), (0, 3)], [2.5, 2.5, 2.5], sigma=0.1)
+        >>> fix
+        PositionFix('unique', 1 solution, best=(2, 1.5), deviation=0.128 m)
     """
     problem = make_problem(
         xy, ranges=ranges, sigma_range=sigma, weights=weights, loss=loss, loss_scale=loss_scale, least=2,
@@ -62,30 +68,31 @@ def trilaterate(
     line = in_line(problem.xy, problem.noise)
     starts = np.vstack([_linearised(problem), _pairs(problem, subsets(len(problem.xy), 2))[0]])
     if line is not None:
-        return _beside_line(problem, starts, line, told=sigma is not None)
-    states, status = pick(*minima(problem, starts), told=sigma is not None)
+        return _beside_line(problem, starts, line, known_sigma=sigma is not None)
+    states, status = pick(*minima(problem, starts), known_sigma=sigma is not None)
     if problem.at_beacon(states[0]):
         status = "at a beacon"
     return problem.fix(states, status)
 
 
 def _pairs(problem: Problem, pairs: NDArray[np.intp]) -> tuple[Floats, NDArray[np.str_]]:
-    """(2 N, 2) where the circles of (N, 2) pairs of beacons cross or come nearest, and (N,) how they lie."""
+    """Intersect the circles of (N, 2) pairs of beacons: (2 N, 2) points and (N,) statuses; see ``two_circles``."""
     assert problem.ranges is not None
     i, j = pairs.T
     variance = problem.sigma_range**2 / problem.weights
-    found, status = two_circles(
+    points, status = two_circles(
         problem.points[i], problem.points[j], problem.ranges[i], problem.ranges[j],
         variance[i] / (variance[i] + variance[j]), problem.noise,
     )  # fmt: skip
-    flat = found.ravel()
+    flat = points.ravel()
     return np.column_stack([flat.real, flat.imag]), status
 
 
 def _linearised(problem: Problem) -> Floats:
-    """(1, 2) solution of the differences of the circles' equations, which are linear in the position.
+    """Solve the differences of the circles' equations, which are linear in the position, for a (1, 2) point.
 
-    |p|^2 - 2 m p + |m|^2 = d^2, less the weighted mean of the same; beacons in line leave their own line.
+    Each equation is |p|^2 - 2 m p + |m|^2 = d^2, less the weighted mean of all. For beacons in line the point lies on
+    their line.
     """
     assert problem.ranges is not None
     share = problem.scales**2 / np.sum(problem.scales**2)
@@ -95,24 +102,24 @@ def _linearised(problem: Problem) -> Floats:
     return np.linalg.lstsq(left, (right - share @ right) * root, rcond=1e-12)[0][None]
 
 
-def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], *, told: bool) -> PositionFix:
-    """Beacons in line: a solution and its mirror image, or one on the line itself."""
+def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], *, known_sigma: bool) -> PositionFix:
+    """Solve for beacons in line: return a solution and its mirror image, or one on the line itself."""
     point, direction = line
     normal = np.array([-direction[1], direction[0]])
     assert problem.ranges is not None
     along = ((problem.xy - point) @ direction)[:, None] + problem.ranges[:, None] * (-1, 1)
     on, on_cost = minima(problem, point + along.reshape(-1, 1) * direction, line)
-    # Mirror images have the same cost, so that the left side is enough.
+    # Mirror images have equal costs, so that the left side suffices.
     left = starts + (np.abs(aside := (starts - point) @ normal) - aside)[:, None] * normal
     states, costs = minima(problem, left)
     aside = (states - point) @ normal
-    # Nearer to the line than the root of the rounding nothing tells a solution from its image.
+    # Nearer to the line than the root of the rounding error, a solution and its image are the same.
     off = np.abs(aside) > 1e-7 * problem.spread
     states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)
     if not len(states) or on_cost[0] <= costs[0] + rounding:
         status = "at a beacon" if problem.at_beacon(on[0]) else "in line"
         return problem.fix(on[:1], status, flat=True)
-    chosen, _ = pick(states, costs, told=told)
-    both = np.stack([chosen, reflect(chosen, line)], axis=1).reshape(-1, 2)
-    return problem.fix(both, "mirror" if len(chosen) == 1 else "ambiguous")
+    best, _ = pick(states, costs, known_sigma=known_sigma)
+    both = np.stack([best, reflect(best, line)], axis=1).reshape(-1, 2)
+    return problem.fix(both, "mirror" if len(best) == 1 else "ambiguous")

@@ -1,4 +1,4 @@
-"""The lowest minima of a problem's cost: least squares from several starts, so that no start need be good."""
+"""Find the lowest minima of a problem's cost by least squares from several starts, good or bad."""
 
 from __future__ import annotations
 
@@ -9,37 +9,37 @@ import numpy as np
 from gpusense.positions.closed_forms import wrap
 from gpusense.positions.problem import LOSSES, Floats, Problem
 
-# Starts that are followed down to their minima, and how far apart they lie, in the scene's spread (or radians).
+# Most starts followed to their minima, and the least distance between them, in the scene's spread (or radians).
 FOLLOWED = 8
 APART = 0.05
-# Minima nearer to each other are one.
+# Minima nearer to each other than this count as one.
 SAME = 1e-6
-# How little a step must change while starts are followed; the lowest minima are then found to rounding.
+# Relative changes at which the search stops: coarse from the starts, then down to rounding from the lowest minima.
 COARSE, FINE = 1e-4, 1e-15
-# Minima whose costs differ by less cannot be told apart: 3 sigma of a likelihood ratio.
+# Minima whose costs differ by less are ambiguous: 3 sigma of a likelihood ratio.
 AMBIGUOUS = 9.0
 
 
 def distance(problem: Problem, states: Floats, state: Floats) -> Floats:
-    """(S,) how far states lie apart, in the scene's spread and in radians, whichever is more."""
+    """Return (S,) distances of ``states`` from ``state``: the larger of position (in spreads) and heading [rad]."""
     away = np.hypot(*(states[:, :2] - state[:2]).T) / (problem.spread or 1.0)
     return away if problem.dimension == 2 else np.maximum(away, np.abs(wrap(states[:, 2] - state[2])))
 
 
 def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None, step: float) -> Floats:
-    """The minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a start.
+    """Return the minimum that least squares (trust-region Gauss-Newton of SciPy) reaches from a start.
 
     Args:
-        problem: What is measured.
-        start: (d,) a state.
-        line: A point and a direction (2,) that the position must not leave; None lets it go anywhere.
-        step: Relative change of the cost and of the state at which it stops.
+        problem: The measurements.
+        start: (d,) state.
+        line: Point and direction (2,) of the line that the position must stay on; None for no constraint.
+        step: Relative change of the cost and of the state at which the search stops.
     """
     from scipy.optimize import least_squares
 
     unit = np.ones(problem.dimension)
     unit[:2] = problem.spread or 1.0
-    # Columns are the directions in which the state may move, in units that make them alike.
+    # Columns are the directions in which the state may move, in comparable units.
     base, moves = np.zeros(problem.dimension), np.diag(unit)
     if line is not None:
         base[:2] = line[0]
@@ -51,48 +51,49 @@ def descend(problem: Problem, start: Floats, line: tuple[Floats, Floats] | None,
         return problem.residuals((base + moves @ x)[None])[0] * scales
 
     def jacobian(x: Floats) -> Floats:
-        # Residuals are measured less expected.
+        # A residual is the measured less the expected value.
         return -(problem.jacobian(base + moves @ x) * scales[:, None]) @ moves
 
     def rho(z: Floats) -> Floats:
         return np.stack(LOSSES[problem.loss](z))
 
     x0 = np.linalg.lstsq(moves, start - base, rcond=None)[0]
-    found = least_squares(
+    result = least_squares(
         residuals, x0, jacobian, loss="linear" if problem.loss == "linear" else rho, f_scale=problem.loss_scale,
         ftol=step, xtol=step, gtol=FINE, x_scale="jac", max_nfev=200,
     )  # fmt: skip
-    return base + moves @ found.x
+    return base + moves @ result.x
 
 
 def minima(
     problem: Problem, starts: Sequence[Floats] | Floats, line: tuple[Floats, Floats] | None = None
 ) -> tuple[Floats, Floats]:
-    """Different minima, the lowest first, and their costs.
+    """Find different minima.
 
     Args:
-        problem: What is measured.
-        starts: (N, d) states; those that are not finite are left out. The best of them are followed, each at least
-            APART from those before it.
-        line: As for :func:`descend`.
+        problem: The measurements.
+        starts: (N, d) states; those that are not finite are left out. The best are followed, each at least APART from
+            those before it.
+        line: See :func:`descend`.
 
     Returns:
-        (S, d) and (S,), of minima that come near the lowest; S is 0 where no start is finite.
+        (S, d) minima whose costs are near the lowest, the lowest first, and (S,) their costs; S is 0 if no start is
+        finite.
     """
-    left = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
-    left = left[np.isfinite(left).all(axis=1)]
-    left = left[np.argsort(problem.costs(left), kind="stable")]
-    found: list[Floats] = []
+    pending = np.asarray(starts, np.float64).reshape(-1, problem.dimension)
+    pending = pending[np.isfinite(pending).all(axis=1)]
+    pending = pending[np.argsort(problem.costs(pending), kind="stable")]
+    coarse: list[Floats] = []
     for _ in range(FOLLOWED):
-        if not len(left):
+        if not len(pending):
             break
-        start, left = left[0], left[1:]
+        start, pending = pending[0], pending[1:]
         state = descend(problem, start, line, COARSE)
         for near in (start, state):
-            left = left[distance(problem, left, near) > APART]
-        if not found or distance(problem, np.array(found), state).min() > APART / 10:
-            found.append(state)
-    states = np.array(found).reshape(-1, problem.dimension)
+            pending = pending[distance(problem, pending, near) > APART]
+        if not coarse or distance(problem, np.array(coarse), state).min() > APART / 10:
+            coarse.append(state)
+    states = np.array(coarse).reshape(-1, problem.dimension)
     costs = problem.costs(states)
     near = states[costs <= 1.1 * costs.min(initial=np.inf) + 2 * AMBIGUOUS]
     fine = [descend(problem, state, line, FINE) for state in near]
@@ -100,27 +101,31 @@ def minima(
 
 
 def distinct(problem: Problem, states: Floats) -> tuple[Floats, Floats]:
-    """The different ones of (S, d) states, the lowest first, and their costs."""
+    """Return the different states of (S, d) states, the lowest cost first, and their costs."""
     costs = problem.costs(states)
-    kept: list[int] = []
+    unique: list[int] = []
     for k in np.argsort(costs, kind="stable"):
-        if not kept or distance(problem, states[kept], states[k]).min() > SAME:
-            kept.append(int(k))
-    return states[kept], costs[kept]
+        if not unique or distance(problem, states[unique], states[k]).min() > SAME:
+            unique.append(int(k))
+    return states[unique], costs[unique]
 
 
-def pick(states: Floats, costs: Floats, *, told: bool) -> tuple[Floats, str]:
-    """The solutions out of minima, and the status: one, or all that the known noise cannot tell apart."""
-    if not told or len(states) < 2:
+def pick(states: Floats, costs: Floats, *, known_sigma: bool) -> tuple[Floats, str]:
+    """Pick the solutions among minima, the lowest first, and the status.
+
+    Without known noise the lowest minimum is the solution. With it, all minima that the noise cannot distinguish from
+    the lowest are solutions.
+    """
+    if not known_sigma or len(states) < 2:
         return states[:1], "unique"
     near = costs - costs[0] < AMBIGUOUS
     return states[near], "ambiguous" if near.sum() > 1 else "unique"
 
 
 def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
-    """The line on which points stand to rounding: a point and a unit vector, from the first to the farthest of them.
+    """Return the line through points: a point and a unit vector, from the first point to the farthest.
 
-    None where they do not stand in line. Points at one place have no line either: ask that first.
+    None if the points are not in line, to rounding. The points must not all be at one place.
     """
     offset = points - points[0]
     away = np.hypot(offset[:, 0], offset[:, 1])
@@ -132,7 +137,7 @@ def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
 
 
 def reflect(states: Floats, line: tuple[Floats, Floats]) -> Floats:
-    """Mirror images of (S, 2) positions on the other side of a line."""
+    """Return the mirror images of (S, 2) positions in a line."""
     point, direction = line
     offset = states - point
     return point + 2 * (offset @ direction)[:, None] * direction - offset

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 from types import ModuleType
 
 import numpy as np
 
-from gpusense.reference import bresenham, cddt, dda, lookup, march, raycast
+from gpusense.interface.casters import caster_file
 from gpusense.reference.ray import expected_range
 
 BLOCK = 1 << 15
-CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
 
 
 def caster_of(flags: frozenset[str]) -> ModuleType:
     """Return the module of the caster of a set of flags."""
-    return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
+    return importlib.import_module(f"gpusense.reference.{caster_file(flags)}")
 
 
 def cast_ranges(

@@ -1,1 +1,1 @@
-"""Tables of a map on a device: distances, rectangles, directional tables, look-ups, normals."""
+"""Tables made of a map on a device: distances, rectangles, directional tables, look-ups, field and normals."""

@@ -1,4 +1,4 @@
-"""Ways to find expected ranges: what each makes of a map, what it gives up, and its knobs.
+"""The casters: methods of computing expected ranges, with their error, memory and knobs.
 
 ``RayCaster(method=...)`` and ``BeamModel(caster=...)`` take one of these, or its name for its default knobs.
 """
@@ -6,92 +6,32 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.tables.caster_base import Caster, CasterInput, Table
+from gpusense.tables.cells import check_size
 from gpusense.tables.directional import directional_table
-from gpusense.tables.distances import check_size, empty_rectangles, sectors_of, squared_distances
+from gpusense.tables.distances import NO_OBSTACLE, squared_distances
 from gpusense.tables.lookup_files import read_lookup
-from gpusense.world.windows import Region
+from gpusense.tables.rectangles import empty_rectangles, sectors_of
+from gpusense.world import windows
 
-_BYTE, _SHORT, _SINGLE = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
-_NO_OBSTACLE = np.iinfo(np.int32).max
-# Rays of one launch that fills a look-up table, so that a launch ends in about a second.
+__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March", "choose"]
+
+_BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
+# Rays per launch that fills a look-up table, so that a launch takes about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
 
 
 @dataclass(frozen=True)
-class Window:
-    """The part of a map that a table is made of.
-
-    Attributes:
-        obstacles: (rows, cols) bool.
-        limit: Longest range in cells.
-        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
-    """
-
-    obstacles: np.ndarray
-    limit: float
-    outside: str
-
-
-@dataclass(frozen=True)
-class Table:
-    """What a caster made of a map: a buffer on the device, its size in bytes, and the flags of kernels that read it."""
-
-    buffer: Buffer
-    size: int
-    flags: frozenset[str] = frozenset()
-
-
-class Caster(ABC):
-    """A way to find expected ranges.
-
-    Attributes:
-        name: What names it with its default knobs.
-        exact: Whether its ranges are the exact ones.
-        error: ``"exact"``, or the bound of its error.
-        memory: Bytes on the device.
-        precomputation: What is made of the map beforehand.
-        knobs: What its error and its time depend on.
-        flag: The kernels' flag; empty for the exact caster.
-        whole: Whether the table is made of the whole map at once.
-        ring: Whether a ring of cells stands for what is outside the grid.
-    """
-
-    name: ClassVar[str]
-    exact: ClassVar[bool] = False
-    error: ClassVar[str]
-    memory: ClassVar[str]
-    precomputation: ClassVar[str]
-    knobs: ClassVar[str] = "none"
-    flag: ClassVar[str] = ""
-    whole: ClassVar[bool] = False
-    ring: ClassVar[bool] = True
-
-    @abstractmethod
-    def prepare(self, backend: Backend, window: Window) -> Table:
-        """Make the table of a window on a device."""
-
-    def mend(self, backend: Backend, window: Window, table: Buffer, changed: Region) -> bool:
-        """Make a table follow obstacles that changed in a part of its window; False where it is to be made anew."""
-        return False
-
-    def scalars(self) -> tuple[int, float, float]:
-        """The kernels' arguments bins, slack [cells] and tolerance [cells]."""
-        return 0, 0.0, 0.0
-
-
-@dataclass(frozen=True)
 class Exact(Caster):
-    """A walk that crosses a whole empty rectangle at a time."""
+    """Traversal that crosses a whole empty rectangle per step."""
 
     name = "exact"
     exact = True
@@ -99,62 +39,60 @@ class Exact(Caster):
     memory = "16 bytes per cell of the reachable map, on GPUs 32, less where that is over 4 GiB"
     precomputation = "empty rectangles, one pass over the map per quadrant"
 
-    def prepare(self, backend: Backend, window: Window) -> Table:
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        rows, cols = window.obstacles.shape
+        rows, cols = inputs.obstacles.shape
         sectors = sectors_of(backend, rows, cols)
         flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
-        return Table(empty_rectangles(backend, window.obstacles, sectors), 8 * sectors * (rows + 2) * (cols + 2), flags)
+        return Table(empty_rectangles(backend, inputs.obstacles, sectors), 8 * sectors * (rows + 2) * (cols + 2), flags)
 
-    def mend(self, backend: Backend, window: Window, table: Buffer, changed: Region) -> bool:
-        """See Caster.mend."""
-        empty_rectangles(backend, window.obstacles, sectors_of(backend, *window.obstacles.shape), table, changed)
+    def refresh(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: windows.Window) -> bool:
+        """See Caster.refresh."""
+        empty_rectangles(backend, inputs.obstacles, sectors_of(backend, *inputs.obstacles.shape), table, changed)
         return True
 
 
 @dataclass(frozen=True)
 class Dda(Caster):
-    """A walk from cell to cell (Amanatides and Woo 1987)."""
+    """Traversal from cell to cell (Amanatides and Woo 1987)."""
 
     name = "dda"
     exact = True
     error = "exact: the same bits as 'exact'"
     memory = "1 byte per cell of the reachable map"
     precomputation = "none"
-    flag = "DDA"
 
-    def prepare(self, backend: Backend, window: Window) -> Table:
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        return _padded_cells(backend, window)
+        return _padded_cells(backend, inputs)
 
 
 @dataclass(frozen=True)
 class Bresenham(Caster):
-    """Bresenham's line from cell to cell, as nav2_amcl and Beluga cast."""
+    """Bresenham's line from cell to cell, as in nav2_amcl and Beluga."""
 
     name = "bresenham"
     error = "about a cell, from centre to centre; lines slip between walls that touch at a corner"
     memory = "1 byte per cell of the reachable map"
     precomputation = "none"
-    flag = "BRESENHAM"
 
-    def prepare(self, backend: Backend, window: Window) -> Table:
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        return _padded_cells(backend, window)
+        return _padded_cells(backend, inputs)
 
 
 @dataclass(frozen=True)
 class March(Caster):
-    """Marching through the distance field.
+    """Ray marching through the distance field.
 
     Args:
-        tolerance: Least step [cells], 0.001 to 10: smaller is more exact and slower.
-        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle;
-            ``"centre"`` takes the distance between cell centres as it is, as range_libc and f1tenth_gym do: faster, and
-            corners are missed.
+        tolerance: Least step [cells], 0.001 to 10: a smaller one is more exact and slower.
+        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle.
+            ``"centre"`` steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster and
+            misses corners.
 
     Raises:
-        TypeError, ValueError: a knob of the wrong kind, or out of range.
+        TypeError, ValueError: A knob has the wrong type, or is out of range.
     """
 
     tolerance: float = 0.1
@@ -165,21 +103,20 @@ class March(Caster):
     memory = "4 bytes per cell of the reachable map"
     precomputation = "exact distance transform"
     knobs = "tolerance [cells], rule"
-    flag = "MARCH"
     ring = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tolerance", checks.real("tolerance", self.tolerance, low=1e-3, high=10))
         checks.choice("rule", self.rule, ("safe", "centre"))
 
-    def prepare(self, backend: Backend, window: Window) -> Table:
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        # Walls outside are obstacles, too.
-        ring = int(window.outside == "occupied")
-        obstacles = np.pad(window.obstacles, ring, constant_values=True)
+        # Walls outside the grid are obstacles, too.
+        ring = int(inputs.outside == "occupied")
+        obstacles = np.pad(inputs.obstacles, ring, constant_values=True)
         squares = backend.download(squared_distances(backend, obstacles), np.empty(obstacles.shape, np.int32))
         squares = squares[ring:-ring, ring:-ring] if ring else squares
-        distances = np.sqrt(np.where(squares == _NO_OBSTACLE, np.inf, squares)).astype(_SINGLE)
+        distances = np.sqrt(np.where(squares == NO_OBSTACLE, np.inf, squares)).astype(_SINGLE)
         return Table(backend.upload(distances), distances.nbytes)
 
     def scalars(self) -> tuple[int, float, float]:
@@ -192,12 +129,12 @@ class Cddt(Caster):
     """Compressed directional distance transform (Walsh and Karaman 2018).
 
     Args:
-        bins: Angle bins of a full turn, 4 to 4096: more are more exact, and take memory.
-        pruned: Leave out obstacles that begin within another one of their line: less memory, and origins that lie free
-            beside that other one may see through walls of a cell's thickness.
+        bins: Angle bins of a full turn, 4 to 4096: more bins are more exact and take more memory.
+        pruned: Whether to leave out obstacles that begin inside another obstacle of their line. The table is smaller;
+            rays from free origins beside that other obstacle may then pass through walls of one cell's thickness.
 
     Raises:
-        TypeError, ValueError: a knob of the wrong kind, or out of range.
+        TypeError, ValueError: A knob has the wrong type, or is out of range.
     """
 
     bins: int = 216
@@ -208,7 +145,6 @@ class Cddt(Caster):
     memory = "4 bytes per bin, line and obstacle"
     precomputation = "for each bin, obstacles at free cells are projected and sorted (on the host)"
     knobs = "bins, pruned"
-    flag = "CDDT"
     whole = True
     ring = False
 
@@ -217,10 +153,10 @@ class Cddt(Caster):
         if not isinstance(self.pruned, bool):
             raise TypeError(f"pruned: must be True or False, got {checks.show(self.pruned)}")
 
-    def prepare(self, backend: Backend, window: Window) -> Table:
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        outside = window.outside == "occupied"
-        table = directional_table(window.obstacles, self.bins, pruned=self.pruned, outside=outside)
+        outside = inputs.outside == "occupied"
+        table = directional_table(inputs.obstacles, self.bins, pruned=self.pruned, outside=outside)
         return Table(backend.upload(table), table.nbytes)
 
     def scalars(self) -> tuple[int, float, float]:
@@ -233,11 +169,11 @@ class Lookup(Caster):
     """Look-up table over cells and angle bins.
 
     Args:
-        bins: Angle bins of a full turn, 4 to 4096: more are more exact, and take memory.
-        file: A table that ``RayCaster.save_table`` wrote for this very map, range and number of bins; None makes it.
+        bins: Angle bins of a full turn, 4 to 4096: more bins are more exact and take more memory.
+        file: Table written by ``RayCaster.save_table`` for the same map, range and number of bins; None makes it.
 
     Raises:
-        TypeError, ValueError: a knob of the wrong kind, or out of range.
+        TypeError, ValueError: A knob has the wrong type, or is out of range.
     """
 
     bins: int = 108
@@ -248,7 +184,6 @@ class Lookup(Caster):
     memory = "2 bytes per bin and cell of the whole map"
     precomputation = "a ray per bin and cell by the exact caster"
     knobs = "bins"
-    flag = "LOOKUP"
     whole = True
     ring = False
 
@@ -257,46 +192,50 @@ class Lookup(Caster):
         if self.file is not None:
             object.__setattr__(self, "file", checks.path("file", self.file))
 
-    def prepare(self, backend: Backend, window: Window) -> Table:
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        rows, cols = window.obstacles.shape
-        count = rows * cols * self.bins
+        size = 2 * inputs.obstacles.size * self.bins
         if self.file is not None:
-            entries = read_lookup(Path(self.file), window.obstacles, window.limit, window.outside, self.bins)
-            return Table(backend.upload(entries), 2 * count)
-        table = backend.empty(count, _SHORT)
-        rectangles = empty_rectangles(backend, window.obstacles, 1)
+            entries = read_lookup(Path(self.file), inputs.obstacles, inputs.limit, inputs.outside, self.bins)
+            return Table(backend.upload(entries), size)
+        return Table(self._fill(backend, inputs), size)
+
+    def _fill(self, backend: Backend, inputs: CasterInput) -> Buffer:
+        """Cast a ray per bin and cell, a strip of rows per launch."""
+        rows, cols = inputs.obstacles.shape
+        table = backend.empty(rows * cols * self.bins, _SHORT)
+        rectangles = empty_rectangles(backend, inputs.obstacles, 1)
         turns = 2 * math.pi * np.arange(self.bins) / self.bins
         ray = backend.upload(np.stack([np.cos(turns), np.sin(turns)], axis=1).astype(_SINGLE))
-        fill = backend.compile("fill_lookup", frozenset({"OUTSIDE_OCCUPIED"} if window.outside == "occupied" else ()))
+        fill = backend.compile("fill_lookup", frozenset({"OUTSIDE_OCCUPIED"} if inputs.outside == "occupied" else ()))
         tile = max(_TILE[backend.info.kind] // (cols * self.bins), 1)
         for first in range(0, rows, tile):
-            these = min(tile, rows - first)
-            fill((self.bins, these * cols), rectangles, ray, table, rows, cols, self.bins, first, these, window.limit)
+            strip = min(tile, rows - first)
+            fill((self.bins, strip * cols), rectangles, ray, table, rows, cols, self.bins, first, strip, inputs.limit)
             backend.synchronize()
-        return Table(table, 2 * count)
+        return table
 
     def scalars(self) -> tuple[int, float, float]:
         """See Caster.scalars."""
         return self.bins, 0.0, 0.0
 
 
-def _padded_cells(backend: Backend, window: Window) -> Table:
-    """1 for occupied cells, in a ring of twos."""
-    check_size(*window.obstacles.shape)
-    cells = np.pad(window.obstacles.astype(_BYTE), 1, constant_values=2)
+def _padded_cells(backend: Backend, inputs: CasterInput) -> Table:
+    """Upload byte 1 for each occupied cell, inside a ring of twos."""
+    check_size(*inputs.obstacles.shape)
+    cells = np.pad(inputs.obstacles.astype(_BYTE), 1, constant_values=2)
     return Table(backend.upload(cells), cells.nbytes)
 
 
-CASTERS: dict[str, type[Caster]] = {kind.name: kind for kind in (Exact, Dda, March, Bresenham, Cddt, Lookup)}
+CASTERS: dict[str, type[Caster]] = {caster.name: caster for caster in (Exact, Dda, March, Bresenham, Cddt, Lookup)}
 
 
 def choose(argument: str, value: object) -> Caster:
-    """A caster by its name, or itself.
+    """Return a caster by its name; a caster is returned as it is.
 
     Raises:
-        TypeError: neither a name nor a caster.
-        ValueError: a name of none.
+        TypeError: The value is neither a name nor a caster.
+        ValueError: The value names no caster.
     """
     if isinstance(value, Caster):
         return value

@@ -1,4 +1,4 @@
-"""Look-up tables of expected ranges on disk: a line of JSON that says what they were made of, then the numbers."""
+"""Read and write look-up tables of expected ranges: a line of JSON that describes their inputs, then the numbers."""
 
 from __future__ import annotations
 
@@ -11,12 +11,22 @@ import numpy as np
 from gpusense._util.checks import show
 from gpusense._util.files import write_whole
 
-_LONGEST_HEAD = 4096
-_KIND = np.dtype("<u2")
+_LONGEST_HEADER = 4096
+_DTYPE = np.dtype("<u2")
 
 
 def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> dict[str, object]:
-    """What a table depends on."""
+    """Describe the inputs of a table.
+
+    Args:
+        obstacles: (rows, cols) bool.
+        limit: Longest range [cells].
+        outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
+        bins: Angle bins of a full turn.
+
+    Returns:
+        The header of its file.
+    """
     cells = hashlib.sha256(np.packbits(obstacles).tobytes()).hexdigest()
     rows, cols = obstacles.shape
     return {
@@ -31,42 +41,42 @@ def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> di
 
 
 def write_lookup(path: Path, entries: np.ndarray, description: dict[str, object]) -> None:
-    """Write a table, whole or not at all.
+    """Write a table atomically.
 
     Raises:
-        OSError, ValueError: the file cannot be written.
+        OSError, ValueError: The file cannot be written.
     """
 
     def write(stream: object) -> None:
         stream.write(json.dumps(description).encode() + b"\n")  # type: ignore[attr-defined]
-        stream.write(entries.astype(_KIND, copy=False).tobytes())  # type: ignore[attr-defined]
+        stream.write(entries.astype(_DTYPE, copy=False).tobytes())  # type: ignore[attr-defined]
 
     write_whole(path, write)
 
 
 def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, bins: int) -> np.ndarray:
-    """Read a table, if it is the one of this map, range and number of bins.
+    """Read a table after checking that it belongs to these inputs; see :func:`describe`.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: it is no table, is cut short, or was made of something else.
+        OSError: The file cannot be read.
+        ValueError: The file is no table, is truncated, or belongs to other inputs.
     """
-    wanted = describe(obstacles, limit, outside, bins)
+    required = describe(obstacles, limit, outside, bins)
     count = obstacles.size * bins
     with path.open("rb") as stream:
-        head = stream.readline(_LONGEST_HEAD)
+        line = stream.readline(_LONGEST_HEADER)
         try:
-            found = json.loads(head)
+            header = json.loads(line)
         except (ValueError, RecursionError):
-            found = None
-        if not isinstance(found, dict) or found.get("format") != wanted["format"]:
+            header = None
+        if not isinstance(header, dict) or header.get("format") != required["format"]:
             raise ValueError(f"file: must be a look-up table that gpusense wrote, got {path}")
-        for key, value in wanted.items():
-            if found.get(key) != value:
+        for key, value in required.items():
+            if header.get(key) != value:
                 raise ValueError(
-                    f"file: must be a table of the same {key}, {value}, got {show(found.get(key))} in {path}"
+                    f"file: must be a table of the same {key}, {value}, got {show(header.get(key))} in {path}"
                 )
-        size = path.stat().st_size - len(head)
-        if size != count * _KIND.itemsize:
-            raise ValueError(f"file: must hold {count * _KIND.itemsize} bytes of ranges, got {size} in {path}")
-        return np.fromfile(stream, _KIND, count).astype(np.uint16, copy=False)
+        size = path.stat().st_size - len(line)
+        if size != count * _DTYPE.itemsize:
+            raise ValueError(f"file: must hold {count * _DTYPE.itemsize} bytes of ranges, got {size} in {path}")
+        return np.fromfile(stream, _DTYPE, count).astype(np.uint16, copy=False)

@@ -1,1 +1,1 @@
-"""Plain data about the world: maps, scanners, parameters, frames; no device."""
+"""Plain data about the world and its sensors: grid, map files, scanner, parameters, landmark maps, frames, windows."""

@@ -1,7 +1,7 @@
-"""The weights that nav2_amcl and Beluga give a scan, for those who come from there: no likelihoods, and said so.
+"""Parameters and reading rules of nav2_amcl and Beluga, for ``compat="amcl"`` and ``compat="beluga"``.
 
 ``BeamModel(..., compat="amcl")`` and ``LikelihoodFieldModel(..., compat="beluga")`` return the logarithm of the factor
-by which these programs multiply a particle's weight:
+by which these programs multiply a particle's weight. These factors are no likelihoods:
 
 ========  ======================  =====================================================================
 peer      model                   weight
@@ -12,16 +12,16 @@ beluga    beam                    ``sum p^3``, book table 6.1 with both normalis
 beluga    likelihood field        ``1 + sum p^3``, the normal density normalised for an unbounded range
 ========  ======================  =====================================================================
 
-Readings are theirs, too. amcl: at range_min or below (-inf too) counts as a max reading, NaN is left out; a max
-reading is scored by the beam model as ``z_hit exp(...) + z_max`` and left out by the likelihood field. Beluga: what is
-not in [range_min, range_max] is left out, +inf too; a reading of exactly range_max is ``z_hit p_hit + z_max`` to the
-beam model and a range to the likelihood field. Beams of the beam models go along Bresenham's lines; unknown cells stop
-them, and so does, for amcl, the map's edge. An end point outside the map counts as ``max_distance`` for amcl and as a
-density of ``1 / range_max`` for Beluga. What is not reproduced are errors of their map look-ups: distances are exact,
-and cells are not shifted by half of one.
+Readings are classed as the peer does. amcl: a reading of at most range_min (-inf too) counts as a max reading, and NaN
+is left out. Its beam model scores a max reading as ``z_hit exp(...) + z_max``; its likelihood field leaves it out.
+Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its beam model scores a reading of exactly
+range_max as ``z_hit p_hit + z_max``; to its likelihood field this reading is a range.
 
-Source: read in nav2_amcl (``sensors/laser``) and Beluga (``sensor/beam_model.hpp``,
-``likelihood_field_model_base.hpp``).
+Beams of the beam models follow Bresenham's lines. Unknown cells stop them and, for amcl, so does the map's edge. An end
+point outside the map counts as ``max_distance`` for amcl and as a density of ``1 / range_max`` for Beluga. Errors of
+the peers' map look-ups are not reproduced: distances are exact, and cells are not shifted by half a cell.
+
+Source: nav2_amcl (``sensors/laser``) and Beluga (``sensor/beam_model.hpp``, ``likelihood_field_model_base.hpp``).
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class BeamWeights(BeamParameters):
     """Parameters of the peers' beam models, whose weights need not sum to 1; the defaults are nav2_amcl's.
 
     Raises:
-        TypeError: a value is not a real number.
-        ValueError: a value breaks its field's rule.
+        TypeError: A value is not a real number.
+        ValueError: A value breaks its field's rule.
     """
 
     z_hit: float = 0.5
@@ -60,8 +60,8 @@ class FieldWeights(LikelihoodFieldParameters):
     """Parameters of the peers' likelihood fields, whose weights need not sum to 1; the defaults are nav2_amcl's.
 
     Raises:
-        TypeError: a value is not a real number.
-        ValueError: a value breaks its field's rule.
+        TypeError: A value is not a real number.
+        ValueError: A value breaks its field's rule.
     """
 
     z_hit: float = 0.5
@@ -75,24 +75,38 @@ class FieldWeights(LikelihoodFieldParameters):
 
 @dataclass(frozen=True)
 class Peer:
-    """What a program does with a scan.
+    """A program whose weights ``compat`` reproduces.
 
     Attributes:
         name: ``"amcl"`` or ``"beluga"``.
-        beam: Default parameters of its beam model.
-        field: Default parameters of its likelihood field.
-        beam_lead: What the beam model's sum begins with.
-        outside: What lies outside the grid for the beam model.
+        beam: Default parameters of the peer's beam model.
+        field: Default parameters of the peer's likelihood field.
+        constant_term: First term of the beam model's sum over readings.
+        outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
     """
 
     name: str
     beam: BeamWeights
     field: FieldWeights
-    beam_lead: float
+    constant_term: float
     outside: str
 
+    @property
+    def beam_lead(self) -> float:
+        """Old name of ``constant_term``."""
+        return self.constant_term
+
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Readings as the program takes them: NaN is left out, range_max stays a reading, +inf is a max reading."""
+        """Convert readings to the peer's classes: NaN is left out, +inf is a max reading, all others are ranges.
+
+        Args:
+            ranges: Readings of any shape and value [m].
+            scanner: The scanner.
+            field: Whether the readings are for the likelihood field, not for the beam model.
+
+        Returns:
+            float64 readings of the same shape.
+        """
         z = ranges.astype(np.float64)
         top = scanner.range_max
         if self.name == "amcl":
@@ -108,20 +122,20 @@ PEERS = {
 
 
 def choose(compat: object) -> Peer | None:
-    """The peer of a name; None for none.
+    """Return the peer that ``compat`` names; None for None.
 
     Raises:
-        TypeError: neither None nor a string.
-        ValueError: no peer's name.
+        TypeError: ``compat`` is neither None nor a string.
+        ValueError: ``compat`` names no peer.
     """
     return None if compat is None else PEERS[checks.choice("compat", compat, tuple(PEERS))]
 
 
 def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat: object) -> None:
-    """Refuse weights that need not sum to 1 where a likelihood is computed.
+    """Check that parameters whose weights need not sum to 1 are used with ``compat`` only.
 
     Raises:
-        ValueError: such weights without ``compat=``.
+        ValueError: ``parameters`` are a peer's weights and ``compat`` is None.
     """
     if compat is None and isinstance(parameters, (BeamWeights, FieldWeights)):
         raise ValueError(f"parameters: weights must sum to 1 unless compat is given, got {checks.show(parameters)}")

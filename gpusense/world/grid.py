@@ -1,4 +1,4 @@
-"""The map: an occupancy grid with its place in the world."""
+"""The map: an occupancy grid and its pose in the world."""
 
 from __future__ import annotations
 
@@ -14,22 +14,30 @@ from gpusense._util import checks
 
 
 class OccupancyGrid:
-    """An immutable occupancy grid, as in ``nav_msgs/OccupancyGrid``.
+    """Immutable occupancy grid, as in ``nav_msgs/OccupancyGrid``.
 
-    ``cells[row, col]`` is the half-open square ``[col, col + 1) x [row, row + 1)`` in cell units, times
-    ``resolution``, turned by the origin's yaw and moved to the origin; ``cells[0, 0]`` touches the origin
-    (REP-103 axes: x along the columns, y along the rows, yaw counter-clockwise).
+    ``cells[row, col]`` covers the half-open square ``[col, col + 1) x [row, row + 1)`` in cell units, scaled by
+    ``resolution``, rotated by the origin's yaw and translated to the origin. ``cells[0, 0]`` touches the origin. Axes
+    follow REP-103: x along the columns, y along the rows, yaw counter-clockwise.
 
     Args:
         cells: (H, W) integers, at least one: occupancy in per cent, 0 to 100, or -1 for unknown. Copied.
-        resolution: the side of a cell [m], > 0.
-        origin: (x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad].
-        occupied_threshold: a cell of at least this many per cent is occupied, 1 to 100. The default is
-            map_server's ``occupied_thresh`` of 0.65.
+        resolution: Side of a cell [m], > 0.
+        origin: Pose (x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad].
+        occupied_threshold: Least occupancy of an occupied cell [per cent], 1 to 100. The default equals map_server's
+            ``occupied_thresh`` of 0.65.
 
     Raises:
-        TypeError: an argument is not of the kind described, such as cells of dtype float or bool.
-        ValueError: a shape or a value breaks the rules above.
+        TypeError: An argument has the wrong type, such as cells of dtype float or bool.
+        ValueError: A shape or a value breaks a rule above.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0, 100, -1], [0, 0, 0]], resolution=0.5)
+        >>> grid
+        OccupancyGrid(2 x 3 cells, 16.7% occupied, resolution=0.5, origin=(0.0, 0.0, 0.0), occupied_threshold=65)
+        >>> grid.bounds()
+        (0.0, 0.0, 1.5, 1.0)
     """
 
     __slots__ = ("_cells", "_occupied", "_occupied_threshold", "_origin", "_resolution")
@@ -42,7 +50,7 @@ class OccupancyGrid:
         *,
         occupied_threshold: int = 65,
     ) -> None:
-        self._cells = _own_cells(cells)
+        self._cells = _checked_cells(cells)
         self._resolution = checks.real("resolution", resolution, above=0)
         x, y, yaw = checks.array("origin", origin, (3,)).tolist()
         self._origin: tuple[float, float, float] = (x, y, yaw)
@@ -56,38 +64,38 @@ class OccupancyGrid:
 
     @property
     def resolution(self) -> float:
-        """The side of a cell [m]."""
+        """Side of a cell [m]."""
         return self._resolution
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """(x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad]."""
+        """Pose (x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad]."""
         return self._origin
 
     @property
     def occupied_threshold(self) -> int:
-        """The least occupancy of an occupied cell [per cent]."""
+        """Least occupancy of an occupied cell [per cent]."""
         return self._occupied_threshold
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(H, W), the numbers of rows and columns."""
+        """Numbers of rows and columns (H, W)."""
         rows, cols = self._cells.shape
         return rows, cols
 
     @property
     def width(self) -> float:
-        """The extent along the columns, the grid's own x axis [m]."""
+        """Extent along the columns, the x axis of the grid's frame [m]."""
         return self.shape[1] * self._resolution
 
     @property
     def height(self) -> float:
-        """The extent along the rows, the grid's own y axis [m]."""
+        """Extent along the rows, the y axis of the grid's frame [m]."""
         return self.shape[0] * self._resolution
 
     @property
     def occupied(self) -> NDArray[np.bool]:
-        """(H, W), where the occupancy is at least ``occupied_threshold``; computed once, read-only."""
+        """(H, W) mask of cells with an occupancy of at least ``occupied_threshold``; computed once, read-only."""
         if self._occupied is None:
             occupied = self._cells >= self._occupied_threshold
             occupied.setflags(write=False)
@@ -96,26 +104,26 @@ class OccupancyGrid:
 
     @property
     def unknown(self) -> NDArray[np.bool]:
-        """(H, W), where nothing is known."""
+        """(H, W) mask of unknown cells."""
         return self._cells < 0
 
     @property
     def free(self) -> NDArray[np.bool]:
-        """(H, W), where the cell is neither occupied nor unknown."""
+        """(H, W) mask of cells that are neither occupied nor unknown."""
         return (self._cells >= 0) & (self._cells < self._occupied_threshold)
 
     def obstacles(self, unknown: Literal["free", "occupied"] = "free") -> NDArray[np.bool]:
-        """What stops a beam.
+        """Return the mask of cells that stop a beam.
 
         Args:
-            unknown: whether an unknown cell counts as ``"free"`` or as ``"occupied"``.
+            unknown: Whether unknown cells count as ``"free"`` or as ``"occupied"``.
 
         Returns:
-            (H, W) bool; read it, do not write to it.
+            (H, W) bool; do not write to it.
 
         Raises:
             TypeError: ``unknown`` is not a string.
-            ValueError: ``unknown`` is neither of the two.
+            ValueError: ``unknown`` is neither ``"free"`` nor ``"occupied"``.
         """
         checks.choice("unknown", unknown, ("free", "occupied"))
         if unknown == "free":
@@ -124,17 +132,17 @@ class OccupancyGrid:
         return self._cells.view(np.uint8) >= self._occupied_threshold
 
     def with_cells(self, cells: ArrayLike, region: ArrayLike) -> OccupancyGrid:
-        """A grid of which some cells are others.
+        """Return a grid with some cells replaced.
 
         Args:
             cells: (h, w) integers, at least one: occupancy in per cent, 0 to 100, or -1 for unknown.
-            region: (row, col) of the cell that ``cells[0, 0]`` replaces. All must lie in the grid.
+            region: (row, col) of the cell that ``cells[0, 0]`` replaces. All of ``cells`` must lie in the grid.
 
         Raises:
-            TypeError: the cells or the region are not integers.
-            ValueError: a shape or a value breaks the rules above.
+            TypeError: ``cells`` or ``region`` does not hold integers.
+            ValueError: A shape or a value breaks a rule above.
         """
-        patch = _own_cells(cells)
+        patch = _checked_cells(cells)
         row, col = checks.array("region", region, (2,), dtype=np.int64).tolist()
         rows, cols = patch.shape
         if not (0 <= row <= self.shape[0] - rows and 0 <= col <= self.shape[1] - cols):
@@ -143,42 +151,42 @@ class OccupancyGrid:
         changed = self._cells.copy()
         changed[row : row + rows, col : col + cols] = patch
         changed.setflags(write=False)
-        # All but the patch has been checked before.
+        # The rest of the grid was checked when it was made.
         grid = object.__new__(OccupancyGrid)
         grid._cells, grid._resolution, grid._origin = changed, self._resolution, self._origin
         grid._occupied_threshold, grid._occupied = self._occupied_threshold, None
         return grid
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """The upright box around the grid in the world: (x_min, y_min, x_max, y_max) [m]."""
+        """Return the axis-aligned box around the grid in the world: (x_min, y_min, x_max, y_max) [m]."""
         corners = np.array([[0, 0], [self.width, 0], [0, self.height], [self.width, self.height]])
         world = self._to_world(corners)
         (x_min, y_min), (x_max, y_max) = world.min(axis=0).tolist(), world.max(axis=0).tolist()
         return x_min, y_min, x_max, y_max
 
     def cell_centers(self, rows: ArrayLike, cols: ArrayLike) -> NDArray[np.float64]:
-        """The centres of cells in the world.
+        """Return the centres of cells in the world.
 
         Args:
-            rows: (M,) integer rows. The lattice goes on beyond the grid, so any integer has a centre.
+            rows: (M,) integer rows. They may lie outside the grid, whose lattice has no end.
             cols: (M,) integer columns.
 
         Returns:
             (M, 2) x and y [m].
 
         Raises:
-            TypeError: the indices are not integers.
-            ValueError: the shapes are not (M,) and (M,).
+            TypeError: The indices are not integers.
+            ValueError: The shapes are not (M,) and (M,).
         """
         row = checks.array("rows", rows, ("M",), dtype=np.int64)
         col = checks.array("cols", cols, row.shape, dtype=np.int64)
         return self._to_world((np.stack([col, row], axis=1) + 0.5) * self._resolution)
 
     def world_to_cells(self, xy: ArrayLike) -> NDArray[np.float64]:
-        """World points in the grid's frame, in cell units.
+        """Convert world points to the grid's frame, in cell units.
 
-        The point is moved by the origin, turned by -yaw about it and divided by the resolution, all in
-        float64; the floor of the result is (col, row). With a yaw of exactly 0 nothing is turned.
+        A point is taken relative to the origin, rotated by -yaw and divided by the resolution, all in float64. The
+        floor of the result is (col, row). A yaw of exactly 0 skips the rotation.
 
         Args:
             xy: (M, 2) x and y [m].
@@ -188,7 +196,7 @@ class OccupancyGrid:
 
         Raises:
             TypeError: ``xy`` does not hold real numbers.
-            ValueError: its shape is not (M, 2), or a value is not finite.
+            ValueError: The shape is not (M, 2), or a value is not finite.
         """
         points = checks.array("xy", xy, ("M", 2))
         x, y, yaw = self._origin
@@ -199,7 +207,7 @@ class OccupancyGrid:
         return np.stack([u, v], axis=1) / self._resolution
 
     def _to_world(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M, 2) metres in the grid's frame to (M, 2) metres in the world."""
+        """Convert (M, 2) points in the grid's frame to the world [m]."""
         x, y, yaw = self._origin
         u, v = local[:, 0], local[:, 1]
         if yaw != 0.0:
@@ -220,27 +228,28 @@ class OccupancyGrid:
 
     def __repr__(self) -> str:
         rows, cols = self.shape
+        share = np.count_nonzero(self.occupied) / self._cells.size
         return (
-            f"OccupancyGrid({rows} x {cols} cells, resolution={self._resolution}, origin={self._origin}, "
-            f"occupied_threshold={self._occupied_threshold})"
+            f"OccupancyGrid({rows} x {cols} cells, {100 * share:.3g}% occupied, resolution={self._resolution}, "
+            f"origin={self._origin}, occupied_threshold={self._occupied_threshold})"
         )
 
     def __reduce__(self) -> tuple[Callable[..., OccupancyGrid], tuple[Any, ...]]:
-        # Copies and pickles go through the constructor, so that their cells are read-only too.
+        # Copies and pickles call the constructor, so that their cells are read-only too.
         make = functools.partial(OccupancyGrid, occupied_threshold=self._occupied_threshold)
         return make, (self._cells, self._resolution, self._origin)
 
 
-def _own_cells(cells: ArrayLike) -> NDArray[np.int8]:
-    """A checked, read-only int8 copy of (H, W) occupancies."""
-    given = checks.as_array("cells", cells)
-    dtype = given.dtype if given.dtype.kind in "iu" else np.int64
-    given = checks.array("cells", given, ("H", "W"), dtype=dtype)
-    if given.size == 0:
-        raise ValueError(f"cells: must hold at least one cell, got shape {given.shape}")
-    if given.min() < -1 or given.max() > 100:
-        row, col = np.argwhere((given < -1) | (given > 100))[0].tolist()
-        raise ValueError(f"cells: every value must be from -1 to 100, got {given[row, col]} at index ({row}, {col})")
-    own = np.array(given, dtype=np.int8, order="C")
-    own.setflags(write=False)
-    return own
+def _checked_cells(cells: ArrayLike) -> NDArray[np.int8]:
+    """Check (H, W) occupancies and return a read-only int8 copy."""
+    values = checks.as_array("cells", cells)
+    dtype = values.dtype if values.dtype.kind in "iu" else np.int64
+    values = checks.array("cells", values, ("H", "W"), dtype=dtype)
+    if values.size == 0:
+        raise ValueError(f"cells: must hold at least one cell, got shape {values.shape}")
+    if values.min() < -1 or values.max() > 100:
+        row, col = np.argwhere((values < -1) | (values > 100))[0].tolist()
+        raise ValueError(f"cells: every value must be from -1 to 100, got {values[row, col]} at index ({row}, {col})")
+    copy = np.array(values, dtype=np.int8, order="C")
+    copy.setflags(write=False)
+    return copy

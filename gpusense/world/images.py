@@ -1,4 +1,4 @@
-"""Map images, opened strip by strip so that nothing is allocated on the word of a header alone."""
+"""Read map images (PGM, PPM, PNG, BMP) strip by strip; memory is allocated only for data that the file holds."""
 
 from __future__ import annotations
 
@@ -16,17 +16,24 @@ from numpy.typing import NDArray
 
 _MAX_CELLS = 1 << 31
 _STRIP_CELLS = 1 << 20
-_MAX_PILLOW_WIDTH = 1 << 26  # so that no strip of a row meets Pillow's own limit on pixels
+_MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on pixels
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
 
-# A strip of image rows, topmost first: the sum of the colour channels (h, w), and where the image is opaque.
+# A strip of image rows, topmost first: the (h, w) sum of the colour channels, and the (h, w) mask of opaque pixels.
 _Strip = tuple[NDArray[np.uint32], NDArray[np.bool] | None]
 
 
 @dataclass(frozen=True)
 class Raster:
-    """An image that is read strip by strip; ``white`` is the sum of the channels of a white pixel."""
+    """An image that is read strip by strip.
+
+    Attributes:
+        rows: Rows of pixels.
+        cols: Columns of pixels.
+        white: Sum of the channels of a white pixel.
+        strips: Strips of rows, topmost first.
+    """
 
     rows: int
     cols: int
@@ -35,7 +42,16 @@ class Raster:
 
 
 def open_raster(stream: BinaryIO, file: Path, size: int) -> Raster:
-    """Open an image by its first bytes."""
+    """Open an image; its first bytes choose the format.
+
+    Args:
+        stream: The open file.
+        file: Name of the file for messages.
+        size: Length of the file [bytes].
+
+    Raises:
+        ValueError: The format is unknown, or the file breaks it.
+    """
     magic = stream.read(8)
     stream.seek(0)
     if magic[:2] in (b"P2", b"P3", b"P5", b"P6"):
@@ -55,13 +71,13 @@ def _check_size(file: Path, rows: int, cols: int) -> None:
 
 
 def _strip_rows(rows: int, cols: int) -> Iterator[tuple[int, int]]:
-    """The first and last-plus-one row of every strip."""
+    """Return the first row of every strip and the row after its last."""
     height = max(1, _STRIP_CELLS // cols)
     return ((top, min(rows, top + height)) for top in range(0, rows, height))
 
 
 def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
-    """A PGM or PPM image, plain (P2, P3) or raw (P5, P6), as the netpbm manual pages define them."""
+    """Open a PGM or PPM image, plain (P2, P3) or raw (P5, P6), as the netpbm manual pages define them."""
     magic = stream.read(2)
     channels = 3 if magic in (b"P3", b"P6") else 1
     cols, rows, maxval = _pnm_header(stream, file)
@@ -92,7 +108,7 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
 
 
 def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
-    """The three numbers after the magic; the stream is left at the first byte of the raster."""
+    """Read width, height and maximum value after the magic number, up to the first byte of the raster."""
     numbers: list[int] = []
     token = b""
     comment = False
@@ -114,7 +130,7 @@ def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
 
 
 def _plain_values(stream: BinaryIO, file: Path, count: int) -> NDArray[np.uint32]:
-    """The first ``count`` decimal numbers of the stream."""
+    """Read the first ``count`` decimal numbers of the stream."""
     values = np.empty(count, np.uint32)
     filled = 0
     rest = b""
@@ -136,7 +152,7 @@ def _plain_values(stream: BinaryIO, file: Path, count: int) -> NDArray[np.uint32
 
 @contextlib.contextmanager
 def _decoding(file: Path, kind: str) -> Iterator[None]:
-    """Turn what a broken image makes Pillow, zlib or struct raise into a ValueError."""
+    """Convert errors of Pillow, zlib or struct about a broken image to a ValueError."""
     try:
         yield
     except (OSError, SyntaxError, EOFError, ValueError, struct.error, zlib.error) as error:
@@ -144,13 +160,13 @@ def _decoding(file: Path, kind: str) -> Iterator[None]:
 
 
 def _check_png(stream: BinaryIO) -> None:
-    """See that the image data of a PNG inflates to what its header claims, in little memory.
+    """Check, in little memory, that the image data of a PNG inflates to the size in its header.
 
-    Pillow allocates by the header, and leaves black what is missing: walls that are not there.
+    Pillow allocates by the header, and leaves missing pixels black: they would become walls.
     """
     cols, rows, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", stream.read(29)[16:])
     bits = depth * {2: 3, 4: 2, 6: 4}.get(colour, 1)
-    # The passes of Adam7: first column and row, step along the columns and along the rows.
+    # The passes of Adam7: first column, first row, step along the columns, step along the rows.
     adam7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
     claimed = 0
     for x, y, dx, dy in adam7 if interlace else ((0, 0, 1, 1),):
@@ -158,22 +174,22 @@ def _check_png(stream: BinaryIO) -> None:
         if width > 0:
             claimed += max(height, 0) * (1 + (width * bits + 7) // 8)
     inflater = zlib.decompressobj()
-    found = 0
+    inflated = 0
     for piece in _png_data(stream):
-        while piece and found <= claimed:
-            found += len(inflater.decompress(piece, 1 << 20))
+        while piece and inflated <= claimed:
+            inflated += len(inflater.decompress(piece, 1 << 20))
             piece = inflater.unconsumed_tail
-        if inflater.eof or found > claimed:
+        if inflater.eof or inflated > claimed:
             break
     else:
-        found += len(inflater.flush())
-    if found < claimed or (found == claimed and not inflater.eof):
-        raise ValueError(f"its data inflates to {found} of {claimed} bytes")
+        inflated += len(inflater.flush())
+    if inflated < claimed or (inflated == claimed and not inflater.eof):
+        raise ValueError(f"its data inflates to {inflated} of {claimed} bytes")
 
 
 def _png_data(stream: BinaryIO) -> Iterator[bytes]:
-    """The contents of a PNG's IDAT chunks, piece by piece; the stream is inside the first chunk, IHDR."""
-    stream.seek(33)
+    """Read the contents of a PNG's IDAT chunks, piece by piece."""
+    stream.seek(33)  # after the signature and the chunk IHDR
     while True:
         length, kind = struct.unpack(">I4s", stream.read(8))
         if kind == b"IEND":
@@ -188,28 +204,9 @@ def _png_data(stream: BinaryIO) -> Iterator[bytes]:
 
 
 def _open_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Raster:
-    """A PNG or BMP image through Pillow."""
-    from PIL.BmpImagePlugin import BmpImageFile
-    from PIL.PngImagePlugin import PngImageFile
-
-    # Not through Image.open, whose limit on pixels is a setting of the whole process and below our maps.
-    with _decoding(file, kind):
-        stream.seek(0)
-        image = PngImageFile(stream) if kind == "PNG" else BmpImageFile(stream)
+    """Open a PNG or BMP image with Pillow."""
+    image = _load_pillow(stream, file, size, kind)
     cols, rows = image.size
-    _check_size(file, rows, cols)
-    if cols > _MAX_PILLOW_WIDTH:
-        raise ValueError(f"{file}: must be at most {_MAX_PILLOW_WIDTH} pixels wide, got {cols}")
-    if kind == "BMP":
-        codec, _, offset, args = image.tile[0]
-        if codec != "raw" or not isinstance(args, tuple):
-            raise ValueError(f"{file}: must be an uncompressed BMP image, got a compressed one")
-        needed = offset + rows * args[1]
-        if size < needed:
-            raise ValueError(f"{file}: must have at least {needed} bytes, got {size}")
-    with _decoding(file, kind):
-        image.load()
-
     transparent = image.info.get("transparency")
     mode = {"1": "L", "P": "RGB"}.get(image.mode, image.mode)
     if transparent is not None:
@@ -232,8 +229,35 @@ def _open_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Raster:
     return Raster(rows, cols, 65535 if deep else 255 * colours, strips())
 
 
+def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
+    """Load a PNG or BMP image after checking its size.
+
+    Image.open is avoided: its limit on pixels is a setting of the whole process, and smaller than large maps.
+    """
+    from PIL.BmpImagePlugin import BmpImageFile
+    from PIL.PngImagePlugin import PngImageFile
+
+    with _decoding(file, kind):
+        stream.seek(0)
+        image = PngImageFile(stream) if kind == "PNG" else BmpImageFile(stream)
+    cols, rows = image.size
+    _check_size(file, rows, cols)
+    if cols > _MAX_PILLOW_WIDTH:
+        raise ValueError(f"{file}: must be at most {_MAX_PILLOW_WIDTH} pixels wide, got {cols}")
+    if kind == "BMP":
+        codec, _, offset, args = image.tile[0]
+        if codec != "raw" or not isinstance(args, tuple):
+            raise ValueError(f"{file}: must be an uncompressed BMP image, got a compressed one")
+        needed = offset + rows * args[1]
+        if size < needed:
+            raise ValueError(f"{file}: must have at least {needed} bytes, got {size}")
+    with _decoding(file, kind):
+        image.load()
+    return image
+
+
 def _channel_sum(values: NDArray[Any]) -> NDArray[np.uint32]:
-    """(h, w, C) channels to their sum (h, w)."""
+    """Return the (h, w) sum of (h, w, C) channels."""
     total: NDArray[np.uint32] = values[:, :, 0].astype(np.uint32)
     for channel in range(1, values.shape[2]):
         total += values[:, :, channel]

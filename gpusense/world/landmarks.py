@@ -1,4 +1,4 @@
-"""Maps of landmarks (features), and the square buckets in which kernels look for those that are near."""
+"""Maps of landmarks, and the square buckets in which kernels search for near ones."""
 
 from __future__ import annotations
 
@@ -10,33 +10,41 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.world.frames import split
 
-# Sides of buckets are powers of two, so that scaling by them is exact; none is smaller than this.
-_SMALLEST_SIDE = -6
-# Landmarks for each bucket, on average over the map's rectangle.
-_EACH = 2
+# Exponent of a bucket's smallest side. Sides are powers of two, so that scaling by them is exact.
+_SMALLEST_POWER = -6
+# Mean number of landmarks per bucket, over the map's rectangle.
+_PER_BUCKET = 2
 
 
 class LandmarkMap:
-    """Landmarks in the plane, each with a signature where they can be told apart by one.
+    """Landmarks in the plane, with optional signatures to tell them apart.
 
-    A signature is a number: an average colour, a height, or an id. *Probabilistic Robotics* section 6.6.
+    A signature is a number: an average colour, a height, or an id. Source: *Probabilistic Robotics*, section 6.6.
 
     Args:
         xy: (M, 2) positions in the world [m]; M may be 0.
-        signatures: None, or (M,) numbers.
+        signatures: (M,) numbers, or None.
 
     Attributes:
         xy: (M, 2) float64, read-only.
         signatures: (M,) float64, read-only, or None.
 
     Raises:
-        TypeError: not real numbers.
-        ValueError: another shape, or a value that is not finite.
+        TypeError: An argument does not hold real numbers.
+        ValueError: A shape differs, or a value is not finite.
+
+    Example:
+        >>> import gpusense as gs
+        >>> landmarks = gs.LandmarkMap([(0, 0), (5, 0), (5, 4)], signatures=[1, 2, 3])
+        >>> landmarks
+        LandmarkMap(3 landmarks with signatures)
+        >>> len(landmarks)
+        3
     """
 
     def __init__(self, xy: object, signatures: object = None) -> None:
-        given = checks.as_array("xy", xy)
-        self.xy = np.zeros((0, 2)) if given.shape == (0,) else checks.array("xy", given, ("M", 2)).copy()
+        positions = checks.as_array("xy", xy)
+        self.xy = np.zeros((0, 2)) if positions.shape == (0,) else checks.array("xy", positions, ("M", 2)).copy()
         self.xy.flags.writeable = False
         self.signatures: np.ndarray | None = None
         if signatures is not None:
@@ -52,7 +60,7 @@ class LandmarkMap:
 
 @dataclass(frozen=True)
 class Buckets:
-    """Landmarks in square buckets, row by row, in the order of the map within each.
+    """Landmarks sorted into square buckets, row by row; a bucket keeps the order of the map.
 
     Attributes:
         origin: (x, y, 0) of the first bucket's corner in the world; poses are placed as in a grid of such cells.
@@ -60,7 +68,7 @@ class Buckets:
         shape: Rows and columns of buckets.
         start: (rows * columns + 1,) int32 place of the first landmark of each bucket.
         index: (M,) int32 index in the map of the landmark at each place.
-        place_of: (M,) int32 its inverse.
+        place_of: (M,) int32 place of each landmark: the inverse of ``index``.
         position: (M, 2) float64 positions relative to the origin, by place.
     """
 
@@ -73,22 +81,26 @@ class Buckets:
     position: np.ndarray
 
     def table(self, real: np.dtype) -> np.ndarray:
-        """(M, 4) x, y and what rounding took from them, in a precision."""
+        """Return (M, 4) x, y and their rounding errors (low parts) in precision ``real``."""
         high, low = split(self.position, real)
         return np.concatenate([high, low], axis=1)
 
 
 def make_buckets(landmarks: LandmarkMap) -> Buckets:
-    """Sort landmarks into buckets of about two."""
+    """Sort landmarks into buckets of about two each.
+
+    Raises:
+        ValueError: The landmarks span an infinite distance.
+    """
     xy, count = landmarks.xy, len(landmarks)
     low, high = (xy.min(axis=0), xy.max(axis=0)) if count else (np.zeros(2), np.zeros(2))
-    most = max(count // _EACH, 1)
+    most = max(count // _PER_BUCKET, 1)
     with np.errstate(over="ignore"):
         size = high - low
     if not np.isfinite(size).all():
         raise ValueError(f"xy: must span a finite distance, got {checks.show(low)} to {checks.show(high)}")
-    power = max(math.ceil(math.log2(max(size.max(), 2.0**_SMALLEST_SIDE))), _SMALLEST_SIDE)
-    while power > _SMALLEST_SIDE and np.prod(np.floor(size / 2.0 ** (power - 1)) + 1) <= most:
+    power = max(math.ceil(math.log2(max(size.max(), 2.0**_SMALLEST_POWER))), _SMALLEST_POWER)
+    while power > _SMALLEST_POWER and np.prod(np.floor(size / 2.0 ** (power - 1)) + 1) <= most:
         power -= 1
     side = 2.0**power
     position = xy - low

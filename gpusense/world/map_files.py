@@ -1,4 +1,4 @@
-"""Maps as ROS map_server writes them: a YAML file beside a PGM, PNG or BMP image."""
+"""Read and write maps in the format of ROS map_server: a YAML file beside a PGM, PNG or BMP image."""
 
 from __future__ import annotations
 
@@ -33,25 +33,35 @@ class _MapYaml:
 def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> OccupancyGrid:
     """Read a map in the format of ROS map_server.
 
-    The values follow nav2_map_server. With v the mean of the colour channels as a fraction of white, the
-    occupancy is p = 1 - v, or v with ``negate``. Modes ``trinary`` (the default) and ``scale``: p >=
-    ``occupied_thresh`` is 100, p <= ``free_thresh`` is 0; between them trinary is unknown and scale is
-    ``round(100 (p - free_thresh) / (occupied_thresh - free_thresh))``; a pixel that is not opaque is unknown.
-    Mode ``raw``: round(255 v), unknown where that exceeds 100. The image's bottom row is ``cells[0]``.
+    The values follow nav2_map_server. Let v be the mean of the colour channels as a fraction of white. The occupancy
+    is p = 1 - v, or v with ``negate``.
 
-    The image is told by its content: PGM (P2, P5; 8 or 16 bits), PPM (P3, P6), PNG (1 to 16 bits; grey,
-    palette or colour, with or without alpha) or uncompressed BMP. A 16-bit value is a fraction of its own
-    maximum, except in a PNG with colours or alpha, of which the upper 8 bits are used. Nothing is allocated
-    on the word of a header alone: the file must hold the pixels that its header claims, and at most 2^31.
+    - Modes ``trinary`` (the default) and ``scale``: p >= ``occupied_thresh`` is 100, and p <= ``free_thresh`` is 0.
+      Values between them are unknown in mode trinary, and in mode scale
+      ``round(100 (p - free_thresh) / (occupied_thresh - free_thresh))``. A pixel that is not opaque is unknown.
+    - Mode ``raw``: round(255 v), unknown if that exceeds 100.
+
+    The image's bottom row is ``cells[0]``. Its content determines its format: PGM (P2, P5; 8 or 16 bits), PPM (P3,
+    P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. A 16-bit value is a
+    fraction of its own maximum; a PNG with colours or alpha counts with its upper 8 bits only. Memory is allocated
+    only after the file has been seen to hold the pixels that its header claims, at most 2^31.
 
     Args:
-        path: the YAML file; its ``image`` is relative to its folder.
-        occupied_threshold: passed on to :class:`OccupancyGrid` [per cent].
+        path: The YAML file; the path of ``image`` in it is relative to its folder.
+        occupied_threshold: Least occupancy of an occupied cell, as in :class:`OccupancyGrid` [per cent].
 
     Raises:
-        FileNotFoundError: the YAML file or its image is missing.
-        TypeError: ``path`` or ``occupied_threshold`` is not of the kind described.
-        ValueError: a file breaks the format; the message names the file and the rule.
+        FileNotFoundError: The YAML file or its image is missing.
+        TypeError: ``path`` or ``occupied_threshold`` has the wrong type.
+        ValueError: A file breaks the format; the message names the file and the rule.
+
+    Example:
+        >>> import gpusense as gs, pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder, "map.yaml")
+        ...     gs.write_map(gs.OccupancyGrid([[0, 100], [-1, 0]], resolution=0.1), path)
+        ...     gs.read_map(path).cells.tolist()
+        [[0, 100], [-1, 0]]
     """
     meta = _read_yaml(checks.existing_file(checks.path("path", path)))
     size = meta.image.stat().st_size
@@ -72,23 +82,30 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
 def write_map(
     grid: OccupancyGrid, path: str | os.PathLike[str], *, image_format: Literal["pgm", "png"] = "pgm"
 ) -> None:
-    """Write a map for ROS map_server, whole or not at all.
+    """Write a map for ROS map_server, atomically.
 
-    The image has the YAML file's name with the suffix of its format. A grid of 0, 100 and unknown is written
-    in mode ``trinary`` with map_saver's greys (254, 0 and 205, ``free_thresh`` 0.196); any other in mode
-    ``raw`` with 255 for unknown. :func:`read_map` gives equal cells, resolution and origin back. The grid's
-    ``occupied_threshold`` is no part of the format.
+    The image has the YAML file's name with the suffix of its format. A grid of 0, 100 and unknown is written in mode
+    ``trinary`` with map_saver's greys (254, 0 and 205, ``free_thresh`` 0.196), any other grid in mode ``raw`` with 255
+    for unknown. :func:`read_map` returns equal cells, resolution and origin. The format has no place for
+    ``occupied_threshold``.
 
     Args:
-        grid: the map.
-        path: the YAML file, ending in .yaml or .yml. It and its image are replaced if they exist.
+        grid: The map.
+        path: The YAML file, ending in .yaml or .yml. It and its image are replaced if they exist.
         image_format: ``"pgm"`` or ``"png"``.
 
     Raises:
-        FileNotFoundError: the folder is missing.
-        TypeError: an argument is not of the kind described.
+        FileNotFoundError: The folder is missing.
+        TypeError: An argument has the wrong type.
         ValueError: ``path`` has another suffix or is a folder, or ``image_format`` is unknown.
-        OSError: the files cannot be written; those of before are then still there.
+        OSError: The files cannot be written; the old files are then unchanged.
+
+    Example:
+        >>> import gpusense as gs, pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     gs.write_map(gs.OccupancyGrid([[0, 100]]), pathlib.Path(folder, "map.yaml"), image_format="png")
+        ...     sorted(file.name for file in pathlib.Path(folder).iterdir())
+        ['map.png', 'map.yaml']
     """
     import yaml
 
@@ -107,7 +124,7 @@ def write_map(
 
     cells = grid.cells
     trinary = sum(np.count_nonzero(cells == value) for value in (0, 100, -1)) == cells.size
-    greys = bytearray([*range(101), *[255] * 155])  # by the cell's byte; that of unknown, -1, is 255
+    greys = bytearray([*range(101), *[255] * 155])  # indexed by the cell's byte; unknown, -1, is byte 255
     if trinary:
         greys[0], greys[100], greys[255] = 254, 0, 205
     pixels = cells[::-1].tobytes().translate(greys)
@@ -140,10 +157,10 @@ def _write_image(stream: BinaryIO, pixels: bytes, shape: tuple[int, int], image_
 
 
 def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
-    """Write files so that either all are replaced or, whatever happens, all are as before."""
+    """Write several files atomically: either all are replaced or, after any failure, none is."""
     tag = secrets.token_hex(4)
     fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
-    kept = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
+    backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
     existed = {target: target.exists() for target in writers}
     try:
         for target, write in writers.items():
@@ -151,17 +168,17 @@ def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
                 write(stream)
         for target in writers:
             if existed[target]:
-                os.replace(target, kept[target])
+                os.replace(target, backup[target])
             os.replace(fresh[target], target)
     except BaseException:
         for target in writers:
-            if kept[target].exists():
-                os.replace(kept[target], target)
+            if backup[target].exists():
+                os.replace(backup[target], target)
             elif not existed[target]:
                 target.unlink(missing_ok=True)
         raise
     else:
-        for file in kept.values():
+        for file in backup.values():
             file.unlink(missing_ok=True)
     finally:
         for file in fresh.values():
@@ -199,7 +216,7 @@ def _read_yaml(file: Path) -> _MapYaml:
 
 
 def _number(file: Path, key: str, value: object, **limits: float) -> float:
-    # 5e-2 is a number to YAML 1.2 and to map_server, but a string to YAML 1.1 and to PyYAML.
+    # 5e-2 is a number in YAML 1.2 and for map_server, but a string in YAML 1.1 and for PyYAML.
     if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", value):
         value = float(value)
     try:
@@ -209,7 +226,7 @@ def _number(file: Path, key: str, value: object, **limits: float) -> float:
 
 
 def _cell_table(meta: _MapYaml, white: int) -> NDArray[np.int8]:
-    """The cell for every sum of channels from 0 to ``white``, by nav2's rules in float64."""
+    """Return the cell for every sum of channels from 0 to ``white``, by nav2's rules in float64."""
     shade = np.arange(white + 1, dtype=np.float64)
     if meta.mode == "raw":
         value = np.floor(shade * 255 / white + 0.5)

@@ -1,4 +1,4 @@
-"""The intrinsic parameters of the measurement models: frozen, validated dataclasses."""
+"""Intrinsic parameters of the scan and landmark models: frozen, validated dataclasses."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _WEIGHT_SUM_TOLERANCE = 1e-6
 
 
 class _Parameters:
-    """What the parameter classes share."""
+    """Conversion and validation shared by the parameter classes."""
 
     _sum_is_one: ClassVar[bool] = True
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields by name, as plain numbers and strings."""
+        """Return the fields by name, as plain numbers and strings."""
         return asdict(self)  # type: ignore[call-overload]
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The parameters that :meth:`to_dict` wrote; a field that is left out takes its default.
+        """Make parameters from the fields that :meth:`to_dict` returns; a missing field takes its default.
 
         Raises:
-            TypeError: ``values`` is not a mapping, or a value is not of its field's kind.
-            ValueError: a key names no field, or a value breaks its field's rule.
+            TypeError: ``values`` is not a mapping, or a value has the wrong type for its field.
+            ValueError: A key names no field, or a value breaks its field's rule.
         """
         if not isinstance(values, Mapping):
             raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
@@ -40,16 +40,16 @@ class _Parameters:
         return cls(**values)
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed.
+        """Return a copy with some fields changed.
 
         Raises:
-            TypeError: a value is not of its field's kind.
-            ValueError: a name is no field's, or the result breaks a rule.
+            TypeError: A value has the wrong type for its field.
+            ValueError: A name is not a field, or the result breaks a rule.
         """
         return self.from_dict({**self.to_dict(), **changes})
 
     def _check(self, name: str, **limits: float) -> None:
-        """Hold one field to its limits and store it as a float."""
+        """Check one field against its limits and store it as a float."""
         object.__setattr__(self, name, checks.real(name, getattr(self, name), **limits))
 
     def _check_weights(self, *names: str) -> None:
@@ -63,11 +63,17 @@ class _Parameters:
 
 @dataclass(frozen=True)
 class BeamParameters(_Parameters):
-    """The beam model's parameters, *Probabilistic Robotics* section 6.3.
+    """Parameters of the beam model, *Probabilistic Robotics* section 6.3.
 
     Raises:
-        TypeError: a value is not a real number.
-        ValueError: a value breaks its field's rule, or the four weights do not sum to 1 within 1e-6.
+        TypeError: A value is not a real number.
+        ValueError: A value breaks its field's rule, or the four weights do not sum to 1 within 1e-6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> p = gs.BeamParameters(z_hit=0.8, z_short=0.1, z_max=0.05, z_rand=0.05, sigma_hit=0.03)
+        >>> p.replace(sigma_hit=0.06).sigma_hit
+        0.06
     """
 
     z_hit: float = 0.7
@@ -91,21 +97,29 @@ class BeamParameters(_Parameters):
 
 @dataclass(frozen=True)
 class IncidenceParameters:
-    """The beam model's parameters for each range of angles of incidence.
+    """Parameters of the beam model for each incidence bin.
 
-    The angle of incidence lies between a beam and the normal of the surface it hits: 0 is head-on, pi / 2 grazing.
+    The angle of incidence is the angle between a beam and the normal of the surface that it hits: 0 is head-on, pi / 2
+    grazing.
 
     Raises:
-        TypeError: a value is not of its field's kind.
-        ValueError: the edges do not rise from 0 to pi / 2, or there is not one set of parameters for each bin.
+        TypeError: A value has the wrong type for its field.
+        ValueError: The edges do not rise from 0 to pi / 2, or the number of parameters differs from that of bins.
+
+    Example:
+        >>> import gpusense as gs, math
+        >>> front, grazing = gs.BeamParameters(), gs.BeamParameters(sigma_hit=0.2)
+        >>> p = gs.IncidenceParameters((0, math.radians(60), math.pi / 2), (front, grazing))
+        >>> p.parameters[1].sigma_hit
+        0.2
     """
 
     edges: tuple[float, ...]
-    """(B + 1,) bounds of the bins, rising from 0 to pi / 2 [rad]."""
+    """(B + 1,) edges of the bins, rising from 0 to pi / 2 [rad]."""
     parameters: tuple[BeamParameters, ...]
-    """(B,) the parameters of each bin."""
+    """(B,) parameters of each bin."""
     no_surface: BeamParameters | None = None
-    """Those of beams that hit nothing, or nothing that returns; None for those of the first bin."""
+    """Parameters of beams that hit nothing, or nothing that returns; None uses those of the first bin."""
 
     def __post_init__(self) -> None:
         edges = tuple(float(edge) for edge in checks.array("edges", self.edges, ("B + 1",)))
@@ -125,7 +139,7 @@ class IncidenceParameters:
         object.__setattr__(self, "parameters", parameters)
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields by name, as plain numbers."""
+        """Return the fields by name, as plain numbers."""
         return {
             "edges": list(self.edges),
             "parameters": [each.to_dict() for each in self.parameters],
@@ -134,34 +148,40 @@ class IncidenceParameters:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """The parameters that :meth:`to_dict` wrote.
+        """Make parameters from the fields that :meth:`to_dict` returns.
 
         Raises:
-            TypeError: ``values`` is not a mapping, or a value is not of its field's kind.
-            ValueError: a key is missing or names no field, or a value breaks its field's rule.
+            TypeError: ``values`` is not a mapping, or a value has the wrong type for its field.
+            ValueError: A key is missing or names no field, or a value breaks its field's rule.
         """
         if not isinstance(values, Mapping):
             raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
         if not {"edges", "parameters"} <= set(values) <= {"edges", "parameters", "no_surface"}:
             rule = "must have the fields edges and parameters, and may have no_surface"
             raise ValueError(f"{cls.__name__}: {rule}, got {sorted(values)}")
-        own, nothing = values["parameters"], values.get("no_surface")
-        if not isinstance(own, (list, tuple)):
-            raise TypeError(f"parameters: must be a list, got {checks.show(own)}")
+        parameters, no_surface = values["parameters"], values.get("no_surface")
+        if not isinstance(parameters, (list, tuple)):
+            raise TypeError(f"parameters: must be a list, got {checks.show(parameters)}")
         return cls(
             values["edges"],
-            tuple(BeamParameters.from_dict(each) for each in own),
-            None if nothing is None else BeamParameters.from_dict(nothing),
+            tuple(BeamParameters.from_dict(each) for each in parameters),
+            None if no_surface is None else BeamParameters.from_dict(no_surface),
         )
 
 
 @dataclass(frozen=True)
 class LikelihoodFieldParameters(_Parameters):
-    """The likelihood field's parameters, *Probabilistic Robotics* section 6.4.
+    """Parameters of the likelihood field, *Probabilistic Robotics* section 6.4.
 
     Raises:
-        TypeError: a value is not of its field's kind.
-        ValueError: a value breaks its field's rule, or the three weights do not sum to 1 within 1e-6.
+        TypeError: A value has the wrong type for its field.
+        ValueError: A value breaks its field's rule, or the three weights do not sum to 1 within 1e-6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> p = gs.LikelihoodFieldParameters(sigma_hit=0.1, max_distance=1.0)
+        >>> p.to_dict()["interpolation"]
+        'nearest'
     """
 
     z_hit: float = 0.9
@@ -173,9 +193,9 @@ class LikelihoodFieldParameters(_Parameters):
     sigma_hit: float = 0.2
     """The standard deviation of an end point's distance to the nearest obstacle, > 0 [m] (table 6.3)."""
     max_distance: float = 2.0
-    """The distance to the nearest obstacle is capped at this, > 0 [m]."""
+    """Largest distance to the nearest obstacle, > 0 [m]; larger ones are clamped."""
     interpolation: Literal["nearest", "bilinear"] = "nearest"
-    """How the distance is read between cell centres: that of the end point's cell, or bilinear."""
+    """Interpolation between cell centres: the distance of the end point's cell, or bilinear."""
 
     def __post_init__(self) -> None:
         self._check_weights("z_hit", "z_max", "z_rand")
@@ -186,14 +206,19 @@ class LikelihoodFieldParameters(_Parameters):
 
 @dataclass(frozen=True)
 class LandmarkParameters(_Parameters):
-    """The landmark model's parameters, *Probabilistic Robotics* section 6.6.
+    """Parameters of the landmark model, *Probabilistic Robotics* section 6.6.
 
-    A deviation of None leaves that part of every feature out.
+    A standard deviation of None leaves that part of every feature out.
 
     Raises:
-        TypeError: a value is not of its field's kind.
-        ValueError: a value breaks its field's rule, the two weights do not sum to 1 within 1e-6, or all deviations are
-            None.
+        TypeError: A value has the wrong type for its field.
+        ValueError: A value breaks its field's rule, the two weights do not sum to 1 within 1e-6, or all standard
+            deviations are None.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.LandmarkParameters(sigma_range=0.1, sigma_bearing=None, range_max=8.0).z_detect
+        0.95
     """
 
     sigma_range: float | None = 0.2
@@ -205,15 +230,15 @@ class LandmarkParameters(_Parameters):
     z_detect: float = 0.95
     """The weight of a feature that is a landmark, >= 0 [1]."""
     z_false: float = 0.05
-    """The weight of a feature that is none, a false positive, >= 0 [1]."""
+    """The weight of a false positive, a feature that is no landmark, >= 0 [1]."""
     range_max: float = 20.0
     """The largest range of a feature, > 0 [m]."""
     field_of_view: float = 2 * math.pi
-    """The angle in which features are seen, half to each side of the sensor's axis, in (0, 2 pi] [rad]."""
+    """The field of view, half to each side of the sensor's axis, in (0, 2 pi] [rad]."""
     signature_span: tuple[float, float] | None = None
-    """The smallest and largest signature of a feature; None for 4 deviations more than the map's own span."""
+    """The smallest and largest signature of a feature; None widens the map's span by 4 standard deviations."""
     p_detect: float = 0.9
-    """The probability that a landmark in view is seen, in [0, 1] [1]; used for negative information only."""
+    """The probability that a landmark in view is detected, in [0, 1] [1]; used for negative information only."""
 
     def __post_init__(self) -> None:
         names = ("sigma_range", "sigma_bearing", "sigma_signature")

@@ -1,4 +1,4 @@
-"""The range scanner's geometry, and what a reading of it says."""
+"""The geometry of a range scanner and the classes of its readings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from gpusense._util import checks
 
 
 class Reading(enum.IntEnum):
-    """The class of a reading, as :func:`classify` returns it."""
+    """The class of a reading, as :func:`classify` returns it.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.Reading(1)
+        <Reading.MAX: 1>
+    """
 
     MISSING = 0
     """No information: the beam is left out."""
@@ -26,27 +32,35 @@ class Reading(enum.IntEnum):
 
 
 class Scanner:
-    """The immutable geometry of a planar range scanner; equal and hashed by value.
+    """Immutable geometry of a planar range scanner; compared and hashed by value.
 
     A sonar is a scanner whose beams are cones: its expected range is the nearest return among ``cone_rays`` rays that
     are spread evenly over the cone's width, both edges included. Smooth walls are mirrors to sound: with
-    ``critical_incidence`` a ray that meets a wall at a larger angle of incidence (see ``RayCaster.incidence``) has no
-    return. Only beam models know cones; a likelihood field, which asks where a reading ends, takes each cone's axis.
+    ``critical_incidence``, a ray that meets a wall at a larger angle of incidence (see ``RayCaster.incidence``) has no
+    return. Only beam models use cones; a likelihood field scores the end point on each cone's axis.
 
     Args:
-        bearings: (K,) beam directions in the scanner's frame, counter-clockwise from its x axis [rad]; K may
-            be 0. Copied.
-        range_max: readings of at least this are "no return" [m], > 0.
-        range_min: readings below this are no information [m], at least 0 and less than ``range_max``. When it
-            is greater than 0, a reading of 0 is no information either.
-        mount: (x, y, theta) of the scanner in the robot's frame [m, m, rad].
-        cone: full width of each beam [rad], 0 (a laser) to 2 pi.
-        cone_rays: rays that a cone is made of, 1 (its axis) to 1024; a laser has one.
-        critical_incidence: largest angle of incidence that returns [rad], above 0 and at most pi / 2; None for all.
+        bearings: (K,) beam directions in the scanner's frame, counter-clockwise from its x axis [rad]; K may be 0.
+            Copied.
+        range_max: Readings of at least ``range_max`` are "no return" [m], > 0.
+        range_min: Readings below ``range_min`` carry no information [m], at least 0 and less than ``range_max``. If
+            ``range_min`` > 0, a reading of 0 carries no information either.
+        mount: Pose (x, y, theta) of the scanner in the robot's frame [m, m, rad].
+        cone: Full width of each beam [rad], 0 (a laser) to 2 pi.
+        cone_rays: Rays per cone, 1 (its axis) to 1024; a laser has one.
+        critical_incidence: Largest angle of incidence with a return [rad], above 0 and at most pi / 2; None for all.
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a shape or a value breaks the rules above.
+        TypeError: An argument has the wrong type.
+        ValueError: A shape or a value breaks a rule above.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 181), range_max=8.0)
+        Scanner(181 beams over 180 deg, range_max=8.0, range_min=0.0, mount=(0.0, 0.0, 0.0))
+        >>> sonars = gs.Scanner(np.radians([-90, -30, 30, 90]), range_max=4.0, cone=0.26)
+        >>> sonars.ray_bearings.shape
+        (4, 9)
     """
 
     __slots__ = ("_bearings", "_cone", "_cone_rays", "_critical", "_hash", "_mount", "_range_max", "_range_min")
@@ -62,9 +76,9 @@ class Scanner:
         cone_rays: int = 9,
         critical_incidence: float | None = None,
     ) -> None:
-        own: NDArray[np.float64] = np.array(checks.array("bearings", bearings, ("K",)))
-        own.setflags(write=False)
-        self._bearings = own
+        directions: NDArray[np.float64] = np.array(checks.array("bearings", bearings, ("K",)))
+        directions.setflags(write=False)
+        self._bearings = directions
         self._range_max = checks.real("range_max", range_max, above=0)
         self._range_min = checks.real("range_min", range_min, low=0)
         if self._range_min >= self._range_max:
@@ -78,7 +92,7 @@ class Scanner:
         if critical_incidence is not None:
             self._critical = checks.real("critical_incidence", critical_incidence, above=0, high=math.pi / 2)
         # Adding 0.0 makes -0.0 and 0.0, which are equal, hash alike.
-        self._hash = hash(((own + 0.0).tobytes(), *self._scalars()))
+        self._hash = hash(((directions + 0.0).tobytes(), *self._scalars()))
 
     @classmethod
     def uniform(
@@ -94,23 +108,23 @@ class Scanner:
         cone_rays: int = 9,
         critical_incidence: float | None = None,
     ) -> Scanner:
-        """A scanner of evenly spaced beams, as ``sensor_msgs/LaserScan`` describes it.
+        """Make a scanner of evenly spaced beams, as ``sensor_msgs/LaserScan`` describes it.
 
         Args:
-            angle_min: the bearing of beam 0 [rad].
-            angle_increment: from one beam to the next, positive counter-clockwise [rad]; beam k has the
-                bearing ``angle_min + k * angle_increment``.
-            count: the number of beams K, 0 to 2^31 - 1.
-            range_max: as for the class [m].
-            range_min: as for the class [m].
-            mount: as for the class [m, m, rad].
-            cone: as for the class [rad].
-            cone_rays: as for the class.
-            critical_incidence: as for the class [rad].
+            angle_min: Bearing of beam 0 [rad].
+            angle_increment: Step between beams, positive counter-clockwise [rad]; beam k has the bearing
+                ``angle_min + k * angle_increment``.
+            count: Number of beams K, 0 to 2^31 - 1.
+            range_max: See :class:`Scanner` [m].
+            range_min: See :class:`Scanner` [m].
+            mount: See :class:`Scanner` [m, m, rad].
+            cone: See :class:`Scanner` [rad].
+            cone_rays: See :class:`Scanner`.
+            critical_incidence: See :class:`Scanner` [rad].
 
         Raises:
-            TypeError: an argument is not of the kind described.
-            ValueError: a value breaks the rules above.
+            TypeError: An argument has the wrong type.
+            ValueError: A value breaks a rule above.
         """
         first = checks.real("angle_min", angle_min)
         step = checks.real("angle_increment", angle_increment)
@@ -129,22 +143,22 @@ class Scanner:
 
     @property
     def count(self) -> int:
-        """The number of beams K."""
+        """Number of beams K."""
         return self._bearings.size
 
     @property
     def range_max(self) -> float:
-        """Readings of at least this are "no return" [m]."""
+        """Upper limit of ranges [m]; readings of at least ``range_max`` are "no return"."""
         return self._range_max
 
     @property
     def range_min(self) -> float:
-        """Readings below this are no information [m]."""
+        """Lower limit of ranges [m]; readings below it carry no information."""
         return self._range_min
 
     @property
     def mount(self) -> tuple[float, float, float]:
-        """(x, y, theta) of the scanner in the robot's frame [m, m, rad]."""
+        """Pose (x, y, theta) of the scanner in the robot's frame [m, m, rad]."""
         return self._mount
 
     @property
@@ -154,17 +168,17 @@ class Scanner:
 
     @property
     def cone_rays(self) -> int:
-        """Rays that a beam is made of; 1 for a laser."""
+        """Rays per beam; 1 for a laser."""
         return self._cone_rays
 
     @property
     def critical_incidence(self) -> float | None:
-        """Largest angle of incidence that returns [rad]; None for all."""
+        """Largest angle of incidence with a return [rad]; None for all."""
         return self._critical
 
     @property
     def ray_bearings(self) -> NDArray[np.float64]:
-        """(K, cone_rays) directions of the rays of each beam in the scanner's frame [rad]; a single one is the axis."""
+        """(K, cone_rays) directions of the rays of each beam in the scanner's frame [rad]; a single ray is the axis."""
         between = self._cone / max(self._cone_rays - 1, 1)
         return self._bearings[:, None] + (np.arange(self._cone_rays) - (self._cone_rays - 1) / 2) * between
 
@@ -182,13 +196,14 @@ class Scanner:
     def __repr__(self) -> str:
         sonar = f", cone={self._cone}, cone_rays={self._cone_rays}" if self._cone > 0 else ""
         sonar += "" if self._critical is None else f", critical_incidence={self._critical}"
+        span = math.degrees(np.ptp(self._bearings)) if self.count else 0.0
         return (
-            f"Scanner({self.count} beams, range_max={self._range_max}, range_min={self._range_min}, "
-            f"mount={self._mount}{sonar})"
+            f"Scanner({self.count} beams over {span:.4g} deg, range_max={self._range_max}, "
+            f"range_min={self._range_min}, mount={self._mount}{sonar})"
         )
 
     def __reduce__(self) -> tuple[Callable[..., Scanner], tuple[Any, ...]]:
-        # Copies and pickles go through the constructor, so that their bearings are read-only too.
+        # Copies and pickles call the constructor, so that their bearings are read-only too.
         sonar = functools.partial(
             Scanner, cone=self._cone, cone_rays=self._cone_rays, critical_incidence=self._critical
         )
@@ -196,7 +211,7 @@ class Scanner:
 
 
 def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
-    """Class every reading of a scan, or of several scans, as a :class:`Reading`.
+    """Classify every reading of a scan, or of several scans, as a :class:`Reading`.
 
     ======================================================  ===========
     reading z                                               class
@@ -206,20 +221,26 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
     else                                                    ``HIT``
     ======================================================  ===========
 
-    The limits are rounded to the readings' own floating dtype before they are compared, so that a scanner's
-    ``range_max`` stored as float32 is recognised. Integers become float64. Source: REP-117 and the message
-    definition of ``sensor_msgs/LaserScan``.
+    The limits are rounded to the floating dtype of the readings before comparison, so that a ``range_max`` stored as
+    float32 is recognised. Integers become float64. Source: REP-117 and the message definition of
+    ``sensor_msgs/LaserScan``.
 
     Args:
         ranges: (K,) or (S, K) readings of any value [m].
-        scanner: the scanner they come from.
+        scanner: The scanner of these readings.
 
     Returns:
         uint8 of the same shape.
 
     Raises:
-        TypeError: ``ranges`` does not hold real numbers, or ``scanner`` is no :class:`Scanner`.
-        ValueError: the shape is neither (K,) nor (S, K).
+        TypeError: ``ranges`` does not hold real numbers, or ``scanner`` is not a :class:`Scanner`.
+        ValueError: The shape is neither (K,) nor (S, K).
+
+    Example:
+        >>> import gpusense as gs
+        >>> scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=8.0, range_min=0.1)
+        >>> gs.classify([2.5, 8.0, float("nan")], scanner).tolist()
+        [2, 1, 0]
     """
     if not isinstance(scanner, Scanner):
         raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
@@ -231,11 +252,11 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
 
 
 def classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:
-    """:func:`classify` for readings of any shape between two ranges."""
-    with np.errstate(over="ignore"):  # a range_max beyond float16 is infinite there
+    """Classify readings of any shape between two ranges; see :func:`classify`."""
+    with np.errstate(over="ignore"):  # range_max may exceed float16
         nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
     too_near = (z < nearest) | (z <= 0) if range_min > 0 else z < 0
-    kinds = np.full(z.shape, Reading.HIT, dtype=np.uint8)
-    kinds[z >= farthest] = Reading.MAX
-    kinds[too_near | np.isnan(z)] = Reading.MISSING
-    return kinds
+    result = np.full(z.shape, Reading.HIT, dtype=np.uint8)
+    result[z >= farthest] = Reading.MAX
+    result[too_near | np.isnan(z)] = Reading.MISSING
+    return result

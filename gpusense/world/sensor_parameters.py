@@ -1,4 +1,4 @@
-"""The intrinsic parameters of absolute, radio and contact sensors: frozen, validated dataclasses."""
+"""Intrinsic parameters of position, heading, beacon and bumper models: frozen, validated dataclasses."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.world.parameters import _Parameters
 
-# Up to this many degrees of freedom a t's mass is a short sum; with more it is a normal for all practical purposes.
+# Limit of degrees of freedom: up to it the mass of Student's t is a short sum; beyond it the t is nearly normal.
 MOST_DEGREES = 100
 
 
 def check_covariance(name: str, value: object) -> tuple[tuple[float, float], tuple[float, float]]:
-    """A symmetric positive definite 2 x 2 matrix.
+    """Return ``value`` after checking that it is a symmetric positive definite 2 x 2 matrix.
 
     Raises:
-        TypeError: not numbers.
-        ValueError: another shape, not finite, not symmetric, or not positive definite.
+        TypeError: The value does not hold numbers.
+        ValueError: The shape differs, or the matrix is not finite, symmetric and positive definite.
     """
     c = checks.array(name, value, (2, 2))
     if abs(c[0, 1] - c[1, 0]) > 1e-9 * np.sqrt(abs(c[0, 0] * c[1, 1])):
         raise ValueError(f"{name}: must be symmetric, got {checks.show(c.tolist())}")
     xx, yy, off = float(c[0, 0]), float(c[1, 1]), float(c[0, 1] / 2 + c[1, 0] / 2)
-    # Exactly, since what follows takes the root of the difference.
+    # In exact arithmetic, because models take the square root of the difference.
     if not (xx > 0 and yy > 0 and Fraction(off) ** 2 < Fraction(xx) * Fraction(yy)):
         raise ValueError(f"{name}: must be positive definite, got {checks.show(c.tolist())}")
     return (xx, off), (off, yy)
@@ -39,26 +39,31 @@ def _check_mount(parameters: object, value: object) -> None:
 
 @dataclass(frozen=True)
 class PositionParameters(_Parameters):
-    """Parameters of a position fix, such as that of a satellite receiver.
+    """Parameters of position fixes, such as those of a satellite receiver.
 
     Raises:
-        TypeError: a value is not of its field's kind.
-        ValueError: a value breaks its field's rule, both or neither of sigma and covariance make sense, or the weights
-            do not sum to 1 within 1e-6.
+        TypeError: A value has the wrong type for its field.
+        ValueError: A value breaks its field's rule, both sigma and covariance are given, or the weights do not sum to 1
+            within 1e-6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.PositionParameters(sigma=2.0, z_hit=0.9, z_rand=0.1, region=(0, 0, 100, 50)).region
+        (0.0, 0.0, 100.0, 50.0)
     """
 
     sigma: float | None = None
     """The standard deviation along x and along y, > 0 [m]."""
     covariance: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """Instead of sigma: the covariance matrix in the world [m^2]. Without either, every measurement has its own."""
+    """The covariance matrix in the world, in place of sigma [m^2]. Without both, each measurement brings its own."""
     z_hit: float = 1.0
     """The weight of a correct fix, >= 0 [1]."""
     z_rand: float = 0.0
-    """The weight of an outlier, which is anywhere in the region, >= 0 [1]."""
+    """The weight of an outlier, uniform in ``region``, >= 0 [1]."""
     region: tuple[float, float, float, float] | None = None
-    """Where outliers are: (x_min, y_min, x_max, y_max) in the world [m]; needed where z_rand > 0."""
+    """The rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; required if z_rand > 0."""
     mount: tuple[float, float] = (0.0, 0.0)
-    """Where the antenna is on the robot (x, y) [m]."""
+    """The antenna's position (x, y) on the robot [m]."""
 
     def __post_init__(self) -> None:
         if self.sigma is not None:
@@ -81,25 +86,30 @@ class PositionParameters(_Parameters):
 
 @dataclass(frozen=True)
 class HeadingParameters(_Parameters):
-    """Parameters of a heading, such as that of a compass.
+    """Parameters of heading readings, such as those of a compass.
 
     Raises:
-        TypeError: a value is not of its field's kind.
-        ValueError: a value breaks its field's rule, or the weights do not sum to 1 within 1e-6.
+        TypeError: A value has the wrong type for its field.
+        ValueError: A value breaks its field's rule, or the weights do not sum to 1 within 1e-6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.HeadingParameters(kind="von_mises", kappa=50.0).kappa
+        50.0
     """
 
     sigma: float = 0.1
     """The standard deviation before wrapping, > 0 [rad]; used by ``"wrapped_normal"``."""
     kappa: float = 100.0
-    """The concentration, >= 0 [1]; used by ``"von_mises"``; a large one is as a normal with 1 / sqrt(kappa)."""
+    """The concentration, >= 0 [1]; used by ``"von_mises"``; if large, nearly a normal with sigma 1 / sqrt(kappa)."""
     kind: Literal["wrapped_normal", "von_mises"] = "wrapped_normal"
-    """How correct readings are distributed around the truth."""
+    """The distribution of correct readings around the true heading."""
     z_hit: float = 1.0
     """The weight of a correct reading, >= 0 [1]."""
     z_rand: float = 0.0
-    """The weight of a reading that may be anything, >= 0 [1]."""
+    """The weight of a random reading, uniform over the circle, >= 0 [1]."""
     offset: float = 0.0
-    """What the sensor reads where the robot's heading is 0: its mount's yaw, less the magnetic declination [rad]."""
+    """The reading at a robot heading of 0: the mount's yaw less the magnetic declination [rad]."""
 
     def __post_init__(self) -> None:
         self._check("sigma", above=0)
@@ -114,16 +124,21 @@ class BeaconParameters(_Parameters):
     """Parameters of ranges to beacons, such as ultra-wideband radios.
 
     Raises:
-        TypeError: a value is not of its field's kind.
-        ValueError: a value breaks its field's rule, or the weights do not sum to 1 within 1e-6.
+        TypeError: A value has the wrong type for its field.
+        ValueError: A value breaks its field's rule, or the weights do not sum to 1 within 1e-6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.BeaconParameters(sigma_range=0.1, kind="student_t", nu=3).nu
+        3
     """
 
     sigma_range: float = 0.3
     """The standard deviation of a correct range, or a Student t's scale, > 0 [m]."""
     bias: float = 0.0
-    """By how much ranges are too long [m]."""
+    """The mean error of ranges; positive if they are too long [m]."""
     kind: Literal["normal", "student_t", "mixture"] = "normal"
-    """How correct ranges are distributed: normal, Student's t, or one normal and a wide one."""
+    """The distribution of correct ranges: a normal, Student's t, or a mixture of a normal and a wide normal."""
     nu: int = 4
     """The degrees of freedom of ``"student_t"``, 1 to 100 [1]."""
     heavy_weight: float = 0.1
@@ -133,11 +148,11 @@ class BeaconParameters(_Parameters):
     z_hit: float = 0.95
     """The weight of a correct range, >= 0 [1]."""
     z_rand: float = 0.05
-    """The weight of a range that may be anything up to range_max, >= 0 [1]."""
+    """The weight of a random range, uniform up to range_max, >= 0 [1]."""
     range_max: float = 100.0
     """The longest range that the radio can report, > 0 [m]."""
     mount: tuple[float, float] = (0.0, 0.0)
-    """Where the antenna is on the robot (x, y) [m]."""
+    """The antenna's position (x, y) on the robot [m]."""
 
     def __post_init__(self) -> None:
         for name in ("sigma_range", "sigma_heavy", "range_max"):
@@ -155,16 +170,21 @@ class BumperParameters(_Parameters):
     """Parameters of a bumper.
 
     Raises:
-        TypeError: a value is not a real number.
-        ValueError: a value breaks its field's rule.
+        TypeError: A value is not a real number.
+        ValueError: A value breaks its field's rule.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.BumperParameters(p_contact=0.9).to_dict()
+        {'p_contact': 0.9, 'p_false': 0.01, 'sigma': 0.05}
     """
 
     p_contact: float = 0.95
-    """The probability that a bumper which touches something is pressed, 0 to 1 [1]."""
+    """The probability that a bumper in contact with an obstacle is pressed, 0 to 1 [1]."""
     p_false: float = 0.01
-    """The probability that a bumper which touches nothing is pressed, 0 to 1 [1]."""
+    """The probability that a bumper without contact is pressed, 0 to 1 [1]."""
     sigma: float = 0.05
-    """The standard deviation of the outline and the map together, > 0 [m]."""
+    """The joint standard deviation of the outline and the map, > 0 [m]."""
 
     def __post_init__(self) -> None:
         self._check("p_contact", low=0, high=1)

@@ -1,4 +1,4 @@
-"""The table of a sensor: log p over readings and expected ranges, in bins of one width."""
+"""Interface of sensor tables: log p over readings and expected ranges, in bins of one width."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from numpy.typing import DTypeLike, NDArray
 
 
 class SensorTable(ABC):
-    """A table of a sensor, for ``BeamModel``: one look-up a beam, max readings too."""
+    """A table of a sensor for ``BeamModel``: one look-up per beam, max readings included."""
 
     range_max: float
-    """Readings of at least this are "no return", > 0 [m]."""
+    """Readings of at least ``range_max`` are "no return", > 0 [m]."""
     bins: int
-    """Bins of a range; one more is for no return."""
+    """Number of range bins; one more bin is for "no return"."""
 
     @abstractmethod
     def sensor_table(self, dtype: DTypeLike) -> NDArray[Any]:
-        """Return the (bins + 1, bins + 1) table by reading, then by expected range: log densities or probabilities.
+        """Return the (bins + 1, bins + 1) table of log densities by bin of the reading, then of the expected range.
+
+        Its last row, "no return", holds log probabilities.
 
         Raises:
-            ValueError: some logarithm does not fit the dtype.
+            ValueError: A logarithm does not fit the dtype.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""The part of a map that a cloud of particles can reach: everything else is left out until the cloud moves there."""
+"""Windows of a map: the part that a cloud of particles can reach. The rest is left out until the cloud moves there."""
 
 from __future__ import annotations
 
@@ -11,21 +11,28 @@ import numpy as np
 from gpusense.world.frames import Cells, Mount
 from gpusense.world.grid import OccupancyGrid
 
-# Poses that enclose others.
+# Poses [m, m, rad] whose box holds all poses of a cloud.
 Corners = Sequence[tuple[float, float, float]]
-# Maps smaller than this are prepared faster than it takes to think about it.
+# A map with fewer cells is prepared as a whole.
 SMALLEST_CELLS = 1 << 20
-# Distances in cells are squared in 32 bits, so no window may be longer.
+# Longest side of a window [cells]: distances in cells are squared in 32 bits.
 LONGEST_SIDE = (1 << 15) - 1
-# A region that covers more than this share of the map is not worth refreshing.
+# A window with a larger share of the map's cells is replaced by the whole map.
 LARGEST_SHARE = 0.6
-# Room to move, as a share of the reach, before a region is made anew.
+# Margin for motion around a new window, as a share of the reach.
 SLACK = 0.5
 
 
 @dataclass(frozen=True)
-class Region:
-    """Half-open window of a grid's rows and columns."""
+class Window:
+    """Half-open window of a grid's rows and columns.
+
+    Attributes:
+        row: First row.
+        col: First column.
+        rows: Number of rows.
+        cols: Number of columns.
+    """
 
     row: int
     col: int
@@ -37,8 +44,8 @@ class Region:
         """Number of cells."""
         return self.rows * self.cols
 
-    def contains(self, other: Region) -> bool:
-        """Whether the other window lies inside."""
+    def contains(self, other: Window) -> bool:
+        """Return whether ``other`` lies inside this window."""
         return (
             self.row <= other.row
             and self.col <= other.col
@@ -46,49 +53,63 @@ class Region:
             and other.col + other.cols <= self.col + self.cols
         )
 
-    def grown(self, by: int, shape: tuple[int, int]) -> Region:
-        """The window with so many more cells on every side, as far as there are cells in an array of that shape."""
-        row, col = max(self.row - by, 0), max(self.col - by, 0)
-        bottom, right = min(self.row + self.rows + by, shape[0]), min(self.col + self.cols + by, shape[1])
-        return Region(row, col, bottom - row, right - col)
+    def grown(self, margin: int, shape: tuple[int, int]) -> Window:
+        """Return this window with ``margin`` more cells on every side, clamped to an array of shape ``shape``."""
+        row, col = max(self.row - margin, 0), max(self.col - margin, 0)
+        bottom, right = min(self.row + self.rows + margin, shape[0]), min(self.col + self.cols + margin, shape[1])
+        return Window(row, col, bottom - row, right - col)
 
-    def shared(self, other: Region) -> Region | None:
-        """The cells in both windows; None without any."""
+    def shared(self, other: Window) -> Window | None:
+        """Return the intersection with ``other``; None if it is empty."""
         row, col = max(self.row, other.row), max(self.col, other.col)
         rows = min(self.row + self.rows, other.row + other.rows) - row
         cols = min(self.col + self.cols, other.col + other.cols) - col
-        return Region(row, col, rows, cols) if rows > 0 and cols > 0 else None
+        return Window(row, col, rows, cols) if rows > 0 and cols > 0 else None
 
-    def moved(self, rows: int, cols: int) -> Region:
-        """The window so many rows and columns farther on."""
-        return Region(self.row + rows, self.col + cols, self.rows, self.cols)
+    def joined(self, other: Window) -> Window:
+        """Return the smallest window that contains this one and ``other``."""
+        row, col = min(self.row, other.row), min(self.col, other.col)
+        return Window(
+            row,
+            col,
+            max(self.row + self.rows, other.row + other.rows) - row,
+            max(self.col + self.cols, other.col + other.cols) - col,
+        )
+
+    def moved(self, rows: int, cols: int) -> Window:
+        """Return this window translated by ``rows`` and ``cols``."""
+        return Window(self.row + rows, self.col + cols, self.rows, self.cols)
 
     def cut(self, array: np.ndarray) -> np.ndarray:
-        """The window of a (H, W) array."""
+        """Return the view of an (H, W) array in this window."""
         return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
 
 
-Window = Region
+# The name that other rooms still import.
+Region = Window
 
 
-def box(cells: np.ndarray) -> Region | None:
-    """The smallest window of all that is True in a (H, W) array; None where nothing is."""
+def box(cells: np.ndarray) -> Window | None:
+    """Return the smallest window that holds all True cells of an (H, W) array; None without any."""
     rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     if len(rows) == 0:
         return None
     row, col = int(rows[0]), int(cols[0])
-    return Region(row, col, int(rows[-1]) + 1 - row, int(cols[-1]) + 1 - col)
+    return Window(row, col, int(rows[-1]) + 1 - row, int(cols[-1]) + 1 - col)
 
 
-def whole(grid: OccupancyGrid) -> Region:
-    """The window of all cells."""
-    return Region(0, 0, *grid.shape)
+def whole(grid: OccupancyGrid) -> Window:
+    """Return the window of all cells."""
+    return Window(0, 0, *grid.shape)
 
 
 def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, float, float]:
-    """Least and largest column and row, in cells, that a sensor of poses within these corners can have.
+    """Return bounds of the sensor's position for poses within ``corners``.
 
-    A call has four corners: numbers of Python's are faster than arrays of four.
+    A call has four corners, for which Python's numbers are faster than arrays.
+
+    Returns:
+        Least and largest column, least and largest row [cells].
     """
     from_x, from_y, yaw = grid.origin
     size, margin = grid.resolution, math.hypot(mount[0], mount[1]) / grid.resolution
@@ -103,15 +124,15 @@ def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, f
     return min(cols) - margin, max(cols) + margin, min(rows) - margin, max(rows) + margin
 
 
-def needed(grid: OccupancyGrid, corners: Corners, mount: Mount, reach: float, slack: float = 0.0) -> Region:
-    """Smallest window that holds all cells within ``reach`` cells of any sensor, at least one cell.
+def needed(grid: OccupancyGrid, corners: Corners, mount: Mount, reach: float, slack: float = 0.0) -> Window:
+    """Return the smallest window that holds all cells within ``reach`` cells of any sensor, at least one cell.
 
     Args:
         grid: The map.
-        corners: Poses [m, m, rad], at least one, between which all others lie.
+        corners: Poses [m, m, rad], at least one; their box holds all poses.
         mount: The sensor's pose on the robot.
-        reach: Longest distance in cells that matters, ring and rounding included.
-        slack: Cells added on every side.
+        reach: Longest distance that matters, ring and rounding included [cells].
+        slack: Additional margin on every side [cells].
     """
     left, right, low, high = extent(grid, corners, mount)
     margin = reach + slack + 3
@@ -119,11 +140,15 @@ def needed(grid: OccupancyGrid, corners: Corners, mount: Mount, reach: float, sl
     low_col, high_col = (int(min(max(v, 0), cols)) for v in (left - margin, right + margin))
     low_row, high_row = (int(min(max(v, 0), rows)) for v in (low - margin, high + margin))
     low_col, low_row = min(low_col, cols - 1), min(low_row, rows - 1)
-    return Region(low_row, low_col, max(high_row - low_row, 1), max(high_col - low_col, 1))
+    return Window(low_row, low_col, max(high_row - low_row, 1), max(high_col - low_col, 1))
 
 
-def choose(grid: OccupancyGrid, current: Region | None, corners: Corners, mount: Mount, reach: float) -> Region:
-    """The window to prepare for a cloud within these corners: the current one where it suffices, else one with room."""
+def choose(grid: OccupancyGrid, current: Window | None, corners: Corners, mount: Mount, reach: float) -> Window:
+    """Choose the window to prepare for a cloud of poses within ``corners``.
+
+    Returns:
+        ``current`` if it suffices, else a window with a margin for motion, or the whole map.
+    """
     everything = whole(grid)
     long = max(grid.shape) > LONGEST_SIDE
     if current == everything or (everything.cells < SMALLEST_CELLS and not long):
@@ -135,14 +160,8 @@ def choose(grid: OccupancyGrid, current: Region | None, corners: Corners, mount:
     if max(roomy.rows, roomy.cols) > LONGEST_SIDE:
         roomy = least
     if current is not None:
-        row, col = min(roomy.row, current.row), min(roomy.col, current.col)
-        joined = Region(
-            row,
-            col,
-            max(roomy.row + roomy.rows, current.row + current.rows) - row,
-            max(roomy.col + roomy.cols, current.col + current.cols) - col,
-        )
-        # A cloud that jumped far away does not drag its old window along.
+        joined = roomy.joined(current)
+        # The old window is dropped after a jump, since the joint window would be much larger than both.
         near = joined.cells <= 2 * (roomy.cells + current.cells)
         roomy = joined if near and max(joined.rows, joined.cols) <= LONGEST_SIDE else roomy
     return everything if roomy.cells > LARGEST_SHARE * everything.cells and not long else roomy

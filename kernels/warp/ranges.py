@@ -1,20 +1,20 @@
 """Expected ranges of poses and bearings by any caster."""
 
 import functools
+import importlib
 
 import warp as wp
 
-from . import bresenham, cddt, dda, lookup, march, raycast
+from gpusense.interface.casters import caster_file
+
 from . import ray as ray_file
 from .prelude import kernel, precision, reader, work_item, writer
 from .tiles import tile_place, tile_ray, tile_step
 
-CASTERS = {"DDA": dda, "MARCH": march, "BRESENHAM": bresenham, "CDDT": cddt, "LOOKUP": lookup}
-
 
 def caster_of(flags):
     """Return the kernel file of the caster of a set of flags."""
-    return next((CASTERS[flag] for flag in CASTERS if flag in flags), raycast)
+    return importlib.import_module(f".{caster_file(flags)}", __package__)
 
 
 @functools.cache

@@ -100,9 +100,9 @@ M, G = "Robot1_Measurement.dat", "Robot1_Groundtruth.dat"
         (M, "# nothing\n", f"{M}: must hold rows of time, barcode, range, bearing, got none"),
         (M, "1 5 2 0\n", f"{M}: must hold readings of landmarks, got none"),
         (G, "0 0 0\n", f"{G}:1: must have 4 fields (time, x, y, heading), got 3"),
-        ("Barcodes.dat", "6 106\n7 106\n", "Barcodes.dat:2: every barcode must stand there once, got 106 again"),
+        ("Barcodes.dat", "6 106\n7 106\n", "Barcodes.dat:2: every barcode must occur once, got 106 again"),
         ("Landmark_Groundtruth.dat", "6 0 0 0 0\n6 1 1 0 0\n",
-         "Landmark_Groundtruth.dat: every subject must stand there once"),
+         "Landmark_Groundtruth.dat: every subject must occur once"),
     ],
 )  # fmt: skip
 def test_bad_files(capsys, folder, tmp_path, file, text, message):

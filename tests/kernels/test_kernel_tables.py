@@ -25,8 +25,9 @@ from support.kernel_scenes import (
 
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.rectangles import OCCUPIED, slope
-from gpusense.tables.distances import empty_rectangles, packed
-from gpusense.world.windows import Region
+from gpusense.tables.cells import packed
+from gpusense.tables.rectangles import empty_rectangles
+from gpusense.world.windows import Window
 
 # ---- distances
 
@@ -235,28 +236,28 @@ def test_free_cells_of_a_part_leave_the_others_alone(occupied: np.ndarray, devic
         assert (outside == 7).all()
 
 
-def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Region]:
+def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Window]:
     """Return edits of single cells, among them the four corners, and of windows, among them those at borders."""
     rows, cols = shape
     places = [(0, 0), (0, cols - 1), (rows - 1, 0), (rows - 1, cols - 1), (rows // 2, cols // 2)]
-    windows = [Region(row, col, 1, 1) for row, col in places]
+    windows = [Window(row, col, 1, 1) for row, col in places]
     for number in range(6):
         high, wide = min(int(rng.integers(1, 40)), rows), min(int(rng.integers(1, 40)), cols)
         row, col = int(rng.integers(0, rows - high + 1)), int(rng.integers(0, cols - wide + 1))
         row = [0, rows - high, row][number % 3]
         col = [0, col, cols - wide][number // 2]
-        windows.append(Region(row, col, high, wide))
+        windows.append(Window(row, col, high, wide))
     return windows
 
 
 @functools.cache
 def made_anew(
     shape: tuple[int, int], share: float, sectors: int, kind: str
-) -> list[tuple[np.ndarray, Region | None, bytes]]:
+) -> list[tuple[np.ndarray, Window | None, bytes]]:
     """Yield a map after each edit: the map, the changed window, and the compressed rectangles made anew."""
     rng = np.random.default_rng(5)
     occupied = rng.random(shape) < share
-    found: list[tuple[np.ndarray, Region | None, bytes]] = []
+    found: list[tuple[np.ndarray, Window | None, bytes]] = []
     for number, changed in enumerate([None, *edits(rng, shape)], -1):
         if changed is not None:
             part = changed.cut(occupied)
@@ -294,7 +295,7 @@ def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(
     empty = made(device, occupied, sectors)
     for number in range(2):
         occupied[place] = number == 0
-        mended = made(device, occupied, sectors, rectangles, Region(*place, 1, 1))
+        mended = made(device, occupied, sectors, rectangles, Window(*place, 1, 1))
         expected = planes_of(occupied, sectors, kind) if number == 0 else empty
         np.testing.assert_array_equal(mended, expected)
         if number == 0:

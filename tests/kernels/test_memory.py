@@ -25,8 +25,8 @@ from gpusense.backends import get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.tables.casters import CASTERS, Lookup, March
 from gpusense.world.frames import frame_scalars
-from gpusense.tables.distances import empty_rectangles
-from gpusense.world.windows import Region
+from gpusense.tables.rectangles import empty_rectangles
+from gpusense.world.windows import Window
 
 rng = np.random.default_rng(0)
 cells = np.zeros((13, 17), int)
@@ -34,7 +34,7 @@ cells[rng.random(cells.shape) < 0.08] = 100
 grid = gs.OccupancyGrid(cells, 0.1, (-0.3, 0.2, 0.3))
 wrong = np.count_nonzero(gs.distance_transform(cells, backend=BACKEND) != gs.distance_transform(cells, backend="numpy"))
 device, numpy = get_backend(BACKEND), NumpyBackend()
-changed, part = cells > 0, Region(4, 0, 3, 5)
+changed, part = cells > 0, Window(4, 0, 3, 5)
 part.cut(changed)[...] = ~part.cut(changed)
 
 

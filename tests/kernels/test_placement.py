@@ -26,7 +26,7 @@ from gpusense.interface.sources import assemble, relevant, uses_double
 from gpusense.reference import heading
 from gpusense.reference.placement import FARTHEST
 from gpusense.world.frames import frame_scalars, place_poses
-from gpusense.world.windows import Region
+from gpusense.world.windows import Window
 
 WORST = TOLERANCES["cosines and sines of headings"].value
 PRECISIONS = ("float32", "float64")
@@ -134,7 +134,7 @@ FRAMES = {
     "far away": (0.05, (4.5e5, 5e6, 2.0), (0.3, 0.1, 0.0)),
     "tiny cells": (0.001, (0.1, -0.2, math.pi), (0.0, 0.0, 0.0)),
 }
-ROWS, COLS, WINDOW = 700, 900, Region(100, 50, 400, 600)
+ROWS, COLS, WINDOW = 700, 900, Window(100, 50, 400, 600)
 
 
 def grid_of(name: str) -> gs.OccupancyGrid:

@@ -13,6 +13,7 @@ import numpy as np
 from support import bad_input_landmarks
 
 import gpusense as gs
+from gpusense.interface.casters import ENTRIES
 from gpusense.tables import casters
 
 Action = Callable[[], object]
@@ -29,7 +30,7 @@ MODEL = gs.BeamModel(GRID, SCANNER, backend="numpy")
 FIELD = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
 CASTER = gs.RayCaster(GRID, 5.0, backend="numpy")
 
-CASTERS = "'exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup'"
+CASTERS = ", ".join(map(repr, ENTRIES))
 
 
 def beam(**changes: Any) -> Action:

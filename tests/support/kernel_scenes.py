@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.interface.signatures import KERNELS
-from gpusense.tables.distances import empty_rectangles
+from gpusense.tables.rectangles import empty_rectangles
 
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05

@@ -11,7 +11,7 @@ from support.ray_oracles import Ray, walk
 
 from gpusense.backends import get_backend
 from gpusense.interface.lanes import widened
-from gpusense.tables.distances import empty_rectangles
+from gpusense.tables.rectangles import empty_rectangles
 
 LAST_FLOAT32 = 1 - 2.0**-24
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, LAST_FLOAT32)

@@ -15,11 +15,13 @@ from support.raycast_scenes import cast as scene_cast
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.interface.casters import ENTRIES
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
-from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March, Window
+from gpusense.tables.caster_base import CasterInput
+from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
-from gpusense.tables.distances import sectors_of
+from gpusense.tables.rectangles import sectors_of
 from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "casters.md"
@@ -52,9 +54,9 @@ def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, mon
     monkeypatch.setattr(windows, "SMALLEST_CELLS", 100)
     cropped = caster(backend=backend)
     cropped.prepare([[200.5, 150.5, 0.0]])
-    before = cropped._caster.map.region
+    before = cropped._caster.map.window
     same_bits(cropped.cast(poses, bearings), whole)
-    assert cropped._caster.map.region == before and before.cells < grid.cells.size / 4
+    assert cropped._caster.map.window == before and before.cells < grid.cells.size / 4
 
 
 @pytest.mark.parametrize("kind", [Exact(), Dda(), Bresenham(), March(), Cddt(36), Lookup(8)], ids=by_name)
@@ -80,7 +82,9 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     flags = {kind.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
     flags |= {"OUTSIDE_OCCUPIED"} if scene.outside_occupied else set()
     flags |= {"ORIGINS_OUTSIDE"} if not ((scene.cell >= 0) & (scene.cell < (cols, rows))).all() else set()
-    table = kind.prepare(device, Window(scene.occupied, scene.limit, "occupied" if scene.outside_occupied else "free"))
+    table = kind.prepare(
+        device, CasterInput(scene.occupied, scene.limit, "occupied" if scene.outside_occupied else "free")
+    )
     flags |= table.flags
     pose, count = np.concatenate([scene.frac, scene.direction], axis=1), len(scene.cell)
     result = device.empty(count, real)
@@ -167,7 +171,7 @@ def test_a_table_too_large_for_the_device_is_an_error_that_names_sizes(name, nee
 
 def test_methods_list_every_caster():
     methods = {method.name: method for method in gs.RayCaster.methods()}
-    assert list(methods) == ["exact", "dda", "march", "bresenham", "cddt", "lookup"] == list(casters.CASTERS)
+    assert list(methods) == list(ENTRIES) == list(casters.CASTERS)
     for name, method in methods.items():
         assert all(dataclasses.astuple(method)) and method.backends == ("numpy", "opencl", "warp")
         assert method.error.startswith("exact") == casters.CASTERS[name].exact

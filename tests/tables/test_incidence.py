@@ -12,7 +12,7 @@ from support.raycast_scenes import FAMILIES, Scene, scenes_of
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, differing
-from gpusense.tables.distances import empty_rectangles
+from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world import windows
 
 # ---------------------------------------------------------------------------------------------------------- normals
@@ -104,8 +104,8 @@ def test_normals_do_not_depend_on_how_a_map_is_cut():
     rng = np.random.default_rng(3)
     obstacles = rng.random((70, 90)) < 0.2
     for outside in ("free", "occupied"):
-        everything = normals.normal_table(obstacles, windows.Region(0, 0, 70, 90), outside, np.dtype(float))
-        for part in (windows.Region(0, 0, 20, 30), windows.Region(33, 41, 37, 49), windows.Region(10, 80, 5, 1)):
+        everything = normals.normal_table(obstacles, windows.Window(0, 0, 70, 90), outside, np.dtype(float))
+        for part in (windows.Window(0, 0, 20, 30), windows.Window(33, 41, 37, 49), windows.Window(10, 80, 5, 1)):
             cut = normals.normal_table(obstacles, part, outside, np.dtype(float))
             want = everything[part.row : part.row + part.rows + 2, part.col : part.col + part.cols + 2]
             np.testing.assert_array_equal(cut, want)
@@ -250,8 +250,8 @@ def test_a_cropped_or_changed_map_has_the_angles_of_a_new_one(backend, monkeypat
     caster.prepare([[200.5, 150.5, 0.0]])
     tolerance = TOLERANCES["float32 angles of incidence"]
     found = caster.incidence(poses, bearings)
-    assert caster._caster.map.region.cells < cells.size / 4
-    assert caster.table_bytes > 8 * caster._caster.map.region.cells
+    assert caster._caster.map.window.cells < cells.size / 4
+    assert caster.table_bytes > 8 * caster._caster.map.window.cells
     np.testing.assert_array_equal(np.isnan(found), np.isnan(whole))
     assert tolerance.difference(np.nan_to_num(found), np.nan_to_num(whole)) <= tolerance.value
     patch = np.full((6, 2), 100)

@@ -10,7 +10,8 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.reference import march as march_reference
-from gpusense.tables.casters import March, Window
+from gpusense.tables.caster_base import CasterInput
+from gpusense.tables.casters import March
 
 LEAST_PART = 2.0**-22
 
@@ -79,7 +80,7 @@ class Counting:
 
 def steps(grid: gs.OccupancyGrid, poses: np.ndarray, kind: March, limit: float) -> int:
     """Return the look-ups of the reference, a ray along each pose's heading."""
-    table = Counting(kind.prepare(get_backend("numpy"), Window(grid.occupied, limit, "free")).buffer)
+    table = Counting(kind.prepare(get_backend("numpy"), CasterInput(grid.occupied, limit, "free")).buffer)
     cell = np.floor(poses[:, :2])
     pose = np.column_stack([poses[:, :2] - cell, np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     ahead, (_, slack, tolerance) = np.tile([1.0, 0.0], (len(pose), 1)), kind.scalars()

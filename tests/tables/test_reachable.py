@@ -36,7 +36,7 @@ def test_a_cropped_map_gives_the_same_bits(kind, outside, backend, monkeypatch):
             owner = make(kind, grid, backend, outside=outside, **options)
             found = [owner.log_likelihood(poses, z) for poses in tour]
         (table,) = parts_of_kind(owner, ReachableMap)
-        return found, [table.preparations, table.region.cells]
+        return found, [table.preparations, table.window.cells]
 
     whole, (preparations, cells) = results()
     assert (preparations, cells) == (1, 400 * 500)
@@ -64,4 +64,4 @@ def test_a_window_is_kept_while_the_cloud_stays(backend, monkeypatch):
         model.expected_ranges(poses)
     (table,) = parts_of_kind(model, ReachableMap)
     assert table.preparations == 1
-    assert table.region.cells < 0.5 * 400 * 500
+    assert table.window.cells < 0.5 * 400 * 500

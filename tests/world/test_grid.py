@@ -97,8 +97,8 @@ def test_copies_are_equal_and_read_only(twin):
 
 def test_repr_names_what_matters():
     grid = OccupancyGrid(CELLS, 0.1, (1, 2, 0))
-    expected = "OccupancyGrid(2 x 3 cells, resolution=0.1, origin=(1.0, 2.0, 0.0), occupied_threshold=65)"
-    assert repr(grid) == expected
+    text = "OccupancyGrid(2 x 3 cells, 50% occupied, resolution=0.1, origin=(1.0, 2.0, 0.0), occupied_threshold=65)"
+    assert repr(grid) == text
 
 
 def test_cell_zero_touches_the_origin():

@@ -68,7 +68,7 @@ def test_copies_are_equal_and_read_only(twin):
 
 def test_repr_is_short():
     text = repr(Scanner(np.zeros(1000), 5.0))
-    assert text == "Scanner(1000 beams, range_max=5.0, range_min=0.0, mount=(0.0, 0.0, 0.0))"
+    assert text == "Scanner(1000 beams over 0 deg, range_max=5.0, range_min=0.0, mount=(0.0, 0.0, 0.0))"
 
 
 @pytest.mark.parametrize(

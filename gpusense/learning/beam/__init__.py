@@ -1,1 +1,6 @@
-"""Parameters of the beam model from readings and expected ranges."""
+"""Parameters of the beam model, learned from readings and expected ranges (book section 6.3.3).
+
+``fit`` and ``incidence`` hold the public functions, with the ``options`` that they share. ``pairs`` classifies the
+readings, ``device_sums`` sums over them on a device, ``problem`` computes the log-likelihood and its derivatives from
+the sums. ``em``, ``book`` and ``searches`` maximise it; ``uncertainty``, ``report`` and ``result`` describe the result.
+"""

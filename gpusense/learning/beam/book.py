@@ -1,4 +1,4 @@
-"""The book's EM as printed (table 6.2), for teaching and comparison; its failures are told, not mended."""
+"""The book's EM as printed (table 6.2), for teaching and comparison; its failures are reported, not corrected."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _SMALLEST = 1e-150
 def climb_book(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
     """Repeat lines 3 to 15 of table 6.2 until the log-likelihood changes by at most ``tolerance`` nats.
 
-    sigma_hit and lambda_short are the closed forms of the book, which ignore the components' normalisers, and no bounds
-    hold them. What goes wrong ends in the notes: steps in which the log-likelihood fell, and a shape that became 0,
-    infinite or undefined, where the last finite parameters are kept.
+    sigma_hit and lambda_short follow the closed forms of the book, which ignore the components' normalisers; no bounds
+    apply. The notes report steps in which the log-likelihood fell, and a shape that became 0, infinite or undefined;
+    the result then has the last finite parameters.
     """
     value = problem.value(start)
     trace = [value.objective]
@@ -37,14 +37,14 @@ def climb_book(problem: Problem, start: Point, *, max_iterations: int, tolerance
         if broken:
             notes += broken
             break
-        found = problem.value(point)
-        change = found.objective - value.objective
-        if not math.isfinite(found.objective):
-            notes.append(f"the log-likelihood became {found.objective} in iteration {iteration}")
+        following = problem.value(point)
+        change = following.objective - value.objective
+        if not math.isfinite(following.objective):
+            notes.append(f"the log-likelihood became {following.objective} in iteration {iteration}")
             break
         if change < -problem.noise(value):
             falls, deepest = falls + 1, max(deepest, -change)
-        value = found
+        value = following
         trace.append(value.objective)
         watch(iteration, value)
         if abs(change) <= tolerance:
@@ -58,7 +58,7 @@ def climb_book(problem: Problem, start: Point, *, max_iterations: int, tolerance
 
 
 def book_step(problem: Problem, value: Value) -> Point:
-    """Lines 10 to 15 of table 6.2; NaN where the book divides 0 by 0."""
+    """Compute lines 10 to 15 of table 6.2; NaN for 0 / 0."""
     sums = value.sums
     with np.errstate(all="ignore"):
         sigma = math.sqrt(float(sums[11] / sums[1 + HIT])) if sums[1 + HIT] > 0 else math.nan

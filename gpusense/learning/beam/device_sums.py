@@ -1,4 +1,4 @@
-"""Sums over all pairs, taken on a device: pairs are uploaded once, a pass brings back a row for each block."""
+"""Sum over all pairs on a device: pairs are uploaded once, and each pass downloads one row of sums per block."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from gpusense.interface.terms import log_weight, rounded_terms
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Point
 
-# Numbers in a row of sums; see kernels/opencl/learning.cl.
+# Length of a row of sums, without and with second derivatives; see kernels/opencl/learning.cl.
 _SUMS = {False: 14, True: 40}
-# Blocks of a pass at most, pairs of a block at least, and pairs that lie together on a device at most.
+# Most blocks per pass, fewest pairs per block, and most pairs in one buffer.
 _BLOCKS = {"cpu": 4096, "gpu": 32768}
 _SHORTEST = 16
 _CHUNK = 1 << 26
@@ -27,7 +27,17 @@ _FLAGS = frozenset({"HIT", "SHORT", "RAND"})
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Some pairs on the device: ``blocks`` blocks of ``readings`` pairs, of which the last may be filled up."""
+    """Pairs in one buffer on the device: ``blocks`` blocks of ``readings`` pairs, the last one padded with NaN.
+
+    Attributes:
+        reading: Readings [m].
+        expected: Expected ranges [m].
+        count: Number of pairs.
+        blocks: Number of blocks.
+        readings: Pairs per block.
+        across: Stride from one block to the next.
+        along: Stride from one pair of a block to the next.
+    """
 
     reading: Any
     expected: Any
@@ -39,11 +49,12 @@ class _Chunk:
 
     @property
     def layout(self) -> tuple[int, int, int, int]:
+        """Layout arguments of the kernels."""
         return self.blocks, self.readings, self.across, self.along
 
 
 class DeviceSums:
-    """The pairs on a device, and what may be asked about them.
+    """Pairs on a device and sums over them.
 
     Args:
         backend: The device.
@@ -51,8 +62,8 @@ class DeviceSums:
         pairs: Readings and expected ranges.
 
     Attributes:
-        real: That precision.
-        passes: How often the pairs were summed over.
+        real: Precision of the kernels.
+        passes: Number of passes over the pairs so far.
     """
 
     def __init__(self, backend: Backend, real: np.dtype, pairs: Pairs) -> None:
@@ -60,7 +71,7 @@ class DeviceSums:
         self._range_max = pairs.range_max
         self._flags = _FLAGS | (frozenset({"FLOAT64"}) if real == np.float64 else frozenset())
         self.passes = 0
-        # The NumPy reference goes through a block's places one after the other, over all blocks at once.
+        # The NumPy reference has the processor's layout: it loops over a block's places, over all blocks at once.
         gpu = backend.info.kind == "gpu"
         most = min(_CHUNK, backend.info.max_buffer // (8 * real.itemsize))
         self._chunks = [
@@ -73,23 +84,23 @@ class DeviceSums:
     def _upload(self, reading: NDArray[np.floating], expected: NDArray[np.floating], gpu: bool) -> _Chunk:
         count = len(reading)
         length = max(_SHORTEST, -(-count // _BLOCKS["gpu" if gpu else "cpu"]))
-        # A processor's lanes take pairs that lie side by side, and are always full.
+        # A processor's lanes take adjacent pairs and are always full.
         length += 0 if gpu else -length % LANES
         blocks = -(-count // length)
-        filled = np.full((2, blocks * length), np.nan, self.real)
-        filled[0, :count], filled[1, :count] = reading, expected
-        # On a GPU neighbouring work-items read neighbouring pairs, on a processor each reads its own stretch.
+        padded = np.full((2, blocks * length), np.nan, self.real)
+        padded[0, :count], padded[1, :count] = reading, expected
+        # On a GPU neighbouring work-items read neighbouring pairs; on a processor each reads a contiguous block.
         across, along = (1, blocks) if gpu else (length, 1)
-        z, ahead = (self._backend.upload(np.ascontiguousarray(row)) for row in filled)
-        return _Chunk(z, ahead, count, blocks, length, across, along)
+        z, z_expected = (self._backend.upload(np.ascontiguousarray(row)) for row in padded)
+        return _Chunk(z, z_expected, count, blocks, length, across, along)
 
     @property
     def selection(self) -> str:
-        """What selects the device."""
+        """The text that selects the device."""
         return self._backend.info.selection
 
     def terms(self, point: Point) -> NDArray[np.floating]:
-        """(12,) the kernels' numbers of a set of parameters."""
+        """Return the (12,) terms of the kernels for a set of parameters."""
         hit, short, top, rand = point.weights
         log_scale = log_weight(hit) - math.log(point.sigma) - 0.5 * math.log(2 * math.pi)
         shape = (0.5 / point.sigma / point.sigma, math.sqrt(0.5) / point.sigma)
@@ -98,7 +109,15 @@ class DeviceSums:
         return np.append(terms, np.array([point.bias, 1 / point.sigma]).astype(self.real))
 
     def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:
-        """(14,) or, with second derivatives, (40,) sums over the hits in float64; the order of addition is fixed."""
+        """Sum over the hits, in a fixed order of addition.
+
+        Args:
+            point: The parameters.
+            information: Whether to sum the terms of second derivatives, too.
+
+        Returns:
+            (14,) or, with second derivatives, (40,) float64.
+        """
         width = _SUMS[information]
         flags = self._flags | (frozenset({"INFORMATION"}) if information else frozenset())
         total = np.zeros(width)
@@ -112,18 +131,18 @@ class DeviceSums:
             launch((chunk.blocks,), chunk.reading, chunk.expected, terms, self._rows, *chunk.layout, width)
             rows = backend.download(self._rows, np.empty((chunk.blocks, width), self.real))
             total += np.ascontiguousarray(rows.T, np.float64).sum(axis=1)
-        # An impossible pair has log p = -inf, which compensated sums turn into nan.
+        # Compensated sums convert the log p = -inf of an impossible pair to NaN.
         total[0] = -math.inf if math.isnan(total[0]) else total[0]
         return total
 
     def causes(self, point: Point) -> NDArray[np.float64]:
-        """(M, 4) log p and the responsibilities of hit, short and rand for each hit."""
+        """Return (M, 4) log p and the responsibilities of hit, short and rand for each hit."""
         backend = self._backend
-        found = [np.empty((0, 4))]
+        rows = [np.empty((0, 4))]
         terms = backend.upload(self.terms(point)) if self._chunks else None
         for chunk in self._chunks:
             out = backend.empty(4 * chunk.blocks * chunk.readings, self.real)
             launch = backend.compile("pair_causes", self._flags)
             launch((chunk.blocks,), chunk.reading, chunk.expected, terms, out, *chunk.layout)
-            found.append(backend.download(out, np.empty((chunk.count, 4), self.real)).astype(np.float64))
-        return np.concatenate(found)
+            rows.append(backend.download(out, np.empty((chunk.count, 4), self.real)).astype(np.float64))
+        return np.concatenate(rows)

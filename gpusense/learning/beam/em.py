@@ -1,17 +1,17 @@
-"""Expectation maximisation with the exact M-step, and Newton steps where EM becomes slow.
+"""Expectation maximisation with the exact M-step, and Newton steps once EM becomes slow.
 
-The book's M-step (table 6.2, lines 14 and 15) leaves out that p_hit is truncated to [0, range_max] and p_short to
-[0, z*]: what it maximises is not the likelihood, which then falls. The exact one solves, for the responsibilities r,
+The book's M-step (table 6.2, lines 14 and 15) ignores that p_hit is truncated to [0, range_max] and p_short to [0, z*].
+It does not maximise the likelihood, which may fall. The exact M-step solves, for the responsibilities r,
 
     sum r u^2 = sum r E[u^2]            sigma_hit: squares are as large as a truncated normal's, E[u^2] = 1 - T
     lambda sum r z = sum r (1 - v)      lambda_short: lengths are as large as a truncated exponential's
 
-(T, v: see ``gpusense.reference.learning``). Both sides' logarithms are nearly linear in log sigma and log lambda, so
-one Newton step of their difference is a good solution; without truncation it is the exact one, and the book's. The step
-is halved until the log-likelihood does not fall: a generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
+(T, v: see ``gpusense.reference.learning``). The logarithms of both sides are nearly linear in log sigma and log lambda,
+so one Newton step of their difference is a good solution; without truncation it is exact and equals the book's. The
+step is halved until the log-likelihood does not fall: a generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
 
-EM is slow where causes are hard to tell apart. The same pass over the pairs gives the observed information, so that a
-Newton step of the log-likelihood itself is tried once EM gains little; it is taken if the log-likelihood rises.
+EM is slow if causes are hard to distinguish. The same pass over the pairs yields the observed information, so that a
+Newton step of the log-likelihood itself is tried once EM gains little. It is accepted if the log-likelihood rises.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ import numpy as np
 from gpusense.learning.beam.point import BIAS, HIT, RATE, SHORT, SIGMA, Floats, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 
-# Steps of log shapes are at most this long.
+# Longest step of a log shape.
 _LONGEST = 2.0
-# Newton steps begin once an EM step gains less than this, or after so many EM steps.
+# Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 20
 _HALVINGS = 30
-# Nats left to gain below which a Newton step is trusted.
+# Remaining gain [nats] below which a Newton step is accepted despite rounding.
 _NEAR = 1e-4
 
 Watch = Callable[[int, Value], None]
@@ -38,13 +38,13 @@ Watch = Callable[[int, Value], None]
 
 @dataclass
 class Climb:
-    """Where a search ended, and how it went.
+    """Result of a search.
 
     Attributes:
-        value: The end.
-        trace: Objectives from the start on, one an iteration.
-        converged: Whether the search says that it ended at an optimum.
-        notes: What is to be said of the way.
+        value: Value at the end.
+        trace: Objectives at the start and after each iteration.
+        converged: Whether the search ended at an optimum.
+        notes: Remarks for the user.
     """
 
     value: Value
@@ -54,7 +54,7 @@ class Climb:
 
 
 def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """Climb from a start until less than ``tolerance`` nats are left, as far as the information matrix can tell."""
+    """Climb until the remaining gain, estimated from the information matrix, is at most ``tolerance`` nats."""
     value = problem.value(start)
     trace = [value.objective]
     newton = False
@@ -76,24 +76,24 @@ def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: 
 
 
 def em_step(problem: Problem, value: Value, *, second: bool = False) -> Value:
-    """One generalised EM step; the objective does not fall by more than rounding."""
+    """Take one generalised EM step; the objective does not fall by more than rounding."""
     step = m_step(problem, value)
     weights = value.totals / problem.total
     for _ in range(_HALVINGS):
-        found = problem.value(_shaped(problem, value.point, weights, step), second=second)
-        if found.objective >= value.objective - problem.noise(value):
-            return found
+        candidate = problem.value(_shaped(problem, value.point, weights, step), second=second)
+        if candidate.objective >= value.objective - problem.noise(value):
+            return candidate
         step = step / 2
     return problem.value(_shaped(problem, value.point, weights, 0 * step), second=second)
 
 
 def _shaped(problem: Problem, point: Point, weights: Floats, step: Floats) -> Point:
-    """The point with new weights and moved shapes."""
+    """Return the point with new weights and moved shapes."""
     return replace(point.moved(step, problem.bounds), weights=weights)
 
 
 def m_step(problem: Problem, value: Value) -> Floats:
-    """(7,) the M-step of the shapes; a shape that no reading is accounted for by stays."""
+    """Compute the (7,) M-step of the shapes; a shape whose cause accounts for no reading stays."""
     sums, point, prior = value.sums, value.point, problem.prior
     free = problem.free(value)
     step = np.zeros(7)
@@ -118,7 +118,7 @@ def m_step(problem: Problem, value: Value) -> Floats:
 
 
 def _log_step(above: float, below: float, slope: float) -> float:
-    """log(above / below) / slope, at most _LONGEST; towards the bound where a side is 0."""
+    """Return log(above / below) / slope, clamped to +-_LONGEST; +-_LONGEST if one side is 0."""
     if above <= 0 or below <= 0:
         return _LONGEST if above > below else -_LONGEST if above < below else 0.0
     rise = math.log(above) - math.log(below)
@@ -126,24 +126,31 @@ def _log_step(above: float, below: float, slope: float) -> float:
 
 
 def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
-    """A Newton step where it raises the objective, and how many nats were left at most by the quadratic model."""
+    """Take a Newton step if it raises the objective.
+
+    Returns:
+        The new value, or the old one; and the gain [nats] that the quadratic model predicted.
+    """
     step, left = newton_direction(problem, value)
     if left <= 0:
         return value, 0.0
     longest = float(np.abs(step[: RATE + 1]).max())
     scale = min(1.0, _LONGEST / max(longest, 1e-300))
-    # Near the optimum the gain is less than rounding, and the step is right all the same.
+    # Near the optimum the step is right even though its gain is less than rounding.
     least = value.objective - (problem.noise(value) if left < _NEAR else 0.0)
     for _ in range(5):
-        found = problem.value(value.point.moved(scale * step, problem.bounds), second=True)
-        if found.objective > least:
-            return found, left
+        candidate = problem.value(value.point.moved(scale * step, problem.bounds), second=True)
+        if candidate.objective > least:
+            return candidate, left
         scale /= 4
     return value, left
 
 
 def newton_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
-    """(7,) the Newton step, uphill even where the objective is not concave, and half its slope: nats left to gain."""
+    """Return the (7,) Newton step, uphill even if the objective is not concave, and its predicted gain [nats].
+
+    The gain is half the slope along the step.
+    """
     assert value.hessian is not None
     places = np.flatnonzero(problem.free(value))
     step = np.zeros(7)
@@ -160,12 +167,13 @@ def newton_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
 
 
 def without_needless(problem: Problem, value: Value) -> Value:
-    """The point without causes that account for hardly any reading, where the objective does not fall."""
+    """Set the weights of causes that account for hardly any reading to 0, unless the objective falls."""
     weights = value.point.weights
     for cause in range(4):
         if weights[cause] > 0 and value.totals[cause] < NOTHING and problem.prior.counts[cause] == 0:
             fewer = np.where(np.arange(4) == cause, 0, value.point.weights)
-            found = problem.value(replace(value.point, weights=fewer / fewer.sum()), second=value.hessian is not None)
-            if found.objective >= value.objective - problem.noise(value):
-                value = found
+            point = replace(value.point, weights=fewer / fewer.sum())
+            candidate = problem.value(point, second=value.hessian is not None)
+            if candidate.objective >= value.objective - problem.noise(value):
+                value = candidate
     return value

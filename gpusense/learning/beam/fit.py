@@ -1,4 +1,4 @@
-"""``fit_beam_parameters``: maximum-likelihood parameters of the beam model from readings and expected ranges."""
+"""Fit the parameters of the beam model to readings and expected ranges, by maximum likelihood."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.progress import progress as progress_bar
 from gpusense.backends import Selection
 from gpusense.learning.beam.book import climb_book
 from gpusense.learning.beam.device_sums import DeviceSums
@@ -45,43 +46,51 @@ def fit_beam_parameters(
     progress: bool = False,
     callback: Callback | None = None,
 ) -> BeamFit:
-    """Learn the beam model's parameters: those that make the readings likeliest (book section 6.3.3, table 6.2).
+    """Fit the parameters of the beam model by maximum likelihood (book section 6.3.3, table 6.2).
 
-    Readings are classed as by :func:`gpusense.classify`: missing ones are left out, "no return" has probability z_max,
-    the others the mixture's density. The sums over pairs are taken on the device.
+    Readings are classified as by :func:`gpusense.classify`: missing ones are left out, "no return" has probability
+    z_max, all others have the mixture's density. The device computes the sums over all pairs.
 
     Args:
         ranges: Readings z of any shape [m].
         expected: Expected ranges z* of the same shape, in [0, range_max] [m]; any value beside a missing reading.
-        range_max: Readings of at least this are "no return" [m].
+        range_max: Readings of at least ``range_max`` are "no return" [m].
         method: ``"em"``: EM with the exact M-step and Newton steps; ``"em-book"``: the book's closed forms, with their
             failures; ``"gradient"``: L-BFGS-B; ``"hill_climb"``: Powell's method; ``"genetic"``: differential
             evolution, finished by gradients.
-        range_min: Readings below this are missing [m].
-        initial: Where to begin; a guess from the readings if None. A cause whose weight is 0 stays
-            out; shapes beyond their bounds begin there.
-        backend: Where it runs, see :func:`gpusense.devices`.
-        precision: ``"float64"`` or ``"float32"``; None is float64 where the device has it.
+        range_min: Readings below ``range_min`` are missing [m].
+        initial: Start of the search; None guesses it from the readings. A cause of weight 0 stays out; shapes beyond
+            their bounds are clamped.
+        backend: The device, see :func:`gpusense.devices`.
+        precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
         max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.
-        tolerance: The method has converged once it expects to gain less than this [nats].
-        restarts: Further starts at random; the best end is returned.
-        seed: Seed of these and of ``"genetic"``.
-        range_bias: Also fit an offset b of correct ranges, z = z* + b. p_hit then has its mean at z* + b, held within
-            [0, range_max].
-        responsibilities: Also return each reading's probabilities of the four causes.
+        tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
+        restarts: Number of additional random starts; the best result is returned.
+        seed: Seed of the random starts and of ``"genetic"``.
+        range_bias: Whether to fit an offset b of correct ranges, too: z = z* + b. p_hit then has its mean at z* + b,
+            clamped to [0, range_max].
+        responsibilities: Whether to return each reading's probabilities of the four causes, too.
         sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
             sqrt(12), or else 1e-6 range_max, to range_max.
         lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
-        progress: Draw a progress bar on standard error where that is a terminal.
-        callback: Called after each iteration with its number, the log-likelihood and the parameters.
+        progress: Whether to show a progress bar on standard error if that is a terminal.
+        callback: Function called after each iteration with its number, the log-likelihood and the parameters.
 
     Returns:
         The fit.
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a value breaks a rule above, the shapes differ, no reading says anything, the backend is absent, or
-            the initial parameters make some reading impossible.
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above, the shapes differ, every reading is missing, the backend is absent, or
+            the initial parameters make a reading impossible.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> expected = np.full(1000, 4.0)
+        >>> ranges = expected + np.random.default_rng(0).normal(0, 0.1, 1000)
+        >>> fit = gs.fit_beam_parameters(ranges, expected, range_max=8.0, backend="numpy")
+        >>> fit.converged, round(fit.parameters.sigma_hit, 3)
+        (True, 0.098)
     """
     pairs = make_pairs(ranges, expected, range_max, range_min)
     options = check_options(
@@ -98,10 +107,10 @@ def fit_beam_parameters(
 def fit_pairs(
     device: DeviceSums, pairs: Pairs, bounds: Bounds, start: Point, options: Options, prior: Prior = NO_PRIOR
 ) -> BeamFit:
-    """The best fit of several starts.
+    """Fit pairs on a device from several starts, and report the best result.
 
     Raises:
-        ValueError: the start makes some reading impossible.
+        ValueError: The start makes a reading impossible.
     """
     problem = Problem(device, pairs, bounds, prior, options.range_bias)
     rng = np.random.default_rng(options.seed)
@@ -130,13 +139,11 @@ def _climb(problem: Problem, start: Point, options: Options, watch: Watch) -> Cl
 
 @contextlib.contextmanager
 def _watcher(options: Options, starts: int) -> Iterator[Watch]:
-    """What is called after each iteration: the user's function, and a bar on a terminal."""
+    """Yield the function called after each iteration, which moves the progress bar and calls the user's callback."""
     with contextlib.ExitStack() as stack:
         step = None
         if options.progress:
-            from gpusense._util.progress import progress
-
-            step = stack.enter_context(progress(options.max_iterations * starts))
+            step = stack.enter_context(progress_bar(options.max_iterations * starts))
 
         def watch(iteration: int, value: Value) -> None:
             if step is not None:

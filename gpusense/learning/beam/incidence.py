@@ -1,4 +1,4 @@
-"""``fit_incidence_parameters``: beam parameters by angle of incidence, thin bins leaning on the whole."""
+"""Fit the parameters of the beam model by incidence bin, with the pooled fit as a prior for bins of few readings."""
 
 from __future__ import annotations
 
@@ -12,36 +12,45 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense.backends import Selection
+from gpusense.backends import Backend, Selection
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.fit import fit_pairs
-from gpusense.learning.beam.options import Callback, check_options, make_bounds, open_device, start_of
+from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
-from gpusense.learning.beam.point import Point, first_guess
+from gpusense.learning.beam.point import Bounds, Point, first_guess
 from gpusense.learning.beam.problem import Prior
 from gpusense.learning.beam.result import BeamFit
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
 
 _MOST_BINS = 1000
-# A float32 pi / 2 is this much more than the float64 one, or less.
+# Bound of the rounding error of a float32 pi / 2.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class IncidenceFit:
-    """The beam model's parameters for each range of angles of incidence.
+    """Parameters of the beam model for each incidence bin, fitted by :func:`fit_incidence_parameters`.
+
+    ``print(fit)`` shows a table of the bins.
 
     Attributes:
-        parameters: The parameters of the bins, ready for a model.
-        pooled: The fit of all readings with a surface together, on which thin bins lean.
-        fits: (B,) the fit of each bin. Their traces are of log-likelihood and log prior; their standard errors take the
-            pseudo-readings for readings.
+        parameters: Parameters of the bins, ready for a model.
+        pooled: Fit of all readings with a surface together: the prior of the bins.
+        fits: (B,) fit of each bin. Traces hold log-likelihood plus log prior; standard errors count pseudo-readings as
+            readings.
         counts: (B,) readings of each bin, hits and max readings.
-        no_surface: The fit of beams that hit no surface, of the same kind; None where there was nothing to fit it to,
-            neither readings nor pseudo-readings.
-        no_surface_count: Their hits and max readings.
-        strength: Pseudo-readings that each of these fits was given from the pooled fit.
+        no_surface: Fit of the beams that hit no surface, with the same prior; None without readings and
+            pseudo-readings.
+        no_surface_count: Hits and max readings of the beams that hit no surface.
+        strength: Pseudo-readings of each fit, distributed as in the pooled fit.
+
+    Example:
+        >>> import gpusense as gs
+        >>> z, expected, angles = [3.9, 4.1, 4.0, 4.3], [4.0] * 4, [0.1, 0.2, 0.3, 1.2]
+        >>> fit = gs.fit_incidence_parameters(z, expected, angles, range_max=8.0, bins=2, backend="numpy")
+        >>> fit
+        IncidenceFit(2 bins, 4 readings, no_surface_count=0, strength=30, converged=True)
     """
 
     parameters: IncidenceParameters
@@ -54,12 +63,12 @@ class IncidenceFit:
 
     @property
     def converged(self) -> bool:
-        """Whether every fit did."""
+        """Whether every fit converged."""
         return self.pooled.converged and all(fit.converged for fit in self._all_fits)
 
     @property
     def log_likelihood(self) -> float:
-        """Of all readings, each with its own parameters: what a model with ``parameters`` gives to them."""
+        """Log-likelihood of all readings, each with the parameters of its bin, as in a model with ``parameters``."""
         return math.fsum(fit.log_likelihood for fit in self._all_fits)
 
     @property
@@ -67,7 +76,7 @@ class IncidenceFit:
         return self.fits if self.no_surface is None else (*self.fits, self.no_surface)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain numbers, lists and strings."""
+        """Return all attributes as plain numbers, lists and strings."""
         return {
             "parameters": self.parameters.to_dict(),
             "pooled": self.pooled.to_dict(),
@@ -77,6 +86,12 @@ class IncidenceFit:
             "no_surface_count": self.no_surface_count,
             "strength": self.strength,
         }
+
+    def __repr__(self) -> str:
+        return (
+            f"IncidenceFit({len(self.fits)} bins, {sum(self.counts)} readings, "
+            f"no_surface_count={self.no_surface_count}, strength={self.strength:g}, converged={self.converged})"
+        )
 
     def __str__(self) -> str:
         names = list(self.pooled.parameters.to_dict())
@@ -118,105 +133,156 @@ def fit_incidence_parameters(
     progress: bool = False,
     callback: Callback | None = None,
 ) -> IncidenceFit:
-    """Learn the beam model's parameters for each range of angles of incidence.
+    """Fit the parameters of the beam model for each incidence bin.
 
-    All readings with a surface are fitted together first. Each bin is then given ``strength`` pseudo-readings that are
-    distributed as this pooled fit says (a Dirichlet prior of the weights and its like for the shapes), and fitted from
-    there: a bin of thousands of readings hardly notices, an empty one keeps the pooled parameters.
+    All readings with a surface are fitted together first. Then each bin is fitted with ``strength`` additional
+    pseudo-readings, distributed as in this pooled fit: a Dirichlet prior of the weights and its counterpart for the
+    shapes. They have little effect on a bin of thousands of readings; an empty bin keeps the pooled parameters.
 
-    A number of bins means bins of equal width. What changes with the angle, lost echoes and long tails, changes fastest
-    near grazing incidence, where readings are few; bins of equal count would put that into one.
+    A number of bins makes bins of equal width. Lost echoes and long tails change fastest with the angle near grazing
+    incidence, where readings are few; bins of equal count would merge them into one.
 
-    Beams that hit no surface have parameters of their own, fitted in the same way: "no return" is what is expected of
-    them, and counting it for a bin of angles would teach that walls are often missed.
+    Beams that hit no surface have separate parameters, fitted with the same prior. Their expected reading is "no
+    return"; counted in a bin, it would make walls look often missed.
 
     Args:
         ranges: Readings z of any shape [m].
         expected: Expected ranges z* of the same shape, in [0, range_max] [m].
-        incidence: Angles of incidence of the same shape, in [0, pi / 2] [rad]; NaN where the beam hits no surface.
-        range_max: Readings of at least this are "no return" [m].
-        bins: Number of bins of equal width, or (B + 1,) their edges, rising from 0 to pi / 2 [rad].
-        strength: Pseudo-readings of each bin, >= 0; 0 fits every bin by itself. Without them, and without a reading of
-            a beam that hits no surface, such beams keep the first bin's parameters.
-        method: See :func:`fit_beam_parameters`, as for all that follows; not ``"em-book"``, which knows no prior.
-        range_min: Readings below this are missing [m].
-        initial: Where the pooled fit begins.
-        backend: Where it runs.
-        precision: ``"float64"`` or ``"float32"``; None is float64 where the device has it.
+        incidence: Angles of incidence of the same shape, in [0, pi / 2] [rad]; NaN for a beam that hits no surface.
+        range_max: Readings of at least ``range_max`` are "no return" [m].
+        bins: Number of bins of equal width, or (B + 1,) edges, rising from 0 to pi / 2 [rad].
+        strength: Pseudo-readings per bin, >= 0; 0 fits every bin by itself. With 0, and without a reading of a beam
+            that hits no surface, such beams keep the first bin's parameters.
+        method: See :func:`fit_beam_parameters`, as for all following arguments; not ``"em-book"``, which has no prior.
+        range_min: Readings below ``range_min`` are missing [m].
+        initial: Start of the pooled fit.
+        backend: The device.
+        precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
         max_iterations: Most iterations of each fit.
-        tolerance: Nats left to gain.
-        restarts: Further starts at random, of each fit.
-        seed: Their seed.
-        range_bias: Also fit an offset of correct ranges in each bin.
+        tolerance: Expected gain below which a fit has converged [nats].
+        restarts: Number of additional random starts of each fit.
+        seed: Seed of the random starts.
+        range_bias: Whether to fit an offset of correct ranges in each bin, too.
         sigma_bounds: Smallest and largest sigma_hit [m].
         lambda_bounds: Smallest and largest lambda_short [1/m].
-        progress: Draw a progress bar for each fit on standard error where that is a terminal.
-        callback: Called after each iteration.
+        progress: Whether to show a progress bar for each fit on standard error if that is a terminal.
+        callback: Function called after each iteration.
 
     Returns:
-        The fit; ``fit.parameters`` goes into a model.
+        The fit; pass ``fit.parameters`` to a model.
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a value breaks a rule above or of :func:`fit_beam_parameters`, or no reading has a surface.
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above or of :func:`fit_beam_parameters`, or no reading has a surface.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> angles, expected = rng.uniform(0, 1.5, 2000), np.full(2000, 4.0)
+        >>> ranges = expected + rng.normal(0, np.where(angles < 0.75, 0.05, 0.2))
+        >>> fit = gs.fit_incidence_parameters(ranges, expected, angles, range_max=8.0, bins=2, backend="numpy")
+        >>> [round(p.sigma_hit, 2) for p in fit.parameters.parameters]
+        [0.06, 0.2]
     """
     pairs = make_pairs(ranges, expected, range_max, range_min)
     angles = _angles(incidence, np.shape(ranges), pairs)
     edges = _edges(bins)
     strength = checks.real("strength", strength, low=0)
     if method == "em-book":
-        raise ValueError("method: must not be 'em-book', which knows no prior, got 'em-book'")
+        raise ValueError("method: must not be 'em-book', which has no prior, got 'em-book'")
     options = check_options(
         method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities=False
     )
-    used = pairs.kinds != Reading.MISSING
     surface = ~np.isnan(angles)
-    if not (used & surface).any():
+    if not ((pairs.kinds != Reading.MISSING) & surface).any():
         raise ValueError("incidence: some reading that is not missing must have an angle, got NaN beside all")
     if initial is not None and not isinstance(initial, BeamParameters):
         raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
-    opened = open_device(backend, precision)
-
-    whole = pairs.subset(surface)
-    bounds = make_bounds(whole, sigma_bounds, lambda_bounds)
-    start = first_guess(whole, bounds) if initial is None else start_of(initial, whole, bounds)
-    pooled = fit_pairs(DeviceSums(*opened, whole), whole, bounds, start, options)
-    middle = Point.of(pooled.parameters, pooled.range_bias if range_bias else 0.0)
-    prior = Prior(strength * middle.weights, middle.sigma, middle.rate, middle.bias)
-
-    place = np.digitize(angles, edges[1:-1])
-    fits, counts = [], []
-    for number in range(len(edges) - 1):
-        own = pairs.subset(surface & (place == number))
-        counts.append(own.hits + own.max_readings)
-        if not counts[-1] and strength == 0:
-            low, high = np.degrees(edges[number : number + 2])
-            raise ValueError(
-                f"strength: must be > 0 where a bin has no reading, got {strength} and none from {low:.3g} to "
-                f"{high:.3g} degrees"
-            )
-        fits.append(fit_pairs(DeviceSums(*opened, own), own, bounds, middle, options, prior))
-    own = pairs.subset(~surface)
-    nothing, count = None, own.hits + own.max_readings
-    if count or strength > 0:
-        # Such beams may need a cause that surfaces do without.
-        weights = 0.5 * (middle.weights + first_guess(own, bounds).weights) if count else middle.weights
-        start = replace(middle, weights=weights)
-        nothing = fit_pairs(DeviceSums(*opened, own), own, bounds, start, options, prior)
+    device = open_device(backend, precision)
+    surfaces = pairs.subset(surface)
+    bounds = make_bounds(surfaces, sigma_bounds, lambda_bounds)
+    start = first_guess(surfaces, bounds) if initial is None else start_of(initial, surfaces, bounds)
+    pooled = fit_pairs(DeviceSums(*device, surfaces), surfaces, bounds, start, options)
+    binned = _Binned(device, bounds, options, pooled, strength)
+    fits, counts = binned.fit_bins(pairs, surface, angles, edges)
+    no_surface, no_surface_count = binned.fit_no_surface(pairs.subset(~surface))
     parameters = IncidenceParameters(
-        tuple(edges.tolist()), tuple(fit.parameters for fit in fits), None if nothing is None else nothing.parameters
+        tuple(edges.tolist()),
+        tuple(fit.parameters for fit in fits),
+        None if no_surface is None else no_surface.parameters,
     )
-    return IncidenceFit(parameters, pooled, tuple(fits), tuple(counts), nothing, count, strength)
+    return IncidenceFit(parameters, pooled, fits, counts, no_surface, no_surface_count, strength)
+
+
+class _Binned:
+    """Fits of the bins with the pooled fit as their prior.
+
+    Args:
+        device: The device and the precision of its kernels.
+        bounds: Bounds of the shapes.
+        options: Options of each fit.
+        pooled: Fit of all readings with a surface.
+        strength: Pseudo-readings per bin.
+    """
+
+    def __init__(
+        self, device: tuple[Backend, np.dtype], bounds: Bounds, options: Options, pooled: BeamFit, strength: float
+    ) -> None:
+        self._device, self._bounds, self._options, self._strength = device, bounds, options, strength
+        self._start = Point.of(pooled.parameters, pooled.range_bias if options.range_bias else 0.0)
+        start = self._start
+        self._prior = Prior(strength * start.weights, start.sigma, start.rate, start.bias)
+
+    def fit_bins(
+        self, pairs: Pairs, surface: NDArray[np.bool_], angles: NDArray[np.float64], edges: NDArray[np.float64]
+    ) -> tuple[tuple[BeamFit, ...], tuple[int, ...]]:
+        """Fit each bin; return the fits and their numbers of readings.
+
+        Args:
+            pairs: All pairs.
+            surface: (n,) mask of readings with a surface.
+            angles: (n,) angles of incidence [rad].
+            edges: (B + 1,) edges of the bins [rad].
+
+        Raises:
+            ValueError: A bin has neither a reading nor a pseudo-reading.
+        """
+        incidence_bin = np.digitize(angles, edges[1:-1])
+        fits, counts = [], []
+        for number in range(len(edges) - 1):
+            subset = pairs.subset(surface & (incidence_bin == number))
+            counts.append(subset.hits + subset.max_readings)
+            if not counts[-1] and self._strength == 0:
+                low, high = np.degrees(edges[number : number + 2])
+                raise ValueError(
+                    f"strength: must be > 0 where a bin has no reading, got {self._strength} and none from {low:.3g} "
+                    f"to {high:.3g} degrees"
+                )
+            fits.append(self._fit(subset, self._start))
+        return tuple(fits), tuple(counts)
+
+    def fit_no_surface(self, pairs: Pairs) -> tuple[BeamFit | None, int]:
+        """Fit the beams that hit no surface; return the fit, or None, and their number of readings."""
+        count = pairs.hits + pairs.max_readings
+        if not count and self._strength == 0:
+            return None, 0
+        start = self._start
+        if count:
+            # These beams may have a cause that beams with a surface do not have.
+            start = replace(start, weights=0.5 * (start.weights + first_guess(pairs, self._bounds).weights))
+        return self._fit(pairs, start), count
+
+    def _fit(self, pairs: Pairs, start: Point) -> BeamFit:
+        return fit_pairs(DeviceSums(*self._device, pairs), pairs, self._bounds, start, self._options, self._prior)
 
 
 def _angles(incidence: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArray[np.float64]:
-    """(n,) angles in [0, pi / 2], NaN without a surface."""
-    given = checks.array("incidence", incidence, finite=False)
-    if given.shape != shape:
-        raise ValueError(
-            f"incidence: shape must be that of ranges, {checks.shape_text(shape)}, got {checks.shape_text(given.shape)}"
-        )
-    angles = given.ravel()
+    """Return (n,) angles in [0, pi / 2], NaN without a surface."""
+    values = checks.array("incidence", incidence, finite=False)
+    if values.shape != shape:
+        text = checks.shape_text(values.shape)
+        raise ValueError(f"incidence: shape must be that of ranges, {checks.shape_text(shape)}, got {text}")
+    angles = values.ravel()
     outside = (pairs.kinds != Reading.MISSING) & ((angles < 0) | (angles > math.pi / 2 + _ROUNDING))
     if outside.any():
         index = int(np.argmax(outside))
@@ -225,7 +291,7 @@ def _angles(incidence: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArr
 
 
 def _edges(bins: int | Sequence[float] | NDArray[np.floating]) -> NDArray[np.float64]:
-    """(B + 1,) edges from 0 to pi / 2."""
+    """Return the (B + 1,) edges of the bins, from 0 to pi / 2."""
     if isinstance(bins, (int, np.integer)) and not isinstance(bins, bool):
         return np.linspace(0, math.pi / 2, checks.integer("bins", bins, low=1, high=_MOST_BINS) + 1)
     edges: NDArray[np.float64] = checks.array("bins", bins, ("B + 1",))

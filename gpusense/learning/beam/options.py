@@ -1,4 +1,4 @@
-"""What a user may ask of a fit, checked: options, device, bounds and start."""
+"""Check the options of a fit, open its device, and make its bounds and its start."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from gpusense.world.parameters import BeamParameters
 METHODS = ("em", "em-book", "gradient", "hill_climb", "genetic")
 Callback = Callable[[int, float, BeamParameters], object]
 
-# By default sigma_hit is at least the deviation of rounding to the sensor's step, or this part of range_max.
+# Default lower bound of sigma_hit as a share of range_max, if readings are not rounded to a larger step.
 _SMALLEST_SIGMA = 1e-6
-# lambda_short range_max: from hardly distinguishable from uniform to readings within 1e-4 range_max.
+# Default bounds of lambda_short range_max: nearly uniform, and readings within 1e-4 range_max.
 _RATES = (1e-3, 1e4)
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a fit is made; see :func:`fit_beam_parameters`."""
+    """Options of a fit; see :func:`fit_beam_parameters`."""
 
     method: str
     max_iterations: int
@@ -49,10 +49,10 @@ def check_options(
     callback: Callback | None,
     responsibilities: bool,
 ) -> Options:
-    """The options of a fit, checked.
+    """Check the options of a fit.
 
     Raises:
-        TypeError, ValueError: as :func:`fit_beam_parameters`.
+        TypeError, ValueError: As in :func:`fit_beam_parameters`.
     """
     method = checks.choice("method", method, METHODS)
     if max_iterations is None:
@@ -78,7 +78,11 @@ def check_options(
 
 
 def open_device(backend: Selection, precision: str | None) -> tuple[Backend, np.dtype]:
-    """The device and the precision of its kernels."""
+    """Open the device and choose the precision of its kernels.
+
+    Raises:
+        TypeError, ValueError: As in :func:`fit_beam_parameters`.
+    """
     opened = get_backend(backend)
     if precision is None:
         precision = "float64" if opened.info.float64 else "float32"
@@ -91,7 +95,7 @@ def open_device(backend: Selection, precision: str | None) -> tuple[Backend, np.
 def make_bounds(
     pairs: Pairs, sigma: tuple[float, float] | None = None, rate: tuple[float, float] | None = None
 ) -> Bounds:
-    """Bounds of the shapes: the user's, or those that the readings allow."""
+    """Make the bounds of the shapes: the user's, or defaults from the readings."""
     range_max = pairs.range_max
     smallest = max(pairs.quantum / math.sqrt(12), _SMALLEST_SIGMA * range_max)
     return Bounds(
@@ -101,20 +105,20 @@ def make_bounds(
     )
 
 
-def _bounds(name: str, given: tuple[float, float] | None, default: tuple[float, float]) -> tuple[float, float]:
-    if given is None:
+def _bounds(name: str, value: tuple[float, float] | None, default: tuple[float, float]) -> tuple[float, float]:
+    if value is None:
         return default
-    low, high = checks.array(name, given, (2,)).tolist()
+    low, high = checks.array(name, value, (2,)).tolist()
     if not 0 < low <= high:
-        raise ValueError(f"{name}: must be two numbers, 0 < smallest <= largest, got {checks.show(given)}")
+        raise ValueError(f"{name}: must be two numbers, 0 < smallest <= largest, got {checks.show(value)}")
     return low, high
 
 
 def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds) -> Point:
-    """Where a user's parameters begin: without the causes that no reading can have.
+    """Make the start of a search from a user's parameters, without the causes that no reading can have.
 
     Raises:
-        ValueError: the causes that are left do not explain the readings.
+        ValueError: The remaining causes do not explain the readings.
     """
     point = bounds.hold(Point.of(initial))
     weights = np.where(possible_causes(pairs), point.weights, 0)

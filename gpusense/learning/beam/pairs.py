@@ -1,4 +1,4 @@
-"""The readings to learn from, classed, beside the ranges that the map lets expect."""
+"""Pairs of readings and expected ranges, classified, from which parameters are learned."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense.world.scanner import Reading, classes
 
-# Readings that are looked at to find the step that a sensor rounds to.
+# Most readings used to estimate the step that a sensor rounds to.
 _SAMPLE = 20_000
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Readings and expected ranges of one shape.
+    """Readings and their expected ranges.
 
     Attributes:
-        reading: (M,) the hits' readings in their own precision [m].
-        expected: (M,) expected ranges beside them, in [0, range_max] [m].
-        places: (M,) where the hits were among all readings.
-        kinds: (n,) the class of every reading.
+        reading: (M,) readings of the hits, in the caller's precision [m].
+        expected: (M,) expected ranges of the hits, in [0, range_max] [m].
+        places: (M,) indices of the hits among all readings.
+        kinds: (n,) class of every reading.
         range_max: Longest range [m].
-        quantum: What readings are multiples of, 0 where no such step shows [m].
+        quantum: Step that readings are multiples of; 0 if there is none [m].
     """
 
     reading: NDArray[np.floating]
@@ -37,28 +37,28 @@ class Pairs:
 
     @property
     def hits(self) -> int:
-        """How many readings are ranges."""
+        """Number of readings that are ranges."""
         return len(self.reading)
 
     @property
     def max_readings(self) -> int:
-        """How many readings are "no return"."""
+        """Number of readings that are "no return"."""
         return int(np.count_nonzero(self.kinds == Reading.MAX))
 
     @property
     def missing(self) -> int:
-        """How many readings say nothing."""
+        """Number of readings that are missing."""
         return int(np.count_nonzero(self.kinds == Reading.MISSING))
 
-    def subset(self, chosen: NDArray[np.bool_]) -> Pairs:
-        """The pairs of some readings; ``chosen`` (n,) says of which."""
-        own = chosen[self.places]
-        places = np.cumsum(chosen)[self.places[own]] - 1
-        return Pairs(self.reading[own], self.expected[own], places, self.kinds[chosen], self.range_max, self.quantum)
+    def subset(self, mask: NDArray[np.bool_]) -> Pairs:
+        """Return the pairs of the readings in ``mask`` (n,)."""
+        hits = mask[self.places]
+        places = np.cumsum(mask)[self.places[hits]] - 1
+        return Pairs(self.reading[hits], self.expected[hits], places, self.kinds[mask], self.range_max, self.quantum)
 
 
 def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_min: float = 0.0) -> Pairs:
-    """Class the readings and keep the hits.
+    """Classify the readings and select the hits.
 
     Args:
         ranges: Readings of any shape and value [m].
@@ -67,41 +67,42 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
         range_min: Shortest range [m].
 
     Raises:
-        TypeError: an argument does not hold real numbers.
-        ValueError: the shapes differ, every reading is missing, or an expected range is not in [0, range_max] beside a
+        TypeError: An argument does not hold real numbers.
+        ValueError: The shapes differ, every reading is missing, or an expected range is not in [0, range_max] beside a
             reading that is not missing.
     """
     range_max = checks.real("range_max", range_max, above=0)
     range_min = checks.real("range_min", range_min, low=0, below=range_max)
     z = checks.array("ranges", ranges, finite=False, dtype=None)
-    ahead = checks.array("expected", expected, finite=False, dtype=None)
-    if z.shape != ahead.shape:
+    z_expected = checks.array("expected", expected, finite=False, dtype=None)
+    if z.shape != z_expected.shape:
         raise ValueError(
             f"expected: shape must be that of ranges, {checks.shape_text(z.shape)}, got "
-            f"{checks.shape_text(ahead.shape)}"
+            f"{checks.shape_text(z_expected.shape)}"
         )
-    z, ahead = z.ravel(), ahead.ravel()
+    z, z_expected = z.ravel(), z_expected.ravel()
     kinds = classes(z, range_min, range_max)
     if not (kinds != Reading.MISSING).any():
         raise ValueError(f"ranges: must hold a reading that is not missing, got {z.size} of which none is")
-    # What a float32 cast returns for "nothing" is range_max, rounded.
-    outside = (kinds != Reading.MISSING) & ~((ahead >= 0) & (ahead <= max(ahead.dtype.type(range_max), range_max)))
+    # A ray without an obstacle has the expected range range_max, possibly rounded to float32.
+    limit = max(z_expected.dtype.type(range_max), range_max)
+    outside = (kinds != Reading.MISSING) & ~((z_expected >= 0) & (z_expected <= limit))
     if outside.any():
         index = int(np.argmax(outside))
         raise ValueError(
-            f"expected: every value must be in [0, range_max] where the reading is not missing, got {ahead[index]} at "
-            f"index {index}"
+            f"expected: every value must be in [0, range_max] where the reading is not missing, got "
+            f"{z_expected[index]} at index {index}"
         )
     places = np.flatnonzero(kinds == Reading.HIT)
     reading = z[places]
-    return Pairs(reading, np.minimum(ahead[places], range_max), places, kinds, range_max, quantum_of(reading))
+    return Pairs(reading, np.minimum(z_expected[places], range_max), places, kinds, range_max, quantum_of(reading))
 
 
 def quantum_of(reading: NDArray[np.floating]) -> float:
-    """The step that readings are multiples of, 0 where none shows.
+    """Estimate the step that readings are multiples of; 0 if there is none.
 
-    A step shows where readings repeat and all gaps between different ones are whole multiples of the smallest; gaps of
-    a few units in the last place of the readings' precision are none.
+    There is a step if readings repeat and all gaps between different readings are whole multiples of the smallest gap.
+    Gaps of a few units in the last place of the readings' precision do not count.
     """
     sample = reading[:: max(1, len(reading) // _SAMPLE)]
     distinct = np.unique(sample).astype(np.float64)

@@ -1,8 +1,8 @@
-"""A set of parameters on the way to the best one, and the coordinates in which it is moved.
+"""Parameters during a search, and the coordinates in which they move.
 
 Coordinates are (log z_hit, log z_short, log z_max, log z_rand, log sigma_hit, log lambda_short, range_bias). Weights
-are renormalised after every step, so one of the four logarithms, the largest weight's, stays where it is: the other
-weights are moved against it.
+are renormalised after every step. Therefore the logarithm of the largest weight stays fixed, and the other weights move
+relative to it.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 HIT, SHORT, MAX, RAND, SIGMA, RATE, BIAS = range(7)
 NAMES = ("z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "lambda_short", "range_bias")
 
-# Readings that are looked at for a first guess.
+# Most readings used for a first guess.
 _SAMPLE = 100_000
 
 
 @dataclass(frozen=True)
 class Point:
-    """Parameters during a fit.
+    """Parameters during a search.
 
     Attributes:
         weights: (4,) z_hit, z_short, z_max, z_rand.
@@ -44,23 +44,23 @@ class Point:
 
     @classmethod
     def of(cls, parameters: BeamParameters, bias: float = 0.0) -> Point:
-        """The point of a set of parameters, its weights' sum made 1."""
+        """Make the point of a set of parameters, with weights normalised to sum 1."""
         p = parameters
         weights = np.array([p.z_hit, p.z_short, p.z_max, p.z_rand])
         return cls(weights / weights.sum(), p.sigma_hit, p.lambda_short, bias)
 
     def parameters(self) -> BeamParameters:
-        """The model's parameters here."""
+        """Return the parameters of the model."""
         hit, short, top, rand = self.weights.tolist()
         return BeamParameters(hit, short, top, rand, self.sigma, self.rate)
 
     def coordinates(self) -> Floats:
-        """(7,) see the module's docstring; -inf for a weight of 0."""
+        """Return the (7,) coordinates, see the module's docstring; -inf for a weight of 0."""
         with np.errstate(divide="ignore"):
             return np.array([*np.log(self.weights), math.log(self.sigma), np.log(self.rate), self.bias])
 
     def moved(self, step: Floats, bounds: Bounds) -> Point:
-        """The point after a step in coordinates, within the bounds."""
+        """Return the point after a step in coordinates, clamped to the bounds."""
         with np.errstate(divide="ignore"):
             logs = np.log(self.weights) + step[:4]
         weights = np.exp(logs - logs.max())
@@ -76,12 +76,12 @@ class Point:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where shapes may lie.
+    """Bounds of the shapes.
 
     Attributes:
         sigma: Smallest and largest sigma_hit [m].
         rate: Smallest and largest lambda_short [1/m].
-        bias: Largest offset of correct ranges, either way [m].
+        bias: Largest magnitude of the offset of correct ranges [m].
     """
 
     sigma: tuple[float, float]
@@ -89,7 +89,7 @@ class Bounds:
     bias: float
 
     def hold(self, point: Point) -> Point:
-        """The point, its shapes moved to the bounds they exceed."""
+        """Return the point with its shapes clamped to the bounds."""
         return dataclasses.replace(
             point,
             sigma=min(max(point.sigma, self.sigma[0]), self.sigma[1]),
@@ -99,13 +99,13 @@ class Bounds:
 
 
 def possible_causes(pairs: Pairs) -> NDArray[np.bool_]:
-    """(4,) which causes some reading can have."""
+    """Return the (4,) mask of causes that at least one reading can have."""
     short = bool(((pairs.reading <= pairs.expected) & (pairs.expected > 0)).any())
     return np.array([pairs.hits > 0, short, pairs.max_readings > 0, pairs.hits > 0])
 
 
 def first_guess(pairs: Pairs, bounds: Bounds) -> Point:
-    """Where a fit begins: weights by the classes of readings, sigma from the median distance to the expected range."""
+    """Guess a start: weights from the classes of readings, sigma from the median distance to the expected range."""
     possible = possible_causes(pairs)
     share = pairs.max_readings / (pairs.hits + pairs.max_readings)
     weights = np.where(possible, [(1 - share) * 0.5, (1 - share) * 0.2, share, (1 - share) * 0.3], 0)
@@ -120,7 +120,7 @@ def first_guess(pairs: Pairs, bounds: Bounds) -> Point:
 
 
 def random_start(point: Point, bounds: Bounds, rng: np.random.Generator) -> Point:
-    """Another start: weights at random among those that are not 0, shapes within a factor of e^2 or so."""
+    """Draw a random start: random weights for causes of weight > 0, shapes within a factor of about e^2."""
     weights = np.where(point.weights > 0, rng.dirichlet(np.ones(4)) + 0.01, 0)
     sigma, rate = point.sigma * math.exp(rng.normal(0, 1)), point.rate * math.exp(rng.normal(0, 1))
     return bounds.hold(Point(weights / weights.sum(), sigma, rate, point.bias))

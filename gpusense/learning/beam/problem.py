@@ -1,9 +1,9 @@
-"""The log-likelihood of a set of parameters, its derivatives, and what pseudo-readings of a prior add to it.
+"""The log-likelihood of a set of parameters and its derivatives, with the pseudo-readings of a prior.
 
 By Fisher's identity the derivatives of the log-likelihood are those of EM's expected log-likelihood of readings *and*
-causes, taken at the same parameters; by Louis's, its second derivatives follow from products of the same terms. One
-pass over the pairs therefore gives all that EM, a search by gradients or Newton's method need. With n readings, w the
-weights, R the sums of responsibilities, y a pair's own terms of the gradient and c the cause of a shape:
+causes, at the same parameters. By Louis's identity its second derivatives follow from products of the same terms. One
+pass over the pairs therefore suffices for EM, for a search by gradients and for Newton's method. With n readings, w the
+weights, R the sums of responsibilities, y the terms of the gradient for one pair, and c the cause of a shape:
 
     d / d log w_k                  R_k - n w_k
     d^2 / d log w_j d log w_k      [j = k] R_k - sum y_j y_k - n ([j = k] w_k - w_j w_k)
@@ -25,22 +25,23 @@ from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import BIAS, HIT, MAX, RAND, RATE, SHORT, SIGMA, Bounds, Floats, Point
 
-# Where the terms y of a pair stand among the coordinates.
+# Coordinates of the terms y of a pair.
 _PLACES = np.array([HIT, SHORT, RAND, SIGMA, BIAS, RATE])
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Pseudo-readings: so many of each cause, those of hits and of short obstacles with shapes of their own.
+    """Pseudo-readings of each cause, with shapes for hits and short readings.
 
-    For the weights this is a Dirichlet density. For sigma_hit it is that of so many hits whose mean square distance is
-    sigma^2, for lambda_short that of so many short readings of mean length 1 / rate, normalisers taken as 1.
+    For the weights this is a Dirichlet density. For sigma_hit it is the density of ``counts[0]`` hits whose mean square
+    distance is sigma^2, for lambda_short that of ``counts[1]`` short readings of mean length 1 / rate; the truncated
+    densities' normalisers count as 1.
 
     Attributes:
         counts: (4,) pseudo-readings of each cause.
-        sigma: Their deviation [m].
-        rate: Their rate [1/m].
-        bias: Their offset [m].
+        sigma: Standard deviation of the pseudo-hits [m].
+        rate: Rate of the short pseudo-readings [1/m].
+        bias: Offset of the pseudo-hits [m].
     """
 
     counts: Floats
@@ -49,7 +50,7 @@ class Prior:
     bias: float = 0.0
 
     def value(self, point: Point) -> float:
-        """Log density up to a constant."""
+        """Return the log density up to a constant."""
         used = self.counts > 0
         with np.errstate(divide="ignore"):
             total = float((self.counts[used] * np.log(point.weights[used])).sum())
@@ -60,11 +61,11 @@ class Prior:
         return total
 
     def _square(self, point: Point) -> float:
-        """Mean square distance of the pseudo-hits, in units of sigma."""
+        """Return the mean square distance of the pseudo-hits, in units of the point's sigma."""
         return (self.sigma**2 + (point.bias - self.bias) ** 2) / point.sigma**2
 
     def derivatives(self, point: Point) -> tuple[Floats, Floats]:
-        """(7,) and (7, 7) first and second derivatives of the shapes' part by the coordinates."""
+        """Return the (7,) first and (7, 7) second derivatives of the shapes' part by the coordinates."""
         first, second = np.zeros(7), np.zeros((7, 7))
         hits, short = self.counts[HIT], self.counts[SHORT]
         off, square = (point.bias - self.bias) / point.sigma**2, self._square(point)
@@ -75,7 +76,7 @@ class Prior:
         return first, second
 
     def of_hits(self, point: Point) -> tuple[float, float]:
-        """Pseudo-hits, and their sum of squares in units of sigma."""
+        """Return the number of pseudo-hits and their sum of squares in units of the point's sigma."""
         return float(self.counts[HIT]), float(self.counts[HIT]) * self._square(point)
 
 
@@ -84,16 +85,16 @@ NO_PRIOR = Prior(np.zeros(4))
 
 @dataclass(frozen=True)
 class Value:
-    """What one pass over the pairs says of a point.
+    """Result of one pass over the pairs at a point.
 
     Attributes:
-        point: Where.
-        log_likelihood: Of the readings alone.
-        objective: Log-likelihood and log prior.
+        point: The parameters.
+        log_likelihood: Log-likelihood of the readings alone.
+        objective: Log-likelihood plus log prior.
         totals: (4,) readings that each cause accounts for, pseudo-readings included.
         gradient: (7,) derivatives of the objective by the coordinates.
         sums: The device's sums.
-        hessian: (7, 7) second derivatives, where asked for.
+        hessian: (7, 7) second derivatives, or None.
     """
 
     point: Point
@@ -106,13 +107,16 @@ class Value:
 
 
 class Problem:
-    """Readings, a prior and bounds: the function that a fit climbs.
+    """Readings, a prior and bounds: the function that a search maximises.
 
     Attributes:
+        device: Sums over the pairs.
         pairs: The readings.
-        bounds: Where shapes may lie.
+        bounds: Bounds of the shapes.
         prior: Pseudo-readings.
         fit_bias: Whether the offset of correct ranges is free.
+        readings: Number of readings that are not missing.
+        total: Number of these readings and of pseudo-readings.
     """
 
     def __init__(self, device: DeviceSums, pairs: Pairs, bounds: Bounds, prior: Prior, fit_bias: bool) -> None:
@@ -121,12 +125,12 @@ class Problem:
         self.total = self.readings + float(prior.counts.sum())
 
     def noise(self, value: Value) -> float:
-        """How far an objective may be off by rounding."""
+        """Return the rounding error of an objective."""
         eps = 1e-14 if self.device.real == np.float64 else 1e-7
         return eps * (self.readings + abs(value.objective))
 
     def value(self, point: Point, *, second: bool = False) -> Value:
-        """One pass over the pairs."""
+        """Evaluate a point in one pass over the pairs, with second derivatives if ``second``."""
         sums = self.device.sums(point, information=second)
         top = float(point.weights[MAX])
         log_likelihood = float(sums[0])
@@ -140,52 +144,52 @@ class Problem:
         return Value(point, log_likelihood, objective, totals, gradient, sums, hessian)
 
     def _hessian(self, point: Point, sums: Floats) -> Floats:
-        """Of the log-likelihood and of the weights' prior."""
+        """Return the second derivatives of the log-likelihood and of the weights' prior."""
         weights = point.weights
         products = np.zeros((6, 6))
         products[np.triu_indices(6)] = sums[15:36]
         products += np.triu(products, 1).T
-        found = np.zeros((7, 7))
-        found[np.ix_(_PLACES, _PLACES)] = -products
-        # A max reading has one possible cause and a pseudo-reading is known to have one: only n w - n w w' is left.
-        found[HIT, HIT] += sums[1]
-        found[SHORT, SHORT] += sums[2]
-        found[RAND, RAND] += sums[3]
-        found[:4, :4] -= self.total * (np.diag(weights) - np.outer(weights, weights))
-        own = np.zeros((7, 7))
-        own[HIT, SIGMA], own[HIT, BIAS], own[SHORT, RATE] = sums[4], sums[5], sums[6]
-        own[SIGMA, BIAS] = sums[8] + sums[37]
-        own += own.T
-        own[SIGMA, SIGMA], own[BIAS, BIAS], own[RATE, RATE] = (
+        hessian = np.zeros((7, 7))
+        hessian[np.ix_(_PLACES, _PLACES)] = -products
+        # Max readings and pseudo-readings have one possible cause each: they add only n w - n w w'.
+        hessian[HIT, HIT] += sums[1]
+        hessian[SHORT, SHORT] += sums[2]
+        hessian[RAND, RAND] += sums[3]
+        hessian[:4, :4] -= self.total * (np.diag(weights) - np.outer(weights, weights))
+        shapes = np.zeros((7, 7))
+        shapes[HIT, SIGMA], shapes[HIT, BIAS], shapes[SHORT, RATE] = sums[4], sums[5], sums[6]
+        shapes[SIGMA, BIAS] = sums[8] + sums[37]
+        shapes += shapes.T
+        shapes[SIGMA, SIGMA], shapes[BIAS, BIAS], shapes[RATE, RATE] = (
             sums[7] + sums[36],
             sums[9] + sums[38],
             sums[10] + sums[39],
         )
-        found += own
-        found[BIAS] /= point.sigma
-        found[:, BIAS] /= point.sigma
-        return found
+        hessian += shapes
+        hessian[BIAS] /= point.sigma
+        hessian[:, BIAS] /= point.sigma
+        return hessian
 
     def free(self, value: Value) -> NDArray[np.bool_]:
-        """(7,) which coordinates may be moved at a point.
+        """Return the (7,) mask of coordinates that may move at a point.
 
-        A weight of 0 stays 0. The largest weight follows from the others. A shape at a bound that the gradient points
-        across stays there, and so does the shape of a cause that accounts for no reading.
+        A weight of 0 stays 0. The largest weight follows from the others. A shape stays at a bound if the gradient
+        points across the bound. The shape of a cause that accounts for no reading stays, too.
         """
         point, bounds = value.point, self.bounds
         free = np.append(point.weights > 0, [True, True, self.fit_bias])
         free[int(np.argmax(point.weights))] = False
         free[[SIGMA, BIAS]] &= value.totals[HIT] > NOTHING
         free[RATE] &= value.totals[SHORT] > NOTHING
-        for place, now, (low, high) in ((SIGMA, point.sigma, bounds.sigma), (RATE, point.rate, bounds.rate)):
+        for place, shape, (low, high) in ((SIGMA, point.sigma, bounds.sigma), (RATE, point.rate, bounds.rate)):
             slope = value.gradient[place]
-            near = _AT * now
-            free[place] &= not ((now <= low + near and slope < 0) or (now >= high - near and slope > 0))
+            near = _AT * shape
+            free[place] &= not ((shape <= low + near and slope < 0) or (shape >= high - near and slope > 0))
         free[BIAS] &= abs(point.bias) < bounds.bias
         return free
 
 
-# A shape so near a bound, relatively, is at it.
+# A shape within this relative distance of a bound is at the bound.
 _AT = 1e-9
-# A cause that accounts for less than this many readings is taken for one that does not occur.
+# A cause that accounts for fewer readings than this does not occur.
 NOTHING = 1e-2

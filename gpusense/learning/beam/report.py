@@ -1,4 +1,4 @@
-"""From where a search ended to what the user is told."""
+"""Build the user's result from the end of a search: parameters, standard errors and status."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from gpusense.world.scanner import Reading
 
 
 def report(problem: Problem, climb: Climb, options: Options) -> BeamFit:
-    """The fit that ended where a search did."""
+    """Build the fit from the end of a search."""
     device, pairs = problem.device, problem.pairs
     value = problem.value(climb.value.point, second=True)
     held = _held(problem, value)
     errors = standard_errors(problem, value)
     bias, bias_error = _bias(problem, value)
-    own = {name: errors[name] for name in NAMES[:BIAS]}
+    parameter_errors = {name: errors[name] for name in NAMES[:BIAS]}
     notes = list(climb.notes)
     if not climb.converged and not notes:
         notes.append("did not converge")
     count = int((value.point.weights > 0).sum()) - 1 + int(value.point.weights[HIT] > 0)
     if problem.readings < count:
         readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
-        notes.append(f"{readings} cannot tell {count} parameters")
-    for name, error in own.items():
+        notes.append(f"{readings} cannot determine {count} parameters")
+    for name, error in parameter_errors.items():
         if error == math.inf:
-            held[name] = "the readings do not tell it"
+            held[name] = "the readings do not determine it"
     notes += [f"{name}: {reason}" for name, reason in held.items()]
     head = "converged" if climb.converged else "stopped"
     return BeamFit(
@@ -44,7 +44,7 @@ def report(problem: Problem, climb: Climb, options: Options) -> BeamFit:
         trace=np.array(climb.trace),
         converged=climb.converged,
         status="; ".join([head, *notes]),
-        standard_errors=own,
+        standard_errors=parameter_errors,
         held=held,
         range_bias=bias,
         range_bias_error=bias_error,
@@ -63,7 +63,7 @@ def report(problem: Problem, climb: Climb, options: Options) -> BeamFit:
 
 
 def _held(problem: Problem, value: Value) -> dict[str, str]:
-    """Why parameters were not free, by their names."""
+    """Return the reasons why parameters were not free, by name."""
     point, bounds = value.point, problem.bounds
     held = {}
     for cause in range(4):
@@ -73,17 +73,17 @@ def _held(problem: Problem, value: Value) -> dict[str, str]:
             held[NAMES[cause]] = "every reading has this cause"
     free = problem.free(value)
     shapes = ((SIGMA, HIT, point.sigma, bounds.sigma), (RATE, SHORT, point.rate, bounds.rate))
-    for place, cause, now, (low, high) in shapes:
+    for place, cause, shape, (low, high) in shapes:
         if value.totals[cause] <= NOTHING:
             held[NAMES[place]] = f"kept, since {NAMES[cause]} accounts for no reading"
         elif not free[place]:
-            side, bound = ("lower", low) if now <= low else ("upper", high)
+            side, bound = ("lower", low) if shape <= low else ("upper", high)
             held[NAMES[place]] = f"at its {side} bound {bound:.3g}"
     return held
 
 
 def _bias(problem: Problem, value: Value) -> tuple[float, float]:
-    """The offset of correct ranges and its standard error; to first order where it was not fitted."""
+    """Return the offset of correct ranges and its standard error; to first order if it was not fitted."""
     if value.totals[HIT] <= NOTHING:
         return value.point.bias, math.nan
     with_bias = Problem(problem.device, problem.pairs, problem.bounds, problem.prior, True)
@@ -93,7 +93,7 @@ def _bias(problem: Problem, value: Value) -> tuple[float, float]:
     if math.isfinite(error):
         # One Newton step from 0 in all coordinates.
         return float(newton_direction(with_bias, value)[0][BIAS]), error
-    # Too far from the optimum for that: the mean of correct readings, weighted by their responsibilities.
+    # Too far from the optimum for a Newton step: the mean of correct readings, weighted by their responsibilities.
     correct = float(value.sums[1])
     if correct <= 0:
         return 0.0, error
@@ -101,9 +101,9 @@ def _bias(problem: Problem, value: Value) -> tuple[float, float]:
 
 
 def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray[np.float64]:
-    """(n, 4) of all readings in their order."""
-    found = np.full((len(pairs.kinds), 4), np.nan)
-    found[pairs.kinds == Reading.MAX] = [0, 0, 1, 0]
+    """Return the (n, 4) responsibilities of all readings, in the caller's order."""
+    rows = np.full((len(pairs.kinds), 4), np.nan)
+    rows[pairs.kinds == Reading.MAX] = [0, 0, 1, 0]
     _, hit, short, rand = device.causes(point).T
-    found[pairs.places] = np.stack([hit, short, np.zeros_like(hit), rand], axis=1)
-    return found
+    rows[pairs.places] = np.stack([hit, short, np.zeros_like(hit), rand], axis=1)
+    return rows

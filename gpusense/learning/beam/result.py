@@ -1,4 +1,4 @@
-"""What a fit found, and how far it may be trusted."""
+"""Result of a fit of the beam model."""
 
 from __future__ import annotations
 
@@ -16,35 +16,44 @@ _UNITS = {"sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m"}
 
 @dataclass(frozen=True, eq=False)
 class BeamFit:
-    """The beam model's parameters as learned from readings.
+    """Parameters of the beam model, fitted to readings by :func:`fit_beam_parameters`.
+
+    ``print(fit)`` shows a table of parameters and standard errors.
 
     Attributes:
         parameters: The parameters, all finite.
-        log_likelihood: Of the readings with them, natural log; hits are densities [1/m], max readings probabilities.
-        trace: (iterations + 1,) the log-likelihood at the start and after each iteration, that of the prior included
-            where there is one.
-        converged: Whether the method came to rest; ``status`` says why not. That is at an optimum of the likelihood,
-            but with ``"em-book"`` where the book's own equations hold.
-        status: What is to be known of the fit, in words.
-        standard_errors: Of each parameter by its name, from the observed information. NaN where a parameter was held
-            (the weight of a cause that does not occur, a shape at a bound or of such a cause), infinite where the
-            readings say nothing of it; ``held`` has the reasons.
-        held: Why a parameter has no standard error, by its name.
-        range_bias: Offset b of correct ranges, z = z* + b: fitted with ``range_bias=True``, else what it would be to
-            first order [m].
-        range_bias_error: Its standard error [m].
-        bias_fitted: Whether the parameters were fitted together with it.
+        log_likelihood: Log-likelihood of the readings, natural log; hits count with densities [1/m], max readings with
+            probabilities.
+        trace: (iterations + 1,) log-likelihood, plus the log prior if there is one, at the start and after each
+            iteration.
+        converged: Whether the method converged, at an optimum of the likelihood; with ``"em-book"``, at a solution of
+            the book's equations. ``status`` gives the reason for False.
+        status: Summary of the fit in words.
+        standard_errors: Standard error of each parameter by name, from the observed information. NaN for a held
+            parameter (the weight of a cause that does not occur, a shape at a bound or of such a cause), infinite if
+            the readings do not determine it; ``held`` has the reasons.
+        held: Reason why a parameter has no standard error, by name.
+        range_bias: Offset b of correct ranges, z = z* + b: fitted with ``range_bias=True``, else estimated to first
+            order [m].
+        range_bias_error: Standard error of ``range_bias`` [m].
+        bias_fitted: Whether the parameters were fitted together with the offset.
         iterations: Iterations of the method.
-        passes: How often the pairs were summed over.
-        hits: Readings that are ranges.
-        max_readings: Readings that are "no return".
-        missing: Readings that say nothing, left out.
-        outliers: Hits whose likeliest cause is z_rand: what the fit leaves unexplained.
-        method: The method's name.
-        precision: ``"float64"`` or ``"float32"``, that of the sums over pairs.
-        device: What selects the device it ran on.
-        responsibilities: (n, 4) probabilities of hit, short, max and rand for each reading, where asked for; NaN for
-            missing readings.
+        passes: Passes over the pairs.
+        hits: Number of readings that are ranges.
+        max_readings: Number of readings that are "no return".
+        missing: Number of missing readings, left out.
+        outliers: Number of hits whose likeliest cause is z_rand: unexplained readings.
+        method: Name of the method.
+        precision: ``"float64"`` or ``"float32"``, of the sums over pairs.
+        device: Text that selects the device of the fit.
+        responsibilities: (n, 4) probabilities of hit, short, max and rand for each reading, or None; NaN for missing
+            readings.
+
+    Example:
+        >>> import gpusense as gs
+        >>> fit = gs.fit_beam_parameters([3.9, 4.1, 4.0, 8.0], [4.0] * 4, range_max=8.0, backend="numpy")
+        >>> fit.converged, fit.hits, fit.max_readings, round(fit.parameters.z_max, 3)
+        (True, 3, 1, 0.25)
     """
 
     parameters: BeamParameters
@@ -69,10 +78,7 @@ class BeamFit:
     responsibilities: NDArray[np.float64] | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the responsibilities as plain numbers, lists and strings; no number is NaN or infinite.
-
-        A standard error that is not finite is None.
-        """
+        """Return all attributes but ``responsibilities`` as plain numbers, lists and strings; None if not finite."""
         names = ["log_likelihood", "converged", "status", "held", "bias_fitted", "iterations", "passes", "hits"]
         names += ["max_readings", "missing", "outliers", "method", "precision", "device"]
         return {
@@ -83,6 +89,10 @@ class BeamFit:
             "trace": [_finite(number) for number in self.trace.tolist()],
             **{name: getattr(self, name) for name in names},
         }
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.to_dict().items())
+        return f"BeamFit({values}, converged={self.converged})"
 
     def __str__(self) -> str:
         rows = [(name, value, self.standard_errors[name]) for name, value in self.parameters.to_dict().items()]

@@ -1,4 +1,4 @@
-"""Searches that climb the log-likelihood itself: by its gradient, without it, and over a population; SciPy's."""
+"""Maximise the log-likelihood with SciPy: by its gradient, without derivatives, and over a population."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from gpusense.learning.beam.em import Climb, Watch, newton_direction, without_ne
 from gpusense.learning.beam.point import BIAS, RAND, Floats, Point
 from gpusense.learning.beam.problem import Problem, Value
 
-# A weight is between e^-25 and e^25 times the one that follows from the others.
+# Bound of a log weight relative to the reference weight: a weight is within e^-25 and e^25 times the reference.
 _WIDEST = 25.0
-# So often hill climbing turns its directions where it is stuck.
+# Most rotations of the directions of a stuck hill climb.
 _TURNS = 5
 
 
 class _Coordinates:
     """The free coordinates of a search as a vector.
 
-    They are the logarithms of the weights but the largest at the start, which follows from the normalisation, and log
-    sigma_hit, log lambda_short and the bias in metres / range_max. Causes that the start leaves out stay out.
+    They are the logarithms of the weights, log sigma_hit, log lambda_short and the bias / range_max. The weight that is
+    largest at the start, the reference, follows from the normalisation. Causes of weight 0 at the start stay out.
     """
 
     def __init__(self, problem: Problem, start: Point) -> None:
@@ -42,20 +42,20 @@ class _Coordinates:
         self.limits = np.array([limits[place] for place in self.places]).reshape(-1, 2) / self.unit[:, None]
 
     def vector(self, point: Point) -> Floats:
-        """A point's free coordinates, within their limits."""
+        """Return the free coordinates of a point, clamped to their limits."""
         logs = point.coordinates()
         logs[:4] += self._origin[self.reference] - logs[self.reference]
         return np.clip(logs[self.places] / self.unit, self.limits[:, 0], self.limits[:, 1])
 
     def point(self, vector: Floats) -> Point:
-        """The point of free coordinates."""
+        """Return the point of free coordinates."""
         step = np.zeros(7)
         step[self.places] = vector * self.unit - self._origin[self.places]
         return self._start.moved(step, self._problem.bounds)
 
 
 class _Search:
-    """A search's function of a vector, which keeps the best point and the trace."""
+    """The objective as a function of a vector, with the best value so far and the trace."""
 
     def __init__(self, problem: Problem, start: Point, watch: Watch) -> None:
         self.problem, self.watch = problem, watch
@@ -64,33 +64,35 @@ class _Search:
         self.trace = [self.best.objective]
 
     def value(self, vector: Floats) -> Value:
-        found = self.problem.value(self.coordinates.point(vector))
-        if found.objective > self.best.objective:
-            self.best = found
-        return found
+        """Evaluate a vector, and remember the best value."""
+        value = self.problem.value(self.coordinates.point(vector))
+        if value.objective > self.best.objective:
+            self.best = value
+        return value
 
     def cost(self, vector: Floats) -> float:
-        """Minus the objective a reading."""
+        """Return minus the objective per reading."""
         return -self.value(vector).objective / self.problem.total
 
     def cost_and_gradient(self, vector: Floats) -> tuple[float, Floats]:
-        found = self.value(vector)
-        slope = found.gradient[self.coordinates.places] * self.coordinates.unit
-        return -found.objective / self.problem.total, -slope / self.problem.total
+        """Return minus the objective per reading and its gradient."""
+        value = self.value(vector)
+        slope = value.gradient[self.coordinates.places] * self.coordinates.unit
+        return -value.objective / self.problem.total, -slope / self.problem.total
 
     def end_iteration(self, *_: Any) -> None:
-        """Note where an iteration ended."""
+        """Append the best objective to the trace, and call the watch."""
         self.trace.append(self.best.objective)
         self.watch(len(self.trace) - 1, self.best)
 
     def left(self) -> float:
-        """Nats that the quadratic model still sees to gain."""
+        """Return the remaining gain that the quadratic model predicts at the best point [nats]."""
         self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
         return newton_direction(self.problem, self.best)[1]
 
 
 def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, begun anew while that still gains."""
+    """Run L-BFGS-B (Byrd, Lu, Nocedal and Zhu 1995) with the analytic gradient, restarted while it still gains."""
     search = _Search(problem, start, watch)
     return _refine(search, max_iterations, tolerance)
 
@@ -103,7 +105,7 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
         return Climb(search.best, search.trace, True)
     while len(search.trace) <= max_iterations:
         before = search.best.objective
-        found = minimize(
+        result = minimize(
             search.cost_and_gradient,
             coordinates.vector(search.best.point),
             jac=True,
@@ -119,7 +121,7 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
             },
         )
         gained = search.best.objective - before
-        if found.nit == 0:
+        if result.nit == 0:
             search.end_iteration()
         if gained <= max(tolerance, search.problem.noise(search.best)):
             left = search.left()
@@ -130,11 +132,11 @@ def _refine(search: _Search, max_iterations: int, tolerance: float) -> Climb:
 
 
 def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
-    """Powell's method (1964) without derivatives, within bounds, begun anew until that gains nothing.
+    """Run Powell's method (1964), without derivatives and within bounds, restarted until it gains nothing.
 
-    Its line searches keep their grip in the long, narrow valleys of this likelihood, where a simplex (Nelder and Mead)
-    collapses; it also takes bounds. It begins along the coordinates. Where all of these lead down but the end is no
-    optimum, as the derivatives there tell, it begins anew along others, which are turned at random.
+    Its line searches make progress in the long, narrow valleys of this likelihood, in which a simplex (Nelder and Mead)
+    collapses; it also accepts bounds. The first directions are the coordinates. If no direction gains but the
+    derivatives show that the end is no optimum, it restarts along randomly rotated directions.
     """
     from scipy.optimize import minimize
 
@@ -173,13 +175,13 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
 def climb_genetic(
     problem: Problem, start: Point, *, seed: int, max_iterations: int, tolerance: float, watch: Watch
 ) -> Climb:
-    """Differential evolution (Storn and Price 1997) over all the bounds, finished by L-BFGS-B."""
+    """Run differential evolution (Storn and Price 1997) over all the bounds, then L-BFGS-B."""
     from scipy.optimize import differential_evolution
 
     search = _Search(problem, start, watch)
     coordinates = search.coordinates
     if len(coordinates.places):
-        # Weights far below one reading in all are not searched: the end of it moves them there if that is better.
+        # Weights far below one reading are not searched; L-BFGS-B reaches them if they are better.
         narrow = np.log(10 * problem.total)
         middle = coordinates.vector(start)
         limits = coordinates.limits.copy()

@@ -1,4 +1,4 @@
-"""Standard errors from the observed information, on the parameters as the model takes them."""
+"""Standard errors of the model's parameters from the observed information."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from gpusense.learning.beam.point import BIAS, NAMES, RATE, SIGMA, Floats
 from gpusense.learning.beam.problem import Problem, Value
 
-# Scaled information below this part of the largest is none.
+# Scaled information below this share of the largest counts as none.
 _FLAT = 1e-10
 
 
 def standard_errors(problem: Problem, value: Value) -> dict[str, float]:
-    """The standard error of each parameter by its name.
+    """Compute the standard error of each parameter by name.
 
-    The inverse of minus the second derivatives by the free coordinates, carried to the parameters by the coordinates'
-    derivatives there. NaN where a parameter was not free (0, at a bound, or of a cause that accounts for no reading),
-    infinite where the readings hold no information about it.
+    The covariance is the inverse of minus the second derivatives by the free coordinates, transformed to the parameters
+    by their derivatives. The error is NaN for a parameter that was not free (0, at a bound, or of a cause that accounts
+    for no reading), and infinite if the readings hold no information about it.
     """
     assert value.hessian is not None
     free = problem.free(value)
@@ -30,7 +30,7 @@ def standard_errors(problem: Problem, value: Value) -> dict[str, float]:
     jacobian[SIGMA, SIGMA], jacobian[RATE, RATE], jacobian[BIAS, BIAS] = point.sigma, point.rate, 1.0
     moved = np.append(weights > 0, free[4:])
     if not (free[:4]).any():
-        # One weight alone is 1 and has no error.
+        # A single weight is 1 and has no error.
         moved[:4] = False
     errors = np.full(7, math.nan)
     if len(places):

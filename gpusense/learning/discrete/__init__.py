@@ -1,1 +1,1 @@
-"""The discrete model of proximity sensors, and its causes from readings."""
+"""The discrete model of proximity sensors: its table, and its causes learned from readings."""

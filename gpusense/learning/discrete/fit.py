@@ -1,4 +1,4 @@
-"""Maximum likelihood for the causes of the discrete model, from counts of (step of z*, step of z)."""
+"""Learn the causes of the discrete model by maximum likelihood, from counts of (step of z*, step of z)."""
 
 from __future__ import annotations
 
@@ -10,26 +10,36 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from gpusense._util import checks
+from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
 from gpusense.learning.discrete.probabilities import separate_causes
-from gpusense.learning.discrete.table import MOST_BINS, DiscreteCauses, DiscreteFit, bins_of, check_pairs
+from gpusense.learning.discrete.readings import MOST_BINS, bins_of, check_pairs
 
 Floats = NDArray[np.float64]
 
 NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
 # Readings that are counted at once.
 _BLOCK = 1 << 20
-# Steps of central differences of the mean log-likelihood: where its rounding and its next derivatives weigh alike.
+# Steps of first and second central differences of the mean log-likelihood: rounding and truncation errors are alike.
 _FIRST, _SECOND = 1e-5, 1e-3
-# A gradient of the mean log-likelihood up to this is 0: it moves a parameter by less than a hundredth of the standard
-# error that ten million readings leave.
+# Largest gradient of the mean log-likelihood that counts as 0: it moves a parameter by less than a hundredth of the
+# standard error of ten million readings.
 _FLAT = 2e-6
-# Steps with which the search begins where there are many.
+# Number of steps of the coarse search that precedes a search with many steps.
 _FEW = 100
 
 
 @dataclass(frozen=True)
 class Counts:
-    """Readings as counts: ``counts[k]`` of them fall into step ``steps[k]`` where ``rows[k]`` was expected."""
+    """Counts of readings: ``counts[k]`` readings in step ``steps[k]`` with an obstacle expected in ``rows[k]``.
+
+    Attributes:
+        rows: (K,) steps of expected ranges.
+        steps: (K,) steps of readings.
+        counts: (K,) numbers of readings.
+        missing: Number of missing readings.
+        bins: Number of steps along the beam.
+        width: Width of a step [m].
+    """
 
     rows: NDArray[np.int64]
     steps: NDArray[np.int64]
@@ -40,16 +50,16 @@ class Counts:
 
     @property
     def total(self) -> float:
-        """Readings that are not missing."""
+        """Number of readings that are not missing."""
         return float(self.counts.sum())
 
     def log_likelihood(self, causes: DiscreteCauses) -> float:
-        """Of all readings: logarithms of their steps' probabilities."""
+        """Return the log-likelihood of all readings, from the probabilities of their steps."""
         log_p = separate_causes(self.bins, self.width, **causes.to_dict(), rows=self.rows, steps=self.steps)
         return float(self.counts @ log_p)
 
     def coarser(self, bins: int) -> Counts:
-        """About the same readings in fewer steps."""
+        """Return approximate counts in fewer steps."""
         scale = bins / self.bins
         both = np.trunc(np.stack([self.rows, self.steps]) * scale).astype(np.int64)
         cells, inverse = np.unique(both, axis=1, return_inverse=True)
@@ -58,7 +68,7 @@ class Counts:
 
 
 def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -> Counts:
-    """Count readings; see ``DiscreteBeamModel.learn`` for the arguments and errors."""
+    """Count readings; see ``DiscreteBeamModel.learn`` for arguments and errors."""
     range_max = checks.real("range_max", range_max, above=0)
     bins = checks.integer("bins", bins, low=1, high=MOST_BINS)
     z, z_exp = (checks.as_array(name, value) for name, value in (("ranges", ranges), ("expected", expected)))
@@ -69,12 +79,12 @@ def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -
     table, missing = np.zeros((bins + 1) ** 2, np.int64), 0
     for first in range(0, max(len(z), 1), _BLOCK):
         block = slice(first, first + _BLOCK)
-        own, own_exp = check_pairs(z[block], z_exp[block], range_max)
-        i, j = bins_of(own, range_max, bins), bins_of(own_exp, range_max, bins)
+        readings, expected_ranges = check_pairs(z[block], z_exp[block], range_max)
+        i, j = bins_of(readings, range_max, bins), bins_of(expected_ranges, range_max, bins)
         missing += int(np.count_nonzero(i < 0))
-        # A bin that does not occur makes bincount's result shorter.
-        found = np.bincount((j * (bins + 1) + i)[i >= 0])
-        table[: len(found)] += found
+        # bincount's result ends with the last bin that occurs.
+        counts = np.bincount((j * (bins + 1) + i)[i >= 0])
+        table[: len(counts)] += counts
     cells = np.flatnonzero(table)
     if cells.size == 0:
         raise ValueError(f"ranges: must have a reading that is not missing, got {missing} missing ones")
@@ -82,32 +92,32 @@ def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -
 
 
 def learn_causes(ranges: object, expected: object, range_max: float, bins: int) -> tuple[DiscreteCauses, DiscreteFit]:
-    """The most likely causes; see ``DiscreteBeamModel.learn``.
+    """Learn the most likely causes; see ``DiscreteBeamModel.learn``.
 
-    The search is a quasi-Newton one over logarithms of rates and deviation and the log odds of detection, within bounds
-    beyond which the table does not change. It begins at the best two of a few starts, or, for many steps, where that
-    search ended for few of them.
+    The search is a quasi-Newton search over the logarithms of rates and sigma_hit and the log odds of detection, within
+    bounds beyond which the table does not change. It starts from the best two of a few starts; for many steps, from the
+    result of the same search with few steps.
     """
     data = count_pairs(ranges, expected, range_max, bins)
     if bins > 2 * _FEW:
         coarse = data.coarser(_FEW)
-        theta = min((_search(coarse, start) for start in _starts(coarse)[:2]), key=lambda found: found[0])[1]
+        theta = min((_search(coarse, start) for start in _starts(coarse)[:2]), key=lambda result: result[0])[1]
         theta[3] = max(theta[3], math.log(0.2 * data.width))
         value, theta, trace = _search(data, theta)
     else:
-        value, theta, trace = min((_search(data, start) for start in _starts(data)[:2]), key=lambda found: found[0])
+        value, theta, trace = min((_search(data, start) for start in _starts(data)[:2]), key=lambda result: result[0])
     return _causes(theta), _fit(data, value, theta, trace)
 
 
 def _search(data: Counts, start: Floats) -> tuple[float, Floats, list[float]]:
-    """Mean negative log-likelihood, where it is least, and its values on the way."""
+    """Minimise the mean negative log-likelihood; return its minimum, the point, and the trace."""
     trace = [_loss(data, start)]
-    found = minimize(
+    result = minimize(
         lambda theta: _loss(data, theta), start, jac=lambda theta: _gradient(data, theta), method="L-BFGS-B",
         bounds=_bounds(data), callback=lambda theta: trace.append(_loss(data, theta)),
         options={"maxiter": 300, "ftol": 0.0, "gtol": 0.1 * _FLAT},
     )  # fmt: skip
-    return float(found.fun), np.array(found.x), trace
+    return float(result.fun), np.array(result.x), trace
 
 
 def _loss(data: Counts, theta: Floats) -> float:
@@ -122,7 +132,7 @@ def _gradient(data: Counts, theta: Floats) -> Floats:
 def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> DiscreteFit:
     low, high = np.transpose(_bounds(data))
     slope = _gradient(data, theta)
-    # Against a bound the likelihood may still rise.
+    # At a bound the likelihood may still rise towards the outside.
     at_low, at_high = theta <= low + 1e-9, theta >= high - 1e-9
     pushed = (at_low & (slope > 0)) | (at_high & (slope < 0))
     converged = bool((np.abs(slope)[~pushed] <= _FLAT).all())
@@ -131,7 +141,7 @@ def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> Discr
     ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
     unknown = [name for name, error in errors.items() if math.isnan(error) and name not in ends]
     if ends:
-        status += f"; at an end of what is possible: {', '.join(ends)}"
+        status += f"; at a bound: {', '.join(ends)}"
     if unknown:
         status += f"; the readings do not determine {', '.join(unknown)}"
     none = data.steps == data.bins
@@ -153,14 +163,17 @@ def _causes(theta: Floats) -> DiscreteCauses:
 
 
 def _bounds(data: Counts) -> list[tuple[float, float]]:
-    """Beyond these a table is the same to a part in a million."""
+    """Return the bounds of the search; beyond them a table changes by less than a part in a million."""
     reach = data.bins * data.width
     rates = math.log(1e-9 / reach), math.log(30 / data.width)
     return [rates, rates, (-25.0, 25.0), (math.log(1e-6 * data.width), math.log(10 * reach))]
 
 
 def _starts(data: Counts) -> list[Floats]:
-    """Shares of readings before, at and behind the expected step, at several deviations; the best first."""
+    """Make starts from the shares of readings before, at and behind the expected step, the best first.
+
+    Each start counts readings within another number of steps as readings at the expected step.
+    """
     reach, total = data.bins * data.width, data.total
     known, none = data.rows < data.bins, data.steps == data.bins
     starts = []
@@ -178,7 +191,7 @@ def _starts(data: Counts) -> list[Floats]:
 
 
 def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dict[str, float]:
-    """From the observed information, in the parameters' own units; NaN where the data do not tell."""
+    """Compute standard errors from the observed information, in the parameters' units; NaN if undetermined."""
 
     def loss(*shifts: Floats) -> float:
         return _loss(data, theta + np.sum(shifts, axis=0))
@@ -192,12 +205,12 @@ def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dic
         for b, two in enumerate(steps[:a]):
             mixed = loss(one, two) - loss(one, -two) - loss(-one, two) + loss(-one, -two)
             information[a, b] = information[b, a] = mixed / (4 * _SECOND**2)
-    # Of a parameter without influence differences are nothing but rounding.
-    told = np.diagonal(information) > 1e-8
+    # Without influence of a parameter, differences are rounding errors only.
+    determined = np.diagonal(information) > 1e-8
     errors = np.full(len(theta), np.nan)
-    inner = information[np.ix_(told, told)] * data.total
-    if told.any() and np.linalg.eigvalsh(inner).min() > 0:
-        errors[places[told]] = np.sqrt(np.diagonal(np.linalg.inv(inner)))
+    inner = information[np.ix_(determined, determined)] * data.total
+    if determined.any() and np.linalg.eigvalsh(inner).min() > 0:
+        errors[places[determined]] = np.sqrt(np.diagonal(np.linalg.inv(inner)))
     causes = _causes(theta)
     scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
     return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}

@@ -1,16 +1,17 @@
-"""The discrete model of proximity sensors: probabilities of steps along a beam, of which each hides what comes later.
+"""Probabilities of the discrete model of proximity sensors: the first trigger along a beam hides all later ones.
 
-A beam goes through ``bins`` steps. At each, every cause that is left triggers a reading or does not; the beam goes on
-where none does, and what no cause has triggered in the end is a max reading. With ``h_k`` the probability that cause k
-triggers at a step which the beam has reached,
+A beam goes through ``bins`` steps. At each step every remaining cause may trigger a reading. The beam continues if none
+does; a beam without any trigger is a max reading. With ``h_k`` the probability that cause k triggers at a step which
+the beam has reached,
 
     ``P_i = S_i (1 - prod_k (1 - h_ki))``, ``S_i = prod_{l < i} prod_k (1 - h_kl)``, ``P_max = S_bins``,
 
-so that the probabilities of a row sum to 1 by construction. All is logarithms: ``log(1 - h)`` is added up, and
-``1 - prod (1 - h_k)`` is the sum of positive terms ``h_1 + (1 - h_1) h_2 + ...``; nothing cancels or underflows.
+so that the probabilities of a row sum to 1 by construction. All computations are in logarithms: ``log(1 - h)`` is
+summed, and ``1 - prod (1 - h_k)`` is the sum of positive terms ``h_1 + (1 - h_1) h_2 + ...``; nothing cancels or
+underflows.
 
 Source: Fox, Burgard and Thrun, *Markov localization for mobile robots in dynamic environments*, JAIR 11 (1999), the
-section on proximity sensors. Row j of a table stands for an obstacle that the map expects in step j; the last row, for
+section on proximity sensors. Row j of a table is for an obstacle that the map expects in step j; the last row is for
 none within range.
 """
 
@@ -27,18 +28,18 @@ Integers = NDArray[np.int64]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _LOG_ROOT_2PI = 0.5 * math.log(2 * math.pi)
-# From here on the series of 1 - x R(x) is more exact than its difference.
+# Least x for which the series of 1 - x R(x) is more exact than the difference.
 _FAR = 30.0
-# Steps narrower than this many deviations are integrated with nodes, wider ones in closed form.
+# Steps narrower than this many standard deviations are integrated by quadrature, wider ones in closed form.
 _NARROW = 0.5
 
 
 def log_table(log_trigger: Floats, log_pass: Floats) -> Floats:
-    """log P of every step and of no return, from the causes' probabilities at a step that the beam has reached.
+    """Compute log P of every step and of no return from the causes' probabilities at a step that the beam has reached.
 
     Args:
         log_trigger: (causes, rows, bins) ``log h_k``.
-        log_pass: (causes, rows, bins) ``log(1 - h_k)``, given apart because neither is exact from the other.
+        log_pass: (causes, rows, bins) ``log(1 - h_k)``, a separate argument because it is not exact from ``log h_k``.
 
     Returns:
         (rows, bins + 1); the last column is the remainder.
@@ -46,9 +47,9 @@ def log_table(log_trigger: Floats, log_pass: Floats) -> Floats:
     steps = log_pass.sum(axis=0)
     reached = np.concatenate([np.zeros((len(steps), 1)), np.cumsum(steps, axis=1)], axis=1)
     first, passed = log_trigger[0], log_pass[0]
-    for own, on in zip(log_trigger[1:], log_pass[1:], strict=True):
-        first = np.logaddexp(first, passed + own)
-        passed = passed + on
+    for trigger, not_triggered in zip(log_trigger[1:], log_pass[1:], strict=True):
+        first = np.logaddexp(first, passed + trigger)
+        passed = passed + not_triggered
     return np.concatenate([reached[:, :-1] + first, reached[:, -1:]], axis=1)
 
 
@@ -56,22 +57,22 @@ def separate_causes(
     bins: int, width: float, *, lambda_short: float, lambda_rand: float, p_detect: float, sigma_hit: float,
     rows: Integers, steps: Integers,
 ) -> Floats:  # fmt: skip
-    """Causes that know nothing of each other; the first one to trigger is what is measured.
+    """Compute probabilities for independent causes; the first cause to trigger determines the reading.
 
-    Unknown obstacles stand at a constant rate along the beam as far as the step of the expected obstacle, random
-    triggers at a constant rate all along it. The expected obstacle is detected with probability ``p_detect``, at a step
-    that :func:`log_spread` distributes around its own; it triggers at a step with the share of that in what is left of
-    its readings and of those that miss it. The products of what each cause lets pass have closed forms here.
+    Unknown obstacles have a constant rate along the beam up to the step of the expected obstacle, random triggers a
+    constant rate along the whole beam. The expected obstacle is detected with probability ``p_detect``, at a step that
+    :func:`log_spread` distributes around its step. Its trigger probability at a step is the share of this step in the
+    mass that is left: detections at this step and later, and misses. The products over causes have closed forms here.
 
     Args:
-        bins: Steps of a beam.
-        width: Of a step [m].
+        bins: Steps along the beam.
+        width: Width of a step [m].
         lambda_short: Rate of unknown obstacles [1/m].
         lambda_rand: Rate of random triggers [1/m].
-        p_detect: Probability that the obstacle of the map is detected where nothing triggers earlier.
-        sigma_hit: Deviation of where it is detected [m]; 0 for its own step.
-        rows: In which step an obstacle is expected, ``bins`` for none within range.
-        steps: In which step a reading falls, ``bins`` for no return.
+        p_detect: Probability that the expected obstacle is detected if no cause triggers earlier.
+        sigma_hit: Standard deviation of the detected range [m]; 0 detects the obstacle in its step.
+        rows: Step of the expected obstacle, ``bins`` for none within range.
+        steps: Step of the reading, ``bins`` for no return.
 
     Returns:
         Natural logarithms of probabilities, in the broadcast shape of rows and steps.
@@ -82,7 +83,7 @@ def separate_causes(
         place = np.minimum(rows, bins - 1)
         spread = log_spread(bins, width, sigma_hit)
         left, total = _spread_from(spread, bins, steps, place), _spread_from(spread, bins, np.zeros_like(place), place)
-        # What has neither been detected before this step nor is detected earlier: that of later steps, and the missed.
+        # Mass not detected before this step: detections at this step and later, and misses.
         unseen = np.where(none, 0.0, np.logaddexp(missed, detected + left - total))
         seen = np.where(none, -np.inf, detected + spread[np.abs(steps - place)] - total)
         reached = -lambda_short * width * np.minimum(steps, rows + 1) - lambda_rand * width * steps + unseen
@@ -97,22 +98,22 @@ def shared_causes(
     bins: int, width: float, *, z_hit: float, z_short: float, z_max: float, z_rand: float, sigma_hit: float,
     lambda_short: float, rows: Integers,
 ) -> Floats:  # fmt: skip
-    """The table whose causes have the shares of the beam model's mixture among the readings.
+    """Compute the table whose causes have the shares of the beam model's mixture among the readings.
 
-    At step i cause k triggers with probability ``z_k m_ki / (what the mixture has left from step i on)``, where m_ki is
-    the share of its component in that step. Two causes that trigger at the same step are one reading: by that alone
-    the table differs from the mixture's integrals over the steps, and it vanishes with the steps' width.
+    At step i cause k triggers with probability ``z_k m_ki / (mass of the mixture from step i on)``, where m_ki is the
+    share of its component in that step. Two causes that trigger at the same step make one reading. This is the only
+    difference between the table and the mixture's integrals over the steps; it vanishes with the steps' width.
 
     Args:
-        bins: Steps.
-        width: Of a step [m].
+        bins: Steps along the beam.
+        width: Width of a step [m].
         z_hit: Weight of a correct range.
         z_short: Weight of an unexpected obstacle.
         z_max: Weight of no return.
         z_rand: Weight of a random reading.
         sigma_hit: Standard deviation of a correct range [m].
         lambda_short: Rate of unexpected obstacles [1/m].
-        rows: (R,) which rows, 0 to ``bins``.
+        rows: (R,) indices of the rows, 0 to ``bins``.
 
     Returns:
         (R, bins + 1) natural logarithms of probabilities.
@@ -132,41 +133,40 @@ def shared_causes(
 
 
 def _log_hits(bins: int, width: float, sigma: float, rows: Integers) -> Floats:
-    """(rows, bins) log masses of a correct range within [0, range_max]; sums of 1.
+    """Return (rows, bins) log masses of a correct range within [0, range_max]; each row has the sum 1.
 
-    An obstacle beyond is expected in the step after the last one.
+    An obstacle beyond range_max is expected in the step after the last one.
     """
     spread = log_spread(bins, width, sigma)[np.abs(np.arange(bins) - rows[:, None])]
-    # Of what is too far for any logarithm, the last step is the nearest.
+    # If all masses of the last row underflow, the nearest step, the last, takes all of it.
     spread[rows == bins, -1] = np.maximum(spread[rows == bins, -1], -np.finfo(np.float64).max)
     normalised: Floats = spread - logsumexp(spread, axis=1, keepdims=True)
     return normalised
 
 
 def _spread_from(spread: Floats, bins: int, steps: Integers, rows: Integers) -> Floats:
-    """log of what :func:`log_spread` puts into steps ``steps`` to ``bins - 1``, from sums over its decreasing tail.
+    """Return the log mass of :func:`log_spread` in steps ``steps`` to ``bins - 1``, from sums over its tail.
 
-    It decreases ever faster, so a difference of two such sums is at least an ``1 / bins`` of the larger one.
+    The tail decreases ever faster, so a difference of two such sums is at least ``1 / bins`` of the larger one.
     """
     beyond = np.append(np.logaddexp.accumulate(spread[::-1])[::-1], -np.inf)
-    ahead = _log_difference(beyond[np.maximum(steps - rows, 0)], beyond[bins - rows])
-    behind = _log_difference(beyond[1], beyond[np.maximum(rows - steps, 0) + 1])
-    return np.logaddexp(ahead, np.where(steps < rows, behind, -np.inf))
+    above = _log_difference(beyond[np.maximum(steps - rows, 0)], beyond[bins - rows])
+    below = _log_difference(beyond[1], beyond[np.maximum(rows - steps, 0) + 1])
+    return np.logaddexp(above, np.where(steps < rows, below, -np.inf))
 
 
 def _log_difference(larger: Floats, smaller: Floats) -> Floats:
-    """log(exp(larger) - exp(smaller)); -inf where both are."""
+    """Return log(exp(larger) - exp(smaller)); -inf if both are -inf."""
     return np.where(np.isneginf(larger), -np.inf, larger + np.log1p(-np.exp(smaller - larger)))
 
 
 def log_spread(bins: int, width: float, sigma: float) -> Floats:
-    """Share of an obstacle's readings that fall d steps from its own, d = 0 to ``bins``, without ends.
+    """Return the log share of an obstacle's readings that fall d steps from its step, d = 0 to ``bins``.
 
-    The obstacle is anywhere in its step, evenly, and its readings are normal around it. With s = width / sigma that is
-    ``s`` times the integral of ``(1 - |u|) phi((d + u) s)`` over [-1, 1], or the second difference
-    ``(H(x - s) - 2 H(x) + H(x + s)) / s`` at x = d s of ``H(x) = phi(x) - x Q(x)``, Q the normal's upper tail. The
-    integral is taken with Gauss-Legendre nodes where s is small, and the difference where it is not, or far out; either
-    keeps 14 digits.
+    The obstacle is uniformly distributed in its step, its readings are normal around it, and the beam has no ends. With
+    s = width / sigma the share is ``s`` times the integral of ``(1 - |u|) phi((d + u) s)`` over [-1, 1], or the second
+    difference ``(H(x - s) - 2 H(x) + H(x + s)) / s`` at x = d s of ``H(x) = phi(x) - x Q(x)``, with Q the normal's
+    upper tail. Gauss-Legendre quadrature is used for small s, the difference for large s or x; either keeps 14 digits.
 
     Returns:
         (bins + 1,) natural logarithms.
@@ -186,12 +186,12 @@ def log_spread(bins: int, width: float, sigma: float) -> Floats:
         u = np.concatenate([-0.5 * (1 + _NODES), 0.5 * (1 + _NODES)])
         weight = 0.5 * np.tile(_WEIGHTS, 2) * (1 - np.abs(u))
         exponent = -x[:, None] * u * s - 0.5 * (u * s) ** 2
-        ruled = -0.5 * x * x - _LOG_ROOT_2PI + logsumexp(exponent, b=weight, axis=1) + np.log(s)
-        return np.where(x > _FAR, differences, ruled)
+        quadrature = -0.5 * x * x - _LOG_ROOT_2PI + logsumexp(exponent, b=weight, axis=1) + np.log(s)
+        return np.where(x > _FAR, differences, quadrature)
 
 
 def _log_h(x: Floats) -> Floats:
-    """log(phi(x) - x Q(x)) for x >= 0, as phi(x) (1 - x R(x)) with Mills' ratio R."""
+    """Return log(phi(x) - x Q(x)) for x >= 0, as phi(x) (1 - x R(x)) with Mills' ratio R."""
     y = np.minimum(x, _FAR)
     near = 1 - y * math.sqrt(math.pi / 2) * erfcx(y * math.sqrt(0.5))
     t = 1 / np.maximum(x, _FAR) ** 2
@@ -201,7 +201,7 @@ def _log_h(x: Floats) -> Floats:
 
 
 def _log_decay(bins: int, decay: float, rows: Integers) -> Floats:
-    """(rows, bins) log masses of an exponential that ends with the step of the expected obstacle; sums of 1."""
+    """Return (rows, bins) log masses of an exponential that ends with the expected step; each row has the sum 1."""
     step, steps = np.arange(bins), np.minimum(rows + 1, bins)[:, None]
     if decay * bins < 1e-17:
         return np.where(step < steps, -np.log(steps), -np.inf)
@@ -210,11 +210,11 @@ def _log_decay(bins: int, decay: float, rows: Integers) -> Floats:
 
 
 def _tails(log_mass: Floats, log_none: Floats) -> Floats:
-    """(rows, bins + 1) logarithms of what is left from each step on, the remainder included."""
+    """Return the (rows, bins + 1) log mass from each step on, the remainder included."""
     all_columns = np.concatenate([log_mass, log_none], axis=1)[:, ::-1]
     return np.logaddexp.accumulate(all_columns, axis=1)[:, ::-1]
 
 
 def _ratio(log_part: Floats, log_whole: Floats) -> Floats:
-    """Difference of logarithms, 0 / 0 being 0: nothing triggers where nothing can arrive."""
+    """Return the difference of logarithms, with 0 / 0 = 0: no cause triggers where no beam arrives."""
     return np.where(np.isneginf(log_part), -np.inf, log_part - log_whole)

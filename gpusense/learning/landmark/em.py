@@ -1,9 +1,9 @@
-"""Expectation maximisation for the landmark model's parameters, and Newton steps where EM becomes slow.
+"""Expectation maximisation for the landmark model's parameters, and Newton steps once EM becomes slow.
 
-Each feature belongs to the landmarks that it may be and to the false positives with certain probabilities (E-step), and
-these weigh the squares of its residuals (M-step). Closed forms of the M-step leave out that features are limited to
-what the sensor can measure, so a step is halved until the log-likelihood does not fall; once EM gains little, Newton
-steps of the log-likelihood itself take over, as for the beam model (``em``).
+The E-step computes the probabilities that a feature is each of its possible landmarks, or a false positive. The M-step
+weighs the squares of its residuals by them. Closed forms of the M-step ignore the limits of the sensor, so a step is
+halved until the log-likelihood does not fall. Once EM gains little, Newton steps of the log-likelihood itself follow,
+as for the beam model (``gpusense.learning.beam.em``).
 """
 
 from __future__ import annotations
@@ -29,37 +29,39 @@ from gpusense.models.landmark.features import wrapped
 from gpusense.world.parameters import LandmarkParameters
 
 SIGMAS = ("sigma_range", "sigma_bearing", "sigma_signature")
-# Features that a cause accounts for below which it is none.
+# A cause that accounts for fewer features than this does not occur.
 NOTHING = 1e-3
-# Newton steps begin once an EM step gains less than this, or after so many of them.
+# Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 30
 _HALVINGS = 30
-# Pairs less probable than this after EM are left out of Newton steps: all of them together change less than rounding.
+# Pairs less probable than this after EM are left out of Newton steps; together they change less than rounding.
 _FAR = 1e-18
-# A deviation is at least this part of range_max, of a radian, and of the signatures' span.
+# Smallest standard deviation as a share of range_max, of a radian, and of the signatures' span.
 _SMALLEST = 1e-6
 
 
 def bounds_of(pairs: Pairs) -> tuple[Floats, Floats]:
-    """(3,) smallest and (3,) largest deviations."""
+    """Return the (3,) smallest and (3,) largest standard deviations."""
     limits = pairs.limits
     lengths = np.array([limits.range_max, 1.0, limits.span[1] - limits.span[0]])
     return _SMALLEST * lengths, np.array([lengths[0], math.pi, lengths[2]])
 
 
 def first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Point:
-    """The user's, or the typical residual of each feature's nearest landmark, with one false positive in ten."""
+    """Make the start from the user's parameters, or from the typical residual of each feature's nearest landmark.
+
+    Without the user's parameters one feature in ten is a false positive.
+    """
     low, high = bounds_of(pairs)
     if initial is not None:
-        given = [getattr(initial, name) for name in SIGMAS]
-        sigma = [float(np.clip(h / 10 if s is None else s, b, h)) for s, b, h in zip(given, low, high, strict=True)]
+        start = [getattr(initial, name) for name in SIGMAS]
+        sigma = [float(np.clip(h / 10 if s is None else s, b, h)) for s, b, h in zip(start, low, high, strict=True)]
         z = min(max(initial.z_detect, 1e-6), 1 - 1e-6) if len(pairs.feature) else 0.0
         return Point((sigma[0], sigma[1], sigma[2]), z, (0.0, 0.0))
-    # Residuals across the line of sight count in metres, as those along it do.
-    scale = np.array([1.0, 1.0, 1.0])
-    far = np.minimum(np.nan_to_num(pairs.means), pairs.limits.range_max)[:, RANGE]
-    size = np.nan_to_num(pairs.residuals) * scale
-    size[:, 1] *= np.maximum(far, 0.1)
+    # Residuals across the line of sight are converted to metres, the unit of those along it.
+    distance = np.minimum(np.nan_to_num(pairs.means), pairs.limits.range_max)[:, RANGE]
+    size = np.nan_to_num(pairs.residuals)
+    size[:, 1] *= np.maximum(distance, 0.1)
     size[:, SIGNATURE] *= pairs.limits.range_max / max(high[SIGNATURE], 1e-300)
     order = np.lexsort(((size**2).sum(axis=1), pairs.feature))
     nearest = order[np.diff(pairs.feature[order], prepend=-1) > 0]
@@ -75,7 +77,19 @@ def first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Point:
 def climb(
     pairs: Pairs, start: Point, bias: bool, max_iterations: int, tolerance: float
 ) -> tuple[Pairs, Value, list[float], bool]:
-    """The pairs that matter, the end, log-likelihoods on the way, and whether less than ``tolerance`` nats are left."""
+    """Climb until the remaining gain, estimated from the second derivatives, is at most ``tolerance`` nats.
+
+    Args:
+        pairs: Features and landmarks.
+        start: Start of the search.
+        bias: Whether to fit offsets of ranges and bearings, too.
+        max_iterations: Most iterations.
+        tolerance: Remaining gain [nats].
+
+    Returns:
+        The pairs of non-negligible probability, the value at the end, the log-likelihoods at the start and after each
+        iteration, and whether the search converged.
+    """
     value = evaluate(pairs, start)
     trace, newton = [value.log_likelihood], False
     for iteration in range(1, max_iterations + 1):
@@ -94,79 +108,86 @@ def climb(
 
 
 def _noise(value: Value) -> float:
-    """What rounding may take from a log-likelihood."""
+    """Return the rounding error of a log-likelihood."""
     return 64 * float(np.finfo(float).eps) * (abs(value.log_likelihood) + len(value.false))
 
 
 def _em_step(pairs: Pairs, value: Value, bias: bool) -> Value:
-    """One generalised EM step; the log-likelihood does not fall by more than rounding."""
+    """Take one generalised EM step; the log-likelihood does not fall by more than rounding."""
     point, r = value.point, value.responsibility
     z = float(np.clip(r.sum() / len(value.false), 0, 1))
     low, high = bounds_of(pairs)
     step = np.zeros(6)
     for part in range(3):
-        there = ~np.isnan(pairs.residuals[:, part])
-        weight = r[there]
+        measured = ~np.isnan(pairs.residuals[:, part])
+        weight = r[measured]
         total = float(weight.sum())
         if total <= NOTHING:
             continue
-        u = pairs.residuals[there, part] - (point.bias[part] if part < 2 else 0.0)
+        u = pairs.residuals[measured, part] - (point.bias[part] if part < 2 else 0.0)
         u = wrapped(u) if part == 1 else u
         if bias and part < 2:
             step[RANGE_BIAS + part] = float(weight @ u) / total
         spread = math.sqrt(float(weight @ (u - (step[RANGE_BIAS + part] if part < 2 else 0)) ** 2) / total)
         step[part] = math.log(min(max(spread, low[part]), high[part]) / point.sigma[part])
     for _ in range(_HALVINGS):
-        found = evaluate(pairs, _held(pairs, replace(point.moved(step), z_detect=z)))
-        if found.log_likelihood >= value.log_likelihood - _noise(value):
-            return found
+        candidate = evaluate(pairs, _clamped(pairs, replace(point.moved(step), z_detect=z)))
+        if candidate.log_likelihood >= value.log_likelihood - _noise(value):
+            return candidate
         step = step / 2
     return evaluate(pairs, replace(point, z_detect=z))
 
 
-def _held(pairs: Pairs, point: Point) -> Point:
-    """The point with deviations within their bounds."""
+def _clamped(pairs: Pairs, point: Point) -> Point:
+    """Return the point with its standard deviations clamped to their bounds."""
     sigma = np.clip(point.sigma, *bounds_of(pairs)).tolist()
     return replace(point, sigma=(sigma[0], sigma[1], sigma[2]))
 
 
 def _without_needless(pairs: Pairs, value: Value) -> Value:
-    """Without a cause that accounts for hardly any feature, where the log-likelihood does not fall."""
+    """Remove a cause that accounts for hardly any feature, unless the log-likelihood falls."""
     for total, z in ((float(value.false.sum()), 1.0), (float(value.responsibility.sum()), 0.0)):
         if 0 < value.point.z_detect < 1 and total < NOTHING:
-            found = evaluate(pairs, replace(value.point, z_detect=z))
-            if found.log_likelihood >= value.log_likelihood - _noise(value):
-                value = found
+            candidate = evaluate(pairs, replace(value.point, z_detect=z))
+            if candidate.log_likelihood >= value.log_likelihood - _noise(value):
+                value = candidate
     return value
 
 
 def free(pairs: Pairs, value: Value, bias: bool) -> Integers:
-    """Coordinates that the likelihood may be climbed along."""
+    """Return the indices of the coordinates that may move."""
     low, high = bounds_of(pairs)
     sigma = np.array(value.point.sigma)
-    told = np.array(pairs.measured) & (value.responsibility.sum() > NOTHING)
-    inner = told & (sigma > low * (1 + 1e-9)) & (sigma < high * (1 - 1e-9))
+    determined = np.array(pairs.measured) & (value.responsibility.sum() > NOTHING)
+    inner = determined & (sigma > low * (1 + 1e-9)) & (sigma < high * (1 - 1e-9))
     odds = [0 < value.point.z_detect < 1]
-    return np.flatnonzero(np.concatenate([inner, odds, told[:2] & bias]))
+    return np.flatnonzero(np.concatenate([inner, odds, determined[:2] & bias]))
 
 
 def _newton_step(pairs: Pairs, value: Value, bias: bool) -> tuple[Value, float]:
-    """A Newton step where it raises the log-likelihood, and how many nats were left by the quadratic model."""
+    """Take a Newton step if it raises the log-likelihood.
+
+    Returns:
+        The new value, or the old one; and the gain [nats] that the quadratic model predicted.
+    """
     step, left = newton_direction(value.gradient, hessian(pairs, value.point), free(pairs, value, bias))
     if left <= 0:
         return value, 0.0
     scale = min(1.0, 1.0 / max(float(np.abs(step[:RANGE_BIAS]).max()), 1e-300))
     for _ in range(6):
-        found = evaluate(pairs, _held(pairs, value.point.moved(scale * step)))
-        if found.log_likelihood > value.log_likelihood:
-            return found, left
+        candidate = evaluate(pairs, _clamped(pairs, value.point.moved(scale * step)))
+        if candidate.log_likelihood > value.log_likelihood:
+            return candidate, left
         scale /= 4
-    # What is left is less than rounding.
+    # A remaining gain below rounding counts as none.
     return value, min(left, 0.0) if left <= _noise(value) else left
 
 
 def newton_direction(gradient: Floats, second: Floats, places: Integers) -> tuple[Floats, float]:
-    """(6,) the Newton step along some coordinates, uphill wherever it is, and half its slope: nats left to gain."""
+    """Return the (6,) Newton step along ``places``, uphill even if the function is not concave, and its gain [nats].
+
+    The predicted gain is half the slope along the step.
+    """
     step = np.zeros(6)
     if not len(places):
         return step, 0.0

@@ -1,6 +1,6 @@
-"""``fit_landmark_parameters``: deviations and weights of the landmark model from features at known poses.
+"""Fit standard deviations and weights of the landmark model to features at known poses.
 
-``landmark_pairs`` has the log-likelihood, ``landmark_em`` climbs it, ``landmark_report`` says how well that went.
+``pairs`` computes the log-likelihood, ``em`` maximises it, ``report`` and ``result`` describe the result.
 """
 
 from __future__ import annotations
@@ -32,12 +32,21 @@ from gpusense.world.parameters import LandmarkParameters
 
 @dataclass(frozen=True)
 class Sightings:
-    """The arguments of a fit, checked: features that say something, and where all were."""
+    """Checked arguments of a fit: the features with at least one measured part, and the poses of all scans.
+
+    Attributes:
+        sensors: (S, 3) poses of the sensor.
+        scan: (F,) index of each feature's pose.
+        features: (F, 3) range, bearing and signature; NaN for missing parts.
+        indices: (F,) indices of these features among the caller's.
+        total: Number of the caller's features.
+        pairs: The features with their possible landmarks.
+    """
 
     sensors: Floats
     scan: Integers
     features: Floats
-    kept: Integers
+    indices: Integers
     total: int
     pairs: Pairs
 
@@ -58,35 +67,44 @@ def fit_landmark_parameters(
     max_iterations: int = 300,
     tolerance: float = 1e-8,
 ) -> LandmarkFit:
-    """Learn the landmark model's parameters: those that make features at known poses likeliest (book section 6.6).
+    """Fit the parameters of the landmark model to features at known poses, by maximum likelihood (book section 6.6).
 
-    A feature with a known landmark j adds ``log(z_detect p(f | j) + z_false p_uniform(f))``, as in ``LandmarkModel``;
-    one without has ``sum_j p(f | j) / V`` there, over the V landmarks in view from its pose. A known false positive
-    adds ``log(z_false p_uniform(f))``.
+    A feature of known landmark j contributes ``log(z_detect p(f | j) + z_false p_uniform(f))``, as in
+    ``LandmarkModel``. For a feature of unknown landmark, ``sum_j p(f | j) / V`` over the V landmarks in view from its
+    pose replaces ``p(f | j)``. A known false positive contributes ``log(z_false p_uniform(f))``.
 
     Args:
         poses: (F, 3) pose of the robot for each feature, or (S, 3) with ``scan`` [m, m, rad].
-        features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN is what was not measured.
+        features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN for missing parts.
         landmarks: The map.
-        correspondence: (F,) landmark that each feature is, -1 for none; None where that is not known.
-        scan: (F,) index of each feature's pose. It also lets landmarks in view be counted, those of poses without a
-            feature included: p_detect is then the share of them that some feature is.
+        correspondence: (F,) landmark of each feature, -1 for none; None if unknown.
+        scan: (F,) index of each feature's pose. With it, landmarks in view are counted, also from poses without a
+            feature: p_detect is then the detected share of them.
         range_max: Largest range of a feature [m].
-        field_of_view: Angle in which features are seen, in (0, 2 pi] [rad].
-        signature_span: Smallest and largest signature; None is the span of the map's and the features'.
+        field_of_view: Field of view of the sensor, in (0, 2 pi] [rad].
+        signature_span: Smallest and largest signature; None is the span of the map's and the features' signatures.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
-        bias: Also fit offsets of ranges and bearings, so that they are no part of the deviations.
-        initial: Where to begin; its limits do not count. None is a guess from the residuals.
+        bias: Whether to fit offsets of ranges and bearings, too, so that they do not increase the standard deviations.
+        initial: Start of the search, without its limits; None guesses it from the residuals.
         max_iterations: Most iterations.
-        tolerance: The search has converged once it expects to gain less than this [nats].
+        tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 
     Returns:
         The fit.
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a value breaks a rule above, the shapes differ, a feature is outside what the sensor can measure, or
-            no feature says anything.
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above, the shapes differ, a feature is outside the limits of the sensor, or no
+            feature has a measured part.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> landmarks = gs.LandmarkMap([(5, 0)])
+        >>> noise = np.random.default_rng(0).normal(0, (0.2, 0.05), (500, 2))
+        >>> poses, features = np.zeros((500, 3)), np.array([5.0, 0.0]) + noise
+        >>> fit = gs.fit_landmark_parameters(poses, features, landmarks, correspondence=np.zeros(500, int))
+        >>> fit.converged, round(fit.parameters.sigma_range, 2), round(fit.parameters.sigma_bearing, 2)
+        (True, 0.2, 0.05)
     """
     if not isinstance(landmarks, LandmarkMap):
         raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
@@ -97,48 +115,52 @@ def fit_landmark_parameters(
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
     base = LandmarkParameters(range_max=range_max, field_of_view=field_of_view, signature_span=signature_span)
-    seen = _sightings(poses, features, landmarks, correspondence, scan, base, mount)
-    start = first_guess(seen.pairs, initial)
-    pairs, value, trace, converged = climb(seen.pairs, start, bias, most, least)
-    seen_by_scan = None if scan is None else _seen(replace(seen, pairs=pairs), landmarks, value)
+    sightings = _sightings(poses, features, landmarks, correspondence, scan, base, mount)
+    start = first_guess(sightings.pairs, initial)
+    pairs, value, trace, converged = climb(sightings.pairs, start, bias, most, least)
+    counts = None if scan is None else _count_detected(replace(sightings, pairs=pairs), landmarks, value)
     base = base if initial is None else replace(base, p_detect=initial.p_detect)
-    return report(pairs, seen.kept, seen.total, value, trace, converged, bias, base, seen_by_scan)
+    return report(pairs, sightings.indices, sightings.total, value, trace, converged, bias, base, counts)
 
 
 def _sightings(
     poses: ArrayLike, features: ArrayLike, landmarks: LandmarkMap, correspondence: ArrayLike | None,
     scan: ArrayLike | None, base: LandmarkParameters, mount: tuple[float, float, float],
 ) -> Sightings:  # fmt: skip
-    own = landmarks.signatures
-    with_signature = replace(base, sigma_signature=None if own is None else 1.0)
+    """Check the arguments of a fit, and pair the features with their possible landmarks."""
+    map_signatures = landmarks.signatures
+    with_signature = replace(base, sigma_signature=None if map_signatures is None else 1.0)
     full = check_features(features, with_signature, base.signature_span or (-math.inf, math.inf))
     x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,)))
-    where = checks.array("poses", poses, (len(full) if scan is None else "S", 3))
-    at = np.arange(len(full)) if scan is None else checks.array("scan", scan, (len(full),), dtype=np.int64)
-    bad = np.flatnonzero((at < 0) | (at >= len(where)))
+    robots = checks.array("poses", poses, (len(full) if scan is None else "S", 3))
+    index = np.arange(len(full)) if scan is None else checks.array("scan", scan, (len(full),), dtype=np.int64)
+    bad = np.flatnonzero((index < 0) | (index >= len(robots)))
     if len(bad):
-        raise ValueError(f"scan: indices must be in [0, {len(where)}), got {at[bad[0]]} at index {bad[0]}")
+        raise ValueError(f"scan: indices must be in [0, {len(robots)}), got {index[bad[0]]} at index {bad[0]}")
     known = None if correspondence is None else check_correspondence(correspondence, len(full), len(landmarks))
-    kept = np.flatnonzero((~np.isnan(full)).any(axis=1))
-    if not len(kept):
-        raise ValueError(f"features: must have one that says something, got {len(full)} that say nothing")
-    signatures = np.concatenate([full[:, 2][~np.isnan(full[:, 2])], np.zeros(0) if own is None else own])
+    used = np.flatnonzero((~np.isnan(full)).any(axis=1))
+    if not len(used):
+        raise ValueError(f"features: must hold one with a measured part, got {len(full)} without")
+    signatures = np.concatenate(
+        [full[:, 2][~np.isnan(full[:, 2])], np.zeros(0) if map_signatures is None else map_signatures]
+    )
     span = base.signature_span or (
         (float(signatures.min()), float(signatures.max())) if len(signatures) and np.ptp(signatures) > 0 else (0.0, 1.0)
     )
     limits = Limits(base.range_max, base.field_of_view / 2, span)
-    sensors = sensor_poses(where, (x, y, yaw))
-    pairs = make_pairs(sensors[at[kept]], full[kept], landmarks.xy, own, None if known is None else known[kept], limits)
-    return Sightings(sensors, at[kept], full[kept], kept, len(full), pairs)
+    sensors = sensor_poses(robots, (x, y, yaw))
+    known = None if known is None else known[used]
+    pairs = make_pairs(sensors[index[used]], full[used], landmarks.xy, map_signatures, known, limits)
+    return Sightings(sensors, index[used], full[used], used, len(full), pairs)
 
 
-def _seen(seen: Sightings, landmarks: LandmarkMap, value: Value) -> tuple[int, float]:
-    """Landmarks in view, over all poses, and how many of them some feature is, as expected."""
-    pairs = seen.pairs
-    total = len(in_view(seen.sensors, landmarks.xy, pairs.limits)[0])
-    at = pairs.in_view
-    key = seen.scan[pairs.feature[at]] * len(landmarks) + pairs.landmark[at]
+def _count_detected(sightings: Sightings, landmarks: LandmarkMap, value: Value) -> tuple[int, float]:
+    """Return the number of landmarks in view, over all poses, and the expected number of detected ones."""
+    pairs = sightings.pairs
+    total = len(in_view(sightings.sensors, landmarks.xy, pairs.limits)[0])
+    visible = pairs.in_view
+    key = sightings.scan[pairs.feature[visible]] * len(landmarks) + pairs.landmark[visible]
     _, place = np.unique(key, return_inverse=True)
     with np.errstate(divide="ignore"):
-        unseen = np.bincount(place.ravel(), np.log1p(-np.minimum(value.responsibility[at], 1)))
-    return total, float((-np.expm1(unseen)).sum())
+        log_missed = np.bincount(place.ravel(), np.log1p(-np.minimum(value.responsibility[visible], 1)))
+    return total, float((-np.expm1(log_missed)).sum())

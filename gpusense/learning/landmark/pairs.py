@@ -1,9 +1,9 @@
-"""Features paired with the landmarks that they may be: log-likelihood of the landmark model and its derivatives.
+"""Pairs of features and their possible landmarks: log-likelihood of the landmark model and its derivatives.
 
 With residuals u = f - m and the mean m = f_j + bias of a part, a pair's derivatives are, by log sigma,
-``(u / sigma)^2 - 1 - d log mass / d log sigma`` and, by the bias, ``u / sigma^2 - d log mass / d m``. The mass is that
-of the part's normal on what can be measured (docs/landmarks.md); for a landmark beyond a limit, that of one at the
-limit, moved by the bias.
+``(u / sigma)^2 - 1 - d log mass / d log sigma`` and, by the bias, ``u / sigma^2 - d log mass / d m``. The mass is the
+integral of the part's normal over the limits of the sensor (docs/landmarks.md). A landmark beyond a limit has the mass
+of a landmark at the limit, moved by the bias.
 """
 
 from __future__ import annotations
@@ -22,22 +22,28 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 RANGE, BEARING, SIGNATURE, ODDS, RANGE_BIAS, BEARING_BIAS = range(6)
-# Nearer than this a landmark has no bearing [m].
+# Distance up to which a landmark has no bearing [m].
 _NO_BEARING = 1e-6
-# Pairs of poses and landmarks that are looked at together.
+# Pairs of poses and landmarks that are processed at once.
 _BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
 class Point:
-    """Deviations of range, bearing and signature, the weight z_detect, offsets of range and bearing."""
+    """Parameters during a search.
+
+    Attributes:
+        sigma: Standard deviations of range [m], bearing [rad] and signature.
+        z_detect: Weight of a feature that is a landmark.
+        bias: Offsets of range [m] and bearing [rad].
+    """
 
     sigma: tuple[float, float, float]
     z_detect: float
     bias: tuple[float, float]
 
     def moved(self, step: Floats) -> Point:
-        """By log sigma, log odds of z_detect, and offsets."""
+        """Return the point after a step in log sigma, log odds of z_detect, and offsets."""
         sigma = [s * math.exp(d) for s, d in zip(self.sigma, step[:ODDS], strict=True)]
         z = self.z_detect
         if 0 < z < 1:
@@ -48,7 +54,13 @@ class Point:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the sensor can measure: range_max [m], half the field of view [rad], the signatures' span."""
+    """Limits of the sensor.
+
+    Attributes:
+        range_max: Largest range [m].
+        half_field: Half the field of view [rad].
+        span: Smallest and largest signature.
+    """
 
     range_max: float
     half_field: float
@@ -56,7 +68,7 @@ class Limits:
 
     @property
     def full_circle(self) -> bool:
-        """Whether the sensor sees all around."""
+        """Whether the field of view is a full circle."""
         return self.half_field >= math.pi
 
 
@@ -66,14 +78,14 @@ class Pairs:
 
     Attributes:
         feature: (P,) feature of each pair.
-        landmark: (P,) its landmark.
-        prior: (P,) log probability of that landmark for a feature that is one.
-        residuals: (P, 3) of range, bearing (in [-pi, pi]) and signature; NaN where not measured.
+        landmark: (P,) landmark of each pair.
+        prior: (P,) log probability of this landmark for a feature that is a landmark.
+        residuals: (P, 3) residuals of range, bearing (in [-pi, pi]) and signature; NaN for missing parts.
         means: (P, 3) expected range, bearing and signature.
         in_view: (P,) whether the landmark is within the limits.
         uniform: (F,) log density of a false positive.
-        given: Whether some feature has a range, a bearing and a signature, compared with a landmark's or not.
-        limits: Of the sensor.
+        present: Whether at least one feature has a range, a bearing and a signature.
+        limits: Limits of the sensor.
     """
 
     feature: Integers
@@ -83,24 +95,32 @@ class Pairs:
     means: Floats
     in_view: NDArray[np.bool]
     uniform: Floats
-    given: tuple[bool, bool, bool]
+    present: tuple[bool, bool, bool]
     limits: Limits
 
     @property
     def measured(self) -> tuple[bool, bool, bool]:
-        """Whether some pair has a range, a bearing and a signature."""
-        there: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
-        return bool(there[0]), bool(there[1]), bool(there[2])
+        """Whether at least one pair has a residual of range, of bearing and of signature."""
+        measured: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
+        return bool(measured[0]), bool(measured[1]), bool(measured[2])
 
-    def part(self, kept: NDArray[np.bool]) -> Pairs:
-        """Some of the pairs, of the same features."""
+    def part(self, mask: NDArray[np.bool]) -> Pairs:
+        """Return the pairs in ``mask`` (P,), with all features."""
         names = ("feature", "landmark", "prior", "residuals", "means", "in_view")
-        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+        return replace(self, **{name: getattr(self, name)[mask] for name in names})
 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """At a point: log-likelihood, gradient by Point's steps, (P,) probabilities of the pairs."""
+    """The log-likelihood at a point and its parts.
+
+    Attributes:
+        point: The parameters.
+        log_likelihood: Log-likelihood of all features.
+        gradient: (6,) derivatives by the steps of :meth:`Point.moved`.
+        responsibility: (P,) probability of each pair.
+        false: (F,) probability of each feature to be a false positive.
+    """
 
     point: Point
     log_likelihood: float
@@ -110,14 +130,14 @@ class Value:
 
 
 def sensor_poses(poses: Floats, mount: Mount) -> Floats:
-    """(N, 3) poses of the sensor."""
+    """Return the (N, 3) poses of the sensor for (N, 3) poses of the robot."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = poses[:, 0] + c * mount[0] - s * mount[1], poses[:, 1] + s * mount[0] + c * mount[1]
     return np.stack([x, y, poses[:, 2] + mount[2]], axis=1)
 
 
 def expected(sensors: Floats, xy: Floats) -> tuple[Floats, Floats]:
-    """Ranges and bearings of landmarks from sensors, broadcast; NaN is the bearing of what is too near to have one."""
+    """Return ranges and bearings of landmarks from sensors, broadcast; the bearing of a very near landmark is NaN."""
     away = xy - sensors[..., :2]
     d: Floats = np.hypot(away[..., 0], away[..., 1])
     bearing = wrapped(np.arctan2(away[..., 1], away[..., 0]) - sensors[..., 2])
@@ -125,35 +145,35 @@ def expected(sensors: Floats, xy: Floats) -> tuple[Floats, Floats]:
 
 
 def within(d: Floats, bearing: Floats, limits: Limits) -> NDArray[np.bool]:
-    """Whether a landmark is in view."""
-    seen: NDArray[np.bool] = (d <= limits.range_max) & ~(np.abs(bearing) > limits.half_field)
-    return seen
+    """Return whether landmarks at ranges ``d`` and bearings ``bearing`` are in view."""
+    visible: NDArray[np.bool] = (d <= limits.range_max) & ~(np.abs(bearing) > limits.half_field)
+    return visible
 
 
 def in_view(sensors: Floats, xy: Floats, limits: Limits) -> tuple[Integers, Integers]:
-    """Poses and landmarks of all pairs in view, pose by pose."""
+    """Return the indices of poses and of landmarks of all pairs in view, pose by pose."""
     rows = max(_BLOCK // max(len(xy), 1), 1)
-    found = []
+    blocks = []
     for first in range(0, len(sensors), rows):
-        row, which = np.nonzero(within(*expected(sensors[first : first + rows, None], xy[None]), limits))
-        found.append((row + first, which))
-    if not found:
+        pose, landmark = np.nonzero(within(*expected(sensors[first : first + rows, None], xy[None]), limits))
+        blocks.append((pose + first, landmark))
+    if not blocks:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return np.concatenate([row for row, _ in found]), np.concatenate([which for _, which in found])
+    return np.concatenate([pose for pose, _ in blocks]), np.concatenate([landmark for _, landmark in blocks])
 
 
 def make_pairs(
     sensors: Floats, features: Floats, xy: Floats, signatures: Floats | None, known: Integers | None, limits: Limits
 ) -> Pairs:
-    """Pairs of (F, 3) features, seen from (F, 3) sensors, with their landmarks or with all that are in view.
+    """Pair features with their known landmarks, or with all landmarks in view.
 
     Args:
-        sensors: Pose of the sensor for each feature.
-        features: Range, bearing and signature; NaN where not measured.
+        sensors: (F, 3) pose of the sensor for each feature.
+        features: (F, 3) range, bearing and signature; NaN for missing parts.
         xy: (M, 2) landmarks.
-        signatures: Theirs, if any.
-        known: (F,) landmarks, -1 for none, or None.
-        limits: Of the sensor.
+        signatures: (M,) signatures of the landmarks, or None.
+        known: (F,) landmark of each feature, -1 for none; None if unknown.
+        limits: Limits of the sensor.
     """
     if known is None:
         feature, landmark = in_view(sensors, xy, limits)
@@ -163,24 +183,24 @@ def make_pairs(
         feature = np.flatnonzero(known >= 0)
         landmark, prior = known[feature], np.zeros(len(feature))
     d, bearing = expected(sensors[feature], xy[landmark])
-    own = np.full(len(feature), np.nan) if signatures is None else signatures[landmark]
-    means = np.stack([d, bearing, own], axis=1)
+    signature = np.full(len(feature), np.nan) if signatures is None else signatures[landmark]
+    means = np.stack([d, bearing, signature], axis=1)
     residuals = features[feature] - means
     residuals[:, BEARING] = wrapped(residuals[:, BEARING])
     lengths = np.array([limits.range_max, 2 * limits.half_field, limits.span[1] - limits.span[0]])
     uniform = -(~np.isnan(features) * np.log(lengths)).sum(axis=1)
-    # A landmark without a bearing has every one with the same density.
+    # A landmark without a bearing has a uniform density of bearings.
     lost = np.isnan(bearing) & ~np.isnan(features[feature, BEARING])
     prior = prior - lost * math.log(lengths[BEARING])
-    given: NDArray[np.bool] = np.any(~np.isnan(features), axis=0)
+    present: NDArray[np.bool] = np.any(~np.isnan(features), axis=0)
     return Pairs(
         feature, landmark, prior, residuals, means, within(d, bearing, limits), uniform,
-        (bool(given[0]), bool(given[1]), bool(given[2])), limits,
+        (bool(present[0]), bool(present[1]), bool(present[2])), limits,
     )  # fmt: skip
 
 
 def evaluate(pairs: Pairs, point: Point) -> Value:
-    """The log-likelihood ``sum_f log(z_detect sum_j prior_j p(f | j) + z_false p_uniform(f))`` and its gradient."""
+    """Evaluate ``sum_f log(z_detect sum_j prior_j p(f | j) + z_false p_uniform(f))`` and its gradient."""
     log_p, score = pairs.prior.copy(), np.zeros((len(pairs.prior), 6))
     for part, column in enumerate((RANGE, BEARING, SIGNATURE)):
         add, by_sigma, by_bias = _part(pairs, point, part)
@@ -206,50 +226,50 @@ def evaluate(pairs: Pairs, point: Point) -> Value:
 
 
 def hessian(pairs: Pairs, point: Point) -> Floats:
-    """(6, 6) second derivatives, by central differences of the gradient."""
-    found = np.zeros((6, 6))
+    """Compute the (6, 6) second derivatives by central differences of the gradient."""
+    second = np.zeros((6, 6))
     for k in range(6):
         step = np.zeros(6)
         step[k] = 1e-4 * (point.sigma[k - RANGE_BIAS] if k >= RANGE_BIAS else 1)
         above, below = (evaluate(pairs, point.moved(sign * step)).gradient for sign in (1, -1))
-        found[k] = (above - below) / (2 * step[k])
-    return (found + found.T) / 2
+        second[k] = (above - below) / (2 * step[k])
+    return (second + second.T) / 2
 
 
 def _part(pairs: Pairs, point: Point, part: int) -> tuple[Floats, Floats, Floats]:
-    """What one part of the features adds: log densities, and their derivatives by log sigma and by the offset."""
+    """Return the log densities of one part of the features, and their derivatives by log sigma and by the offset."""
     sigma, limits = point.sigma[part], pairs.limits
     bias = point.bias[part] if part < 2 else 0.0
     u, mean = pairs.residuals[:, part] - bias, pairs.means[:, part]
     if part == BEARING:
         u, ends = wrapped(u), (-limits.half_field, limits.half_field)
-        held = np.clip(mean, *ends) + bias
-        low, high = np.maximum(ends[0] - held, -math.pi), np.minimum(ends[1] - held, math.pi)
+        center = np.clip(mean, *ends) + bias
+        low, high = np.maximum(ends[0] - center, -math.pi), np.minimum(ends[1] - center, math.pi)
         if limits.full_circle:
-            low, high = np.full_like(held, -math.pi), np.full_like(held, math.pi)
+            low, high = np.full_like(center, -math.pi), np.full_like(center, math.pi)
     else:
         ends = (0.0, limits.range_max) if part == RANGE else limits.span
-        held = np.clip(mean, *ends) + bias
-        low, high = ends[0] - held, ends[1] - held
+        center = np.clip(mean, *ends) + bias
+        low, high = ends[0] - center, ends[1] - center
     mass, by_sigma, by_mean = _mass(low / sigma, high / sigma)
     if part == BEARING and not limits.full_circle:
-        # Of a wide field of view, differences beyond half a turn come in at the other side.
-        side = limits.half_field + np.abs(held)
+        # In a wide field of view, differences beyond half a turn wrap around to the other side.
+        side = limits.half_field + np.abs(center)
         more, more_sigma, more_mean = _mass((2 * math.pi - side) / sigma, np.full_like(side, math.pi / sigma))
         wide = side > math.pi
         mass, by_sigma = mass + wide * more, by_sigma + wide * more_sigma
-        by_mean = by_mean + wide * np.sign(held) * more_mean
+        by_mean = by_mean + wide * np.sign(center) * more_mean
     if part == BEARING and limits.full_circle:
-        by_mean = np.zeros_like(held)
-    there = ~np.isnan(u)
-    x = np.where(there, u, 0) / sigma
-    mass = np.where(there, mass, 1)
+        by_mean = np.zeros_like(center)
+    measured = ~np.isnan(u)
+    x = np.where(measured, u, 0) / sigma
+    mass = np.where(measured, mass, 1)
     log_p = -0.5 * x * x - math.log(sigma * math.sqrt(2 * math.pi)) - np.log(mass)
     slope = x * x - 1 - by_sigma / mass
-    return there * log_p, np.where(there, slope, 0), np.where(there, (x - by_mean / mass) / sigma, 0)
+    return measured * log_p, np.where(measured, slope, 0), np.where(measured, (x - by_mean / mass) / sigma, 0)
 
 
 def _mass(low: Floats, high: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mass of a standard normal on [low, high], its derivative by log sigma, and by the mean times sigma."""
+    """Return the mass of a standard normal on [low, high], its derivative by log sigma, and by the mean times sigma."""
     below, above = (np.exp(-0.5 * end * end) / math.sqrt(2 * math.pi) for end in (low, high))
     return ndtr(high) - ndtr(low), low * below - high * above, below - above

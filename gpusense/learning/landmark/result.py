@@ -1,4 +1,4 @@
-"""What a fit of the landmark model found, and how far it may be trusted."""
+"""Result of a fit of the landmark model."""
 
 from __future__ import annotations
 
@@ -16,31 +16,42 @@ _UNITS = {"sigma_range": "m", "sigma_bearing": "rad", "range_bias": "m", "bearin
 
 @dataclass(frozen=True, eq=False)
 class LandmarkFit:
-    """The landmark model's parameters as learned from features at known poses.
+    """Parameters of the landmark model, fitted by :func:`fit_landmark_parameters`.
+
+    ``print(fit)`` shows a table of parameters and standard errors.
 
     Attributes:
-        parameters: The parameters. A deviation is None where no feature has that part; p_detect is the start's where
-            it could not be counted.
-        log_likelihood: Of the features with them, natural log; densities in 1/m, 1/rad and 1/unit of the signature.
-        trace: (iterations + 1,) the log-likelihood at the start and after each iteration.
-        converged: Whether the search came to rest at an optimum; ``status`` says why not.
-        status: What is to be known of the fit, in words.
-        standard_errors: Of sigma_range, sigma_bearing, sigma_signature, z_detect, z_false and p_detect, from the
-            observed information (p_detect: of a share). NaN where there is none; ``held`` has the reasons.
-        held: Why a parameter has no standard error, by its name.
-        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else the mean residual of the
-            features that are landmarks; NaN without ranges [m].
-        range_bias_error: Its standard error [m].
+        parameters: The parameters. A standard deviation is None if no feature has this part; p_detect is the start's
+            unless it was counted.
+        log_likelihood: Log-likelihood of the features, natural log; densities in 1/m, 1/rad and 1/unit of the
+            signature.
+        trace: (iterations + 1,) log-likelihood at the start and after each iteration.
+        converged: Whether the search ended at an optimum; ``status`` gives the reason for False.
+        status: Summary of the fit in words.
+        standard_errors: Standard errors of sigma_range, sigma_bearing, sigma_signature, z_detect, z_false and p_detect,
+            from the observed information (p_detect: of a share). NaN if there is none; ``held`` has the reasons.
+        held: Reason why a parameter has no standard error, by name.
+        range_bias: Offset of ranges, r = d + offset: fitted with ``bias=True``, else the mean residual of the features
+            that are landmarks; NaN without ranges [m].
+        range_bias_error: Standard error of ``range_bias`` [m].
         bearing_bias: Offset of bearings, as for ranges [rad].
-        bearing_bias_error: Its standard error [rad].
+        bearing_bias_error: Standard error of ``bearing_bias`` [rad].
         bias_fitted: Whether the parameters were fitted together with the offsets.
         iterations: Iterations of the search.
-        features: Features that say something.
-        missing: Features of which nothing was measured, left out.
-        false_positives: Expected number of features that are no landmark.
-        expected: Landmarks in view, over all poses; 0 where features were not given by scans.
-        detected: Expected number of these that a feature is.
-        false: (F,) probability of each feature to be a false positive; NaN for missing ones.
+        features: Number of features with at least one measured part.
+        missing: Number of features without any measured part, left out.
+        false_positives: Expected number of false positives.
+        expected: Number of landmarks in view, over all poses; 0 without ``scan``.
+        detected: Expected number of detected landmarks among these.
+        false: (F,) probability of each feature to be a false positive; NaN for missing features.
+
+    Example:
+        >>> import gpusense as gs
+        >>> landmarks = gs.LandmarkMap([(5, 0), (0, 5)])
+        >>> features = [(5.1, 0.0), (4.9, 0.0), (5.0, 1.6), (5.1, 1.5)]
+        >>> fit = gs.fit_landmark_parameters([(0, 0, 0)] * 4, features, landmarks, correspondence=[0, 0, 1, 1])
+        >>> fit.converged, fit.features, round(fit.parameters.sigma_range, 3)
+        (True, 4, 0.087)
     """
 
     parameters: LandmarkParameters
@@ -64,7 +75,7 @@ class LandmarkFit:
     false: NDArray[np.float64] = field(repr=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but ``false`` as plain numbers, lists and strings; what is not finite is None."""
+        """Return all attributes but ``false`` as plain numbers, lists and strings; None if not finite."""
         biases = ["range_bias", "range_bias_error", "bearing_bias", "bearing_bias_error"]
         names = ["log_likelihood", "converged", "status", "held", "bias_fitted", "iterations", "features", "missing"]
         names += ["false_positives", "expected", "detected"]
@@ -75,6 +86,12 @@ class LandmarkFit:
             "trace": [_finite(number) for number in self.trace.tolist()],
             **{name: getattr(self, name) for name in names},
         }
+
+    def __repr__(self) -> str:
+        names = ("sigma_range", "sigma_bearing", "sigma_signature", "z_detect", "z_false", "p_detect")
+        values = [(name, getattr(self.parameters, name)) for name in names]
+        text = ", ".join(f"{name}={value:.4g}" for name, value in values if value is not None)
+        return f"LandmarkFit({text}, converged={self.converged})"
 
     def __str__(self) -> str:
         rows = [

@@ -1,4 +1,4 @@
-"""Landmarks whose readings say that they stand where another one does, as in maps with two of them exchanged."""
+"""Find errors of a landmark map: exchanged and misplaced landmarks."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ class Exchange:
     """Two landmarks that fit their readings better with positions exchanged."""
 
     first: int
-    """Index in the map."""
+    """Index of the first landmark in the map."""
     second: int
-    """Index in the map."""
+    """Index of the second landmark in the map."""
     readings: tuple[int, int]
-    """Features of each."""
+    """The numbers of their features."""
     gain: float
-    """Nats that the log-likelihood of these features gains."""
+    """The gain of the log-likelihood of these features [nats]."""
     before: tuple[float, float]
-    """Share of each one's features that agree with its position: more likely it than a false positive."""
+    """The share of each landmark's features that agree with its position: more likely it than a false positive."""
     after: tuple[float, float]
-    """The same with positions exchanged."""
+    """The same shares with positions exchanged."""
 
 
 @dataclass(frozen=True)
 class Misplaced:
-    """A landmark that most of its readings do not agree with, and no exchange explains."""
+    """A landmark whose position disagrees with most of its readings, without an exchange that explains them."""
 
     landmark: int
     """Index in the map."""
     readings: int
-    """Its features."""
+    """The number of its features."""
     agree: float
-    """Share of them that agree with its position."""
+    """The share of its features that agree with its position."""
 
 
 @dataclass(frozen=True)
 class Suspicions:
-    """What is suspicious of a map."""
+    """Suspicious landmarks of a map."""
 
     exchanged: tuple[Exchange, ...]
-    """Pairs, the largest gain first."""
+    """Exchanged pairs, the largest gain first."""
     misplaced: tuple[Misplaced, ...]
-    """Others, in the order of the map."""
+    """Misplaced landmarks, in the order of the map."""
 
 
 def suspicious_landmarks(
@@ -65,29 +65,37 @@ def suspicious_landmarks(
     least_gain: float = 20.0,
     least_readings: int = 5,
 ) -> Suspicions:
-    """Compare the features of each known landmark with the position of every landmark.
+    """Find exchanged and misplaced landmarks, by comparing features with the positions of all landmarks.
 
-    S[j, k] is the log-likelihood of the features known as landmark j if it stood where k does, false positives
-    included. j and k are reported as exchanged if each fits better in the other's place, S[j, k] > S[j, j] and
-    S[k, j] > S[k, k], and both together by ``least_gain``. Parameters may be fitted to the same features: false
-    positives take what does not fit. Signatures are left out.
+    S[j, k] is the log-likelihood of the features labelled j with the position of landmark k, false positives included.
+    Landmarks j and k are reported as exchanged if each fits better at the other's position, S[j, k] > S[j, j] and
+    S[k, j] > S[k, k], and both gains together are at least ``least_gain``. The parameters may be fitted to the same
+    features, since false positives absorb features that do not fit. Signatures are ignored.
 
     Args:
         poses: (F, 3) pose of the robot for each feature [m, m, rad].
-        features: (F, 2 or 3) ranges [m] and bearings [rad]; NaN is what was not measured.
+        features: (F, 2 or 3) ranges [m] and bearings [rad]; NaN for missing parts.
         landmarks: The map.
-        correspondence: (F,) landmark that each feature is said to be, -1 for none.
-        parameters: Of the sensor; a z_false below 1e-3 or z_detect counts as 1e-3.
+        correspondence: (F,) labelled landmark of each feature, -1 for none.
+        parameters: Parameters of the sensor; a z_false or z_detect below 1e-3 counts as 1e-3.
         mount: The sensor's pose on the robot [m, m, rad].
         least_gain: Smallest gain of an exchange [nats], > 0.
-        least_readings: Landmarks with fewer features are not judged.
+        least_readings: Least number of features of a landmark that is judged.
 
     Returns:
-        Pairs to exchange, and landmarks that less than half of their features agree with.
+        Exchanged pairs, and misplaced landmarks, whose position agrees with less than half of their features.
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a value breaks a rule above, or the shapes differ.
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above, or the shapes differ.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> landmarks, poses = gs.LandmarkMap([(5, 0), (0, 5)]), np.zeros((20, 3))
+        >>> features, labels = [(5.0, 0.0), (5.0, np.pi / 2)] * 10, [1, 0] * 10
+        >>> errors = gs.suspicious_landmarks(poses, features, landmarks, labels, gs.LandmarkParameters())
+        >>> [(pair.first, pair.second) for pair in errors.exchanged]
+        [(0, 1)]
     """
     if not isinstance(landmarks, LandmarkMap):
         raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
@@ -95,42 +103,57 @@ def suspicious_landmarks(
         raise TypeError(f"parameters: must be LandmarkParameters, got {checks.show(parameters)}")
     full = check_features(features, parameters, span_of(parameters, landmarks))
     known = check_correspondence(correspondence, len(full), len(landmarks))
-    where = checks.array("poses", poses, (len(full), 3))
+    robots = checks.array("poses", poses, (len(full), 3))
     x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,)))
     least = checks.real("least_gain", least_gain, above=0)
-    few = checks.integer("least_readings", least_readings, low=1)
+    fewest = checks.integer("least_readings", least_readings, low=1)
     full[:, 2] = np.nan
-    kept = (known >= 0) & (~np.isnan(full)).any(axis=1)
-    known, full, sensors = known[kept], full[kept], sensor_poses(where[kept], (x, y, yaw))
+    used = (known >= 0) & (~np.isnan(full)).any(axis=1)
+    known, full, sensors = known[used], full[used], sensor_poses(robots[used], (x, y, yaw))
     count = np.bincount(known, minlength=len(landmarks))
     log_p, agree = _scores(full, sensors, known, count, landmarks, parameters)
-    judged = np.flatnonzero(count >= few)
-    found = []
+    judged = np.flatnonzero(count >= fewest)
+    exchanged = _exchanges(judged, count, log_p, agree, least)
+    explained = {index for pair in exchanged for index in (pair.first, pair.second)}
+    misplaced = [
+        Misplaced(int(j), int(count[j]), float(agree[j, j])) for j in judged if j not in explained and agree[j, j] < 0.5
+    ]
+    return Suspicions(tuple(exchanged), tuple(misplaced))
+
+
+def _exchanges(judged: np.ndarray, count: np.ndarray, log_p: Floats, agree: Floats, least: float) -> list[Exchange]:
+    """Return disjoint exchanges, the largest gain first.
+
+    Args:
+        judged: Landmarks with enough features.
+        count: (M,) numbers of features.
+        log_p: (M, M) log-likelihood of the row's features at the column's position.
+        agree: (M, M) share of these features that agree.
+        least: Smallest gain [nats].
+    """
+    candidates = []
     for place, j in enumerate(judged):
         for k in judged[place + 1 :]:
             gains = log_p[j, k] - log_p[j, j], log_p[k, j] - log_p[k, k]
             if min(gains) > 0 and sum(gains) >= least:
-                found.append(Exchange(
+                candidates.append(Exchange(
                     int(j), int(k), (int(count[j]), int(count[k])), float(sum(gains)),
                     (float(agree[j, j]), float(agree[k, k])), (float(agree[j, k]), float(agree[k, j])),
                 ))  # fmt: skip
     exchanged: list[Exchange] = []
     taken: set[int] = set()
-    for each in sorted(found, key=lambda e: -e.gain):
-        if not {each.first, each.second} & taken:
-            exchanged.append(each)
-            taken |= {each.first, each.second}
-    misplaced = [
-        Misplaced(int(j), int(count[j]), float(agree[j, j])) for j in judged if j not in taken and agree[j, j] < 0.5
-    ]
-    return Suspicions(tuple(exchanged), tuple(misplaced))
+    for pair in sorted(candidates, key=lambda candidate: -candidate.gain):
+        if not {pair.first, pair.second} & taken:
+            exchanged.append(pair)
+            taken |= {pair.first, pair.second}
+    return exchanged
 
 
 def _scores(
     features: Floats, sensors: Floats, known: np.ndarray, count: np.ndarray, landmarks: LandmarkMap,
     p: LandmarkParameters,
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    """(M, M) log-likelihood of row's features at column's position, and the share of them that agree."""
+    """Return (M, M) log-likelihoods of the row's features at the column's position, and the shares that agree."""
     limits = Limits(p.range_max, p.field_of_view / 2, (0.0, 1.0))
     sigma = tuple(1.0 if s is None else s for s in (p.sigma_range, p.sigma_bearing, None))
     measured = features.copy()
@@ -143,9 +166,10 @@ def _scores(
     order = np.argsort(known, kind="stable")
     first = np.concatenate([[0], np.cumsum(count)])
     for j in np.flatnonzero(count):
-        own = order[first[j] : first[j + 1]]
+        rows = order[first[j] : first[j + 1]]
         for k in range(size):
-            at = np.full(len(own), k)
-            value = evaluate(make_pairs(sensors[own], measured[own], landmarks.xy, None, at, limits), point)
+            landmark = np.full(len(rows), k)
+            pairs = make_pairs(sensors[rows], measured[rows], landmarks.xy, None, landmark, limits)
+            value = evaluate(pairs, point)
             log_p[j, k], agree[j, k] = value.log_likelihood, float(np.mean(value.false < 0.5))
     return log_p, agree

@@ -21,7 +21,7 @@ from gpusense.tables.distances import squared_distances
 from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters
-from gpusense.world.windows import LONGEST_SIDE, Region
+from gpusense.world.windows import LONGEST_SIDE, Window
 
 # Cells around the map and the outline: so many deviations, but no more than that many cells.
 _DEVIATIONS, _MOST_MARGIN = 4, 64
@@ -95,7 +95,7 @@ class BumperModel(PointModel):
             constant_values=self.outside == "occupied",
         )
         self._table = squared_distances(self._backend, obstacles)
-        self._region = Region(-margin, -margin, rows, cols)
+        self._window = Window(-margin, -margin, rows, cols)
         self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
         high, low = split(self._points / side, self._real)
         self._given = [self._backend.upload(each) for each in (high, low)]
@@ -130,16 +130,16 @@ class BumperModel(PointModel):
         start = np.concatenate([[0], np.cumsum(sizes[there])]).astype(np.int32)
         own = states[there].astype(np.int32)
         flags = self._flags | (frozenset({"CAREFUL"}) if self._real == np.float32 else frozenset())
-        region, space = self._region, self._workspace
+        window, space = self._window, self._workspace
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:
-            frame, careful = Frame(region, self.grid, (0.0, 0.0, 0.0)), "CAREFUL" in flags
+            frame, careful = Frame(window, self.grid, (0.0, 0.0, 0.0)), "CAREFUL" in flags
             placed = place(some, part, frame, self._backend, space, self._real, careful=careful)
             score = launch(
                 "score_contact", flags, (placed.count,), table=self._table, pose_cell=placed.cell, pose=placed.pose,
                 pose_low=placed.low, point=points[0], point_low=points[1], start=space.upload("start", start),
-                pressed=space.upload("pressed", own), terms=self._terms_there, log_p=log_p, rows=region.rows,
-                cols=region.cols, particles=placed.count, segments=len(own), guard=self._guard,
+                pressed=space.upload("pressed", own), terms=self._terms_there, log_p=log_p, rows=window.rows,
+                cols=window.cols, particles=placed.count, segments=len(own), guard=self._guard,
                 temperature=self.temperature,
             )  # fmt: skip
             return (*placed.launches(), score)

@@ -47,8 +47,9 @@ class RayCaster:
     Args:
         grid: The map.
         range_max: Longest range [m], > 0; what a ray without a nearer obstacle returns.
-        method: A name of ``RayCaster.methods()``, or one of ``gpusense.casters`` with knobs of its own, such as
-            ``casters.March(tolerance=0.02)``.
+        caster: A name of ``RayCaster.methods()``, or a caster of ``gs.casters`` with its knobs, such as
+            ``gs.casters.March(tolerance=0.02)``; ``"exact"`` by default.
+        method: The same as ``caster``.
         backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
@@ -64,7 +65,8 @@ class RayCaster:
         grid: OccupancyGrid,
         range_max: float,
         *,
-        method: str | Caster = "exact",
+        caster: str | Caster | None = None,
+        method: str | Caster | None = None,
         backend: Selection = "auto",
         precision: str = "float32",
         unknown: str = "free",
@@ -72,13 +74,16 @@ class RayCaster:
     ) -> None:
         self.range_max = checks.real("range_max", range_max, above=0)
         self.grid = check_scene(grid, self.range_max)
-        self.method = casters.choose("method", method)
+        if caster is not None and method is not None:
+            raise ValueError(f"method: must be None where caster is given, got {checks.show(method)}")
+        named = ("caster", caster) if method is None else ("method", method)
+        self.caster = casters.choose(named[0], "exact" if named[1] is None else named[1])
         self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", outside, ("free", "occupied"))
         device = get_backend(backend)
         real = real_dtype(precision, device)
         self._caster = MapCaster(
-            device, real, grid, _NO_MOUNT, self.range_max, self.method, unknown=unknown, outside=outside, crop=True
+            device, real, grid, _NO_MOUNT, self.range_max, self.caster, unknown=unknown, outside=outside, crop=True
         )
 
     @staticmethod
@@ -89,6 +94,11 @@ class RayCaster:
             CasterMethod(kind.name, kind.error, kind.memory, kind.precomputation, everywhere, kind.knobs)
             for kind in casters.CASTERS.values()
         )
+
+    @property
+    def method(self) -> Caster:
+        """The same as ``caster``."""
+        return self.caster
 
     @property
     def device(self) -> BackendInfo:
@@ -137,9 +147,9 @@ class RayCaster:
             ValueError: the method has no table that is worth keeping: only ``"lookup"`` has.
             OSError: the file cannot be written.
         """
-        if not isinstance(self.method, casters.Lookup):
-            raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.method.name!r}")
-        self._caster.save(checks.path("path", path), self.method.bins)
+        if not isinstance(self.caster, casters.Lookup):
+            raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.caster.name!r}")
+        self._caster.save(checks.path("path", path), self.caster.bins)
 
     def cast(self, poses: object, bearings: object, *, out: Any = None) -> Any:
         """Expected ranges.
@@ -178,5 +188,5 @@ class RayCaster:
             TypeError, ValueError: arguments that are not finite numbers of these shapes, or a method that is not exact.
         """
         vectors = ray_vectors(checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
-        require_exact("method", self.method)
+        require_exact("method", self.caster)
         return self._caster.cast(poses, vectors, out, Cones(incidence=True))

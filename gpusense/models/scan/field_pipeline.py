@@ -67,7 +67,7 @@ class FieldPipeline(ScanPipeline):
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.mend
+            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.refresh
         )
 
     @property
@@ -78,8 +78,8 @@ class FieldPipeline(ScanPipeline):
     @property
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before there is one."""
-        region = self._map.region
-        return 0 if region is None else self.real.itemsize * (region.rows + 2 * RING) * (region.cols + 2 * RING)
+        window = self._map.window
+        return 0 if window is None else self.real.itemsize * (window.rows + 2 * RING) * (window.cols + 2 * RING)
 
     def _mixture(
         self, p: LikelihoodFieldParameters, *, bilinear: bool, cubes: bool

@@ -20,13 +20,13 @@ from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.models.scan.cones import LASER, Cones
 from gpusense.models.scan.tiles import all_within, order_of, tiles_of
 from gpusense.tables import casters
-from gpusense.tables.casters import Caster, Window
+from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
 from gpusense.tables.normals import normal_table
 from gpusense.tables.reachable import ReachableMap, TableMemoryError
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.windows import Region
+from gpusense.world.windows import Window
 
 
 class MapCaster:
@@ -61,15 +61,15 @@ class MapCaster:
         self.limit = range_max / grid.resolution
         self.method, self.outside, self._table_bytes = method, outside, 0
         # Normals of the map's walls, and the window they belong to.
-        self._normals: tuple[Region, Buffer, int] | None = None
+        self._normals: tuple[Window, Buffer, int] | None = None
         self._no_normals = backend.upload(np.zeros(2, real))
         self.map = ReachableMap(
-            backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._mend
+            backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._refresh
         )
-        self._own_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
-        self._own_flags |= {method.flag} if method.flag else set()
-        # Those of the table once there is one.
-        self.flags = self._own_flags
+        self._fixed_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
+        self._fixed_flags |= {method.entry.flag} if method.entry.flag else set()
+        # With those of the table once there is one.
+        self.flags = self._fixed_flags
         self._wide = {"FLOAT64"} if real == np.float64 else set()
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
@@ -80,7 +80,7 @@ class MapCaster:
         """Bytes of the map's tables on the device."""
         return self._table_bytes + (0 if self._normals is None else self._normals[2])
 
-    def normals(self, region: Region, flags: frozenset[str]) -> Buffer:
+    def normals(self, window: Window, flags: frozenset[str]) -> Buffer:
         """Normals of the walls in a window, where flags ask for them; made once for a window.
 
         Raises:
@@ -88,11 +88,11 @@ class MapCaster:
         """
         if "INCIDENCE" not in flags:
             return self._no_normals
-        if self._normals is None or self._normals[0] != region:
+        if self._normals is None or self._normals[0] != window:
             self._normals = None
             try:
-                table = normal_table(self.map.obstacles, region, self.outside, self.real)
-                self._normals = (region, self.backend.upload(table), table.nbytes)
+                table = normal_table(self.map.obstacles, window, self.outside, self.real)
+                self._normals = (window, self.backend.upload(table), table.nbytes)
             except MemoryError as error:
                 raise TableMemoryError(*error.args) from error
         return self._normals[1]
@@ -104,17 +104,17 @@ class MapCaster:
 
     def omission(self) -> Omission | None:
         """What cropping the map left out, once a cloud has been seen."""
-        region = self.map.region
-        return self.map.omission(self.table_bytes / region.cells) if region is not None else None
+        window = self.map.window
+        return self.map.omission(self.table_bytes / window.cells) if window is not None else None
 
     def _prepare(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
-        table = self.method.prepare(backend, Window(obstacles, self.limit, self.outside))
+        table = self.method.prepare(backend, CasterInput(obstacles, self.limit, self.outside))
         self._table_bytes = table.size
-        self.flags = self._own_flags | table.flags
+        self.flags = self._fixed_flags | table.flags
         return table.buffer
 
-    def _mend(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Region) -> bool:
-        return self.method.mend(backend, Window(obstacles, self.limit, self.outside), table, changed)
+    def _refresh(self, backend: Backend, obstacles: np.ndarray, table: Buffer, changed: Window) -> bool:
+        return self.method.refresh(backend, CasterInput(obstacles, self.limit, self.outside), table, changed)
 
     def update(self, cells: object, region: object) -> OccupancyGrid:
         """Replace cells of the map, and return it."""
@@ -133,9 +133,9 @@ class MapCaster:
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
         with self._lock:
-            buffer, region = self.map.ensure([self.grid.origin])
-            entries = self.backend.download(buffer, np.empty(region.cells * bins, np.uint16))
-            obstacles = region.cut(self.map.obstacles)
+            buffer, window = self.map.ensure([self.grid.origin])
+            entries = self.backend.download(buffer, np.empty(window.cells * bins, np.uint16))
+            obstacles = window.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
     def cast(self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER) -> Any:

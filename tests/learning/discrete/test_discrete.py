@@ -14,7 +14,7 @@ from support.oracles import Mixture
 
 import gpusense as gs
 from gpusense.learning.discrete.probabilities import log_spread
-from gpusense.learning.discrete.table import bins_of
+from gpusense.learning.discrete.readings import bins_of
 
 RANGE = 6.0
 CAUSES = {

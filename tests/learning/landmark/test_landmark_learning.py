@@ -129,7 +129,7 @@ def test_degenerate_data_are_named():
     seen = world.simulate(4)
     lm, pose = gs.LandmarkMap(seen.xy), seen.poses[seen.scan]
     for features in (np.zeros((0, 2)), np.full((3, 2), np.nan)):
-        with pytest.raises(ValueError, match=r"features: must have one that says something, got \d that say nothing"):
+        with pytest.raises(ValueError, match=r"features: must hold one with a measured part, got \d without"):
             gs.fit_landmark_parameters(np.zeros((len(features), 3)), features, lm)
     none = fit(world.Seen(seen.xy, seen.poses, seen.features, np.full(len(seen.ids), -1), seen.scan, seen.false))
     assert none.parameters.z_false == 1 and none.converged and "every feature is a false positive" in none.status
@@ -143,7 +143,7 @@ def test_degenerate_data_are_named():
     alone = gs.fit_landmark_parameters(pose[one], seen.features[one], lm, correspondence=seen.ids[one], range_max=9.0)
     assert "landmark 3 alone was seen" in alone.status and alone.converged
     few = gs.fit_landmark_parameters(pose[:1], seen.features[:1], lm, correspondence=seen.ids[:1], range_max=9.0)
-    assert "1 features cannot tell 3 parameters" in few.status
+    assert "1 features cannot determine 3 parameters" in few.status
     for found in (none, empty, exact, alone, few):
         assert all(np.isfinite(v) for v in found.parameters.to_dict().values() if isinstance(v, float))
         assert np.isfinite(found.trace).all() and str(found) and found.to_dict()["status"] == found.status

@@ -67,7 +67,7 @@ def test_beam_weights_by_hand(peer, readings, kept, precision, backend):
     cubes = [0.0 if z is None else beam_density(peer, p, z, e) ** 3 for z, e in zip(kept, EXPECTED[peer], strict=True)]
     log_p, parts = model.log_likelihood(POSE, readings, per_beam=True)
     assert parts[0] == pytest.approx(cubes, **close(precision))
-    assert log_p[0] == pytest.approx(weight(PEERS[peer].beam_lead, cubes), **close(precision))
+    assert log_p[0] == pytest.approx(weight(PEERS[peer].constant_term, cubes), **close(precision))
     assert model.log_likelihood(POSE, readings)[0] == log_p[0]
 
 

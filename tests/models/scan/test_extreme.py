@@ -11,7 +11,7 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing, per_scan
-from gpusense.tables.distances import empty_rectangles
+from gpusense.tables.rectangles import empty_rectangles
 
 PRECISIONS = ("float32", "float64")
 # Denormal in float32, denormal in float64 too, and on either side of what a ray takes for 0.

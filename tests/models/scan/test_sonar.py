@@ -225,7 +225,7 @@ def test_cones_of_a_scanner_in_attributes_and_repr():
     assert (scanner.cone, scanner.cone_rays, scanner.critical_incidence) == (0.2, 3, 0.4)
     np.testing.assert_allclose(scanner.ray_bearings, [(-0.1, 0, 0.1), (0.9, 1, 1.1)])
     assert (scanner.ray_bearings[:, 1] == scanner.bearings).all()
-    text = "Scanner(2 beams, range_max=5.0, range_min=0.0, mount=(0.0, 0.0, 0.0), "
+    text = "Scanner(2 beams over 57.3 deg, range_max=5.0, range_min=0.0, mount=(0.0, 0.0, 0.0), "
     assert repr(scanner) == text + "cone=0.2, cone_rays=3, critical_incidence=0.4)"
     laser = gs.Scanner([0.0, 1.0], 5.0)
     assert (laser.cone, laser.cone_rays, laser.critical_incidence) == (0.0, 1, None)

@@ -189,7 +189,7 @@ def test_windows_of_the_map_follow(make, monkeypatch):
         centre = [(10, 12, 0), (40, 30, 1)][step // 4 % 2]
         poses = rng.normal(centre, 0.3, (20, 3))
         says(poses)
-        window, before = table.region, table.preparations
+        window, before = table.window, table.preparations
         assert window.cells < 0.5 * shape[0] * shape[1]
         rows, cols = (int(n) for n in rng.integers(1, 40, 2))
         ends = [(window.row, window.col), (window.row + window.rows, window.col + window.cols)]
@@ -199,7 +199,7 @@ def test_windows_of_the_map_follow(make, monkeypatch):
         model.update_map(cells, (row, col))
         grid = changed_by_hand(grid, cells, (row, col))
         found = says(poses)
-        assert table.preparations == before and table.region == window
+        assert table.preparations == before and table.window == window
         np.testing.assert_array_equal(found, tables(make(grid), RANGES)[1](poses))
 
 
@@ -343,11 +343,11 @@ def test_a_grid_with_other_cells_is_read_only_and_keeps_the_rest():
 
 
 def test_windows_and_boxes():
-    window = windows.Region(2, 3, 4, 5)
-    assert window.grown(3, (10, 9)) == windows.Region(0, 0, 9, 9)
-    assert window.shared(windows.Region(5, 0, 9, 4)) == windows.Region(5, 3, 1, 1)
-    assert window.shared(windows.Region(6, 3, 1, 1)) is None
+    window = windows.Window(2, 3, 4, 5)
+    assert window.grown(3, (10, 9)) == windows.Window(0, 0, 9, 9)
+    assert window.shared(windows.Window(5, 0, 9, 4)) == windows.Window(5, 3, 1, 1)
+    assert window.shared(windows.Window(6, 3, 1, 1)) is None
     cells = np.zeros((6, 7), bool)
     assert windows.box(cells) is None
     cells[2, 5] = cells[4, 1] = True
-    assert windows.box(cells) == windows.Region(2, 1, 3, 5)
+    assert windows.box(cells) == windows.Window(2, 1, 3, 5)

@@ -1,4 +1,4 @@
-"""A pose from beacons of which range and bearing are measured."""
+"""Locate: compute a pose from ranges and bearings of beacons."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Floats, Problem, make_problem, subsets
 from gpusense.positions.solver import minima, pick
 
-# The deviation of a bearing that says nothing [rad].
+# Standard deviation of a bearing without information [rad].
 NO_BEARING = 1e100
 
 
@@ -29,26 +29,26 @@ def locate(
     loss: str = "linear",
     loss_scale: float = 1.0,
 ) -> PositionFix:
-    """The pose that sees beacons at the ranges and bearings measured.
+    """Compute the pose from ranges and bearings of beacons.
 
-    Two beacons are enough, or one where the heading is known. The minimum of ``sum of rho(weight (residual /
-    sigma)^2)`` over ranges and bearings is found by Gauss-Newton steps from the rigid motion that takes the seen points
-    onto the beacons, from those of pairs, and from where pairs of circles cross. All minima that the noise cannot tell
-    from the best are returned.
+    Two beacons suffice, or one if the heading is known. The solution is the minimum of ``sum of rho(weight (residual /
+    sigma)^2)`` over ranges and bearings. Gauss-Newton steps reach it from the rigid motions that map the measured
+    points onto the beacons, of all beacons and of pairs, and from the intersections of pairs of circles. All minima are
+    returned whose costs the noise cannot distinguish from the best.
 
-    One measurement set a call; coordinates may be as large as UTM's.
+    A call takes one set of measurements. Coordinates may be as large as those of UTM.
 
     Args:
-        xy: (M, 2) the beacons' x and y [m].
+        xy: (M, 2) positions of the beacons [m].
         ranges: (M,) measured distances [m], >= 0.
-        bearings: (M,) directions in the robot's frame, counter-clockwise from straight ahead [rad], any real. The
-            bearing to a beacon at range 0 says nothing and is not used.
-        heading: The robot's heading in the world [rad], or None: it is looked for.
+        bearings: (M,) directions in the robot's frame, counter-clockwise from straight ahead [rad], any real numbers.
+            The bearing to a beacon at range 0 carries no information and is ignored.
+        heading: The robot's heading in the world [rad], or None if unknown.
         sigma_range: Standard deviation of the ranges [m], one or (M,), > 0.
         sigma_bearing: Standard deviation of the bearings [rad], one or (M,), > 0.
         weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
-        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``; of each range
-            and of each bearing.
+        loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``; applied to
+            each range and to each bearing.
         loss_scale: Residual at which a robust loss bends [sigma], > 0.
 
     Returns:
@@ -56,10 +56,16 @@ def locate(
         "unique", "ambiguous", "coincident" (no solution), "at a beacon", "singular".
 
     Raises:
-        TypeError: an argument is not of the kind described.
-        ValueError: a shape or value breaks its rule, or too few beacons are left.
+        TypeError: An argument has the wrong type.
+        ValueError: A shape or value breaks its rule, or too few beacons are left.
 
     Source: lectures, "Distance and Bearing"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> fix = gs.locate([(3, 0), (0, 4)], [3, 4], [0, np.pi / 2], sigma_range=0.1, sigma_bearing=0.02)
+        >>> fix.status, (fix.best + 1e-9).round(3).tolist()
+        ('unique', [0.0, 0.0, 0.0])
     """
     for name, sigma in (("sigma_range", sigma_range), ("sigma_bearing", sigma_bearing)):
         if sigma is None:
@@ -73,27 +79,26 @@ def locate(
     if heading is None and np.hypot(*(problem.xy - problem.xy[0]).T).max() <= problem.noise:
         return problem.fix([], "coincident")
     assert problem.ranges is not None
-    # A beacon at no distance has no bearing: a deviation that is large enough for it to count for nothing.
+    # A beacon at range 0 has no bearing: a huge standard deviation removes it from the cost.
     problem = replace(
         problem, sigma_bearing=np.where(problem.ranges <= problem.touch, NO_BEARING, problem.sigma_bearing)
     )
-    states, status = pick(*minima(problem, _starts(problem)), told=True)
+    states, status = pick(*minima(problem, _starts(problem)), known_sigma=True)
     if problem.at_beacon(states[0]):
         status = "at a beacon"
     return problem.fix(states, status)
 
 
 def _starts(problem: Problem) -> Floats:
-    """(N, d) states: rigid motions of all beacons and of pairs, and crossings of circles with the heading that fits."""
+    """Return (N, d) starts: rigid motions of all beacons and of pairs, and intersections of circles with headings."""
     assert problem.ranges is not None and problem.bearings is not None
     world, count = problem.points, len(problem.xy)
     if problem.heading is not None:
-        # With a known heading each beacon has its own answer.
-        own = world - problem.ranges * np.exp(1j * (problem.bearings + problem.heading))
-        points, headings = np.append(own, own.mean()), np.full(count + 1, problem.heading)
+        # With a known heading each beacon determines a position.
+        positions = world - problem.ranges * np.exp(1j * (problem.bearings + problem.heading))
+        points, headings = np.append(positions, positions.mean()), np.full(count + 1, problem.heading)
     else:
-        sets = [np.arange(count)[None], subsets(count, 2)]
-        parts = [_rigid(problem, chosen) for chosen in sets]
+        parts = [_rigid(problem, sets) for sets in (np.arange(count)[None], subsets(count, 2))]
         points, headings = (np.concatenate(part) for part in zip(*parts, strict=True))
     if count > 1:
         i, j = subsets(count, 2).T
@@ -104,17 +109,18 @@ def _starts(problem: Problem) -> Floats:
     return np.column_stack([points.real, points.imag, wrap(headings)])[:, : problem.dimension]
 
 
-def _rigid(problem: Problem, chosen: NDArray[np.intp]) -> tuple[NDArray[np.complex128], Floats]:
-    """Positions and headings (N,) that move the points seen of (N, K) beacons onto these, in least squares.
+def _rigid(problem: Problem, sets: NDArray[np.intp]) -> tuple[NDArray[np.complex128], Floats]:
+    """Return (N,) positions and headings that map the measured points of (N, K) beacons onto the beacons.
 
-    The heading is the angle of sum conj(z_i - z) (m_i - m), with means z and m (Horn 1987, in the plane).
+    In least squares the heading is the angle of sum conj(z_i - z) (m_i - m), with means z and m (Horn 1987, in the
+    plane).
     """
     assert problem.ranges is not None and problem.bearings is not None
-    seen = (problem.ranges * np.exp(1j * problem.bearings))[chosen]
-    world = problem.points[chosen]
-    # A point's own error: along the ray, and across it.
+    seen = (problem.ranges * np.exp(1j * problem.bearings))[sets]
+    world = problem.points[sets]
+    # The error of a measured point, along the ray and across it.
     variance = problem.sigma_range**2 + (problem.ranges * problem.sigma_bearing) ** 2
-    share = (problem.weights / variance)[chosen]
+    share = (problem.weights / variance)[sets]
     share = share / share.sum(axis=1, keepdims=True)
     middle, centre = (share * seen).sum(axis=1), (share * world).sum(axis=1)
     heading = np.angle((share * np.conj(seen - middle[:, None]) * (world - centre[:, None])).sum(axis=1))

@@ -1,0 +1,77 @@
+"""Causes of readings in the discrete model, and the result of learning them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from gpusense.world.parameters import _Parameters
+
+
+@dataclass(frozen=True)
+class DiscreteCauses(_Parameters):
+    """Parameters of the independent causes of a reading; the first cause to trigger hides all later ones.
+
+    In terms of Fox, Burgard and Thrun (1999), ``c_r = 1 - exp(-(lambda_short + lambda_rand) width)`` is the probability
+    that a step of the beam triggers without an obstacle of the map, and ``c_d = p_detect``.
+
+    Raises:
+        TypeError: A value is not a real number.
+        ValueError: A value breaks its field's rule.
+
+    Example:
+        >>> import gpusense as gs
+        >>> causes = gs.DiscreteCauses(p_detect=0.8)
+        >>> gs.DiscreteBeamModel(causes, range_max=5.0, bins=50).probabilities.shape
+        (51, 51)
+    """
+
+    lambda_short: float = 0.05
+    """The rate of unknown obstacles before the expected one, >= 0 [1/m]."""
+    lambda_rand: float = 0.01
+    """The rate of random triggers along the whole beam, also behind a missed obstacle, >= 0 [1/m]."""
+    p_detect: float = 0.95
+    """The probability that the expected obstacle is detected if no cause triggers earlier, in [0, 1]."""
+    sigma_hit: float = 0.05
+    """The standard deviation of the detected range, >= 0 [m]; 0 always detects the obstacle in its step."""
+
+    def __post_init__(self) -> None:
+        self._check("lambda_short", low=0)
+        self._check("lambda_rand", low=0)
+        self._check("p_detect", low=0, high=1)
+        self._check("sigma_hit", low=0)
+
+
+@dataclass(frozen=True)
+class DiscreteFit:
+    """Result of learning a :class:`DiscreteBeamModel`.
+
+    Example:
+        >>> import gpusense as gs
+        >>> table = gs.DiscreteBeamModel.learn([1.9, 2.0, 2.1, 5.0], [2.0, 2.0, 2.0, 2.0], range_max=5.0, bins=10)
+        >>> table.fit.hits, table.fit.max, table.fit.missing
+        (3, 1, 0)
+    """
+
+    log_likelihood: float
+    """The log-likelihood of all readings: probabilities of bins, not densities; natural logarithm."""
+    converged: bool
+    """Whether the gradient vanishes at the result, within the bounds of the search."""
+    standard_errors: Mapping[str, float]
+    """The standard error of each parameter, in its unit, from the curvature of the likelihood; NaN if undetermined."""
+    trace: tuple[float, ...]
+    """The log-likelihood after each iteration of the successful search."""
+    hits: int
+    """The number of readings with a range."""
+    max: int
+    """The number of readings without a return."""
+    missing: int
+    """The number of missing readings, left out."""
+    status: str
+    """The reason of the search's end and the undetermined parameters, in words."""
+
+    def __repr__(self) -> str:
+        return (
+            f"DiscreteFit(log_likelihood={self.log_likelihood:.6g}, hits={self.hits}, max={self.max}, "
+            f"missing={self.missing}, converged={self.converged})"
+        )

@@ -1,0 +1,95 @@
+"""Interface of the casters: their input, their table, and the base class."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.interface.casters import ENTRIES, CasterEntry
+from gpusense.world.windows import Window
+
+
+@dataclass(frozen=True)
+class CasterInput:
+    """A window of a map, from which a caster makes its table.
+
+    Attributes:
+        obstacles: (rows, cols) bool.
+        limit: Longest range [cells].
+        outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
+    """
+
+    obstacles: np.ndarray
+    limit: float
+    outside: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """A caster's table on a device.
+
+    Attributes:
+        buffer: The table.
+        size: Its size [bytes].
+        flags: Flags of the kernels that read it.
+    """
+
+    buffer: Buffer
+    size: int
+    flags: frozenset[str] = frozenset()
+
+
+class Caster(ABC):
+    """A method of computing expected ranges.
+
+    Attributes:
+        name: Name that selects the caster with its default knobs, and its entry in the registry.
+        exact: Whether its ranges are exact.
+        error: ``"exact"``, or the bound of its error.
+        memory: Memory on the device, in words.
+        precomputation: Work on the map before the first ray, in words.
+        knobs: Parameters that trade error for time, in words.
+        whole: Whether the table needs the whole map at once.
+        ring: Whether the table has a ring of cells that stands for space outside the grid.
+    """
+
+    name: ClassVar[str]
+    exact: ClassVar[bool] = False
+    error: ClassVar[str]
+    memory: ClassVar[str]
+    precomputation: ClassVar[str]
+    knobs: ClassVar[str] = "none"
+    whole: ClassVar[bool] = False
+    ring: ClassVar[bool] = True
+
+    @property
+    def entry(self) -> CasterEntry:
+        """The caster in the registry."""
+        return ENTRIES[self.name]
+
+    @abstractmethod
+    def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
+        """Make the table of a window on a device."""
+
+    def refresh(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: Window) -> bool:
+        """Update ``table`` in place after obstacles changed.
+
+        Args:
+            backend: The device.
+            inputs: The window after the change.
+            table: Its table before the change.
+            changed: Part of the window that holds all changed obstacles.
+
+        Returns:
+            False if the caster cannot update its table, which must then be made again.
+        """
+        return False
+
+    def scalars(self) -> tuple[int, float, float]:
+        """Return the kernels' arguments bins, slack [cells] and tolerance [cells]."""
+        return 0, 0.0, 0.0

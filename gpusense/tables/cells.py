@@ -1,0 +1,36 @@
+"""Occupied cells in the layouts of the kernels, as bytes or packed bits, and the limit of their number."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_INT = np.dtype(np.int32)
+_BYTE = np.dtype(np.uint8)
+# Kernels index the cells of four padded planes in 32 bits.
+_MOST_CELLS = (1 << 31) // 4 - 1
+
+
+def check_size(rows: int, cols: int) -> None:
+    """Check that the tables of a window can be indexed.
+
+    Raises:
+        ValueError: There are more than 536 million padded cells.
+    """
+    if (rows + 4) * (cols + 4) > _MOST_CELLS:
+        raise ValueError(f"grid: the part in use must have at most {_MOST_CELLS} cells, got {rows} x {cols}")
+
+
+def as_bytes(obstacles: np.ndarray) -> np.ndarray:
+    """Return a contiguous array with byte 1 for an obstacle; a contiguous array of bool is not copied."""
+    return np.ascontiguousarray(obstacles, dtype=bool).view(_BYTE)
+
+
+def packed(obstacles: np.ndarray) -> np.ndarray:
+    """Pack a (rows, cols) map into (rows, words) int32 bits; the kernel file ``bits`` defines the layout."""
+    rows, cols = obstacles.shape
+    if cols % 32 == 0:
+        bits = np.packbits(np.ascontiguousarray(obstacles), bitorder="little").reshape(rows, cols // 8)
+    else:
+        bits = np.zeros((rows, -(-cols // 32) * 4), _BYTE)
+        bits[:, : -(-cols // 8)] = np.packbits(obstacles, axis=1, bitorder="little")
+    return bits.view("<i4").astype(_INT, copy=False)

@@ -1,0 +1,79 @@
+"""Empty rectangles of a map, computed on a device and refreshed where the map changes; the exact caster reads them.
+
+Processors run few long work-items, one per row. GPUs run one work-item per cell, on bits that the host packs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.backends.base import Buffer
+from gpusense.tables.cells import as_bytes, check_size, packed
+from gpusense.world.windows import Window
+
+_INT = np.dtype(np.int32)
+_BYTE = np.dtype(np.uint8)
+_SHORT = np.dtype(np.uint16)
+_NO_FLAGS: frozenset[str] = frozenset()
+# The kernel file ``rectangles`` has the same numbers.
+RECTANGLE_REACH = 254
+_STACK = 1024
+
+
+def sectors_of(backend: Backend, rows: int, cols: int) -> int:
+    """Return the number of sectors per quadrant; more sectors make steps longer and tables larger.
+
+    GPUs gain most, since neighbouring rays wait for the slowest one. Kernels index the cells of all planes in 32 bits,
+    which limits the number.
+    """
+    sectors = {"gpu": 4, "cpu": 2}[backend.info.kind] if backend.info.backend != "numpy" else 1
+    planes = 4 * (rows + 4) * (cols + 4)
+    while sectors > 1 and (planes * sectors >= 1 << 31 or 2 * planes * sectors > backend.info.max_buffer):
+        sectors //= 2
+    return sectors
+
+
+def empty_rectangles(
+    backend: Backend,
+    obstacles: np.ndarray,
+    sectors: int,
+    rectangles: Buffer | None = None,
+    changed: Window | None = None,
+) -> Buffer:
+    """Compute or refresh the padded planes of empty rectangles; the kernel file ``rectangles`` defines them.
+
+    Args:
+        backend: The device.
+        obstacles: (rows, cols) bool.
+        sectors: Sectors per quadrant: 1, 2 or 4.
+        rectangles: Planes of the map before the change, refreshed in place; None makes new planes.
+        changed: Window whose obstacles changed; None is all of the map.
+    """
+    rows, cols = obstacles.shape
+    check_size(rows, cols)
+    if rectangles is None or changed is None:
+        rectangles = backend.empty(4 * sectors * (rows + 2) * (cols + 2), _SHORT, zero=True)
+        changed = Window(0, 0, rows, cols)
+    top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
+    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most that
+    # far behind them; the same holds in the opposite directions.
+    first, begin = max(top - RECTANGLE_REACH, 0), max(left - RECTANGLE_REACH, 0)
+    end = min(right + RECTANGLE_REACH, cols)
+    near = obstacles[first : bottom + RECTANGLE_REACH]
+    band = len(near)
+    runs = backend.empty(2 * band * cols, _BYTE)
+    place = (rows, cols, sectors, first, band, top, left, bottom, right)
+    if backend.info.kind == "cpu":
+        strips, height = -(-(end - begin) // 64), min(changed.rows + RECTANGLE_REACH, rows)
+        columns = backend.compile("free_columns", _NO_FLAGS)
+        columns((strips, 2), backend.upload(as_bytes(near)), runs, band, cols, begin, end)
+        stack = backend.empty(_STACK * height, _INT)
+        backend.compile("rectangles_rows", _NO_FLAGS)((height, 4), runs, stack, rectangles, *place)
+    else:
+        words, bits = -(-cols // 32), backend.upload(packed(near))
+        backend.compile("free_rows", _NO_FLAGS)((end - begin, band), bits, runs, band, cols, words, begin, end)
+        size = (min(changed.cols + RECTANGLE_REACH, cols), min(changed.rows + RECTANGLE_REACH, rows), 4)
+        backend.compile("rectangles_scan", _NO_FLAGS)(size, runs, rectangles, *place)
+    backend.synchronize()
+    return rectangles

@@ -41,8 +41,8 @@ import dataclasses, json, sys
 sys.path[:] = json.loads(sys.argv[1])
 from gpusense.backends import processor
 processor._CPUINFO = sys.argv[2]
-from gpusense.backends.opencl import backend, pocl
-info, device = next((i, d) for i, d in backend.list_devices() if "Portable Computing Language" in i.driver)
+from gpusense.backends.opencl import devices, pocl
+info, device = next((i, d) for i, d in devices.list_devices() if "Portable Computing Language" in i.driver)
 print(json.dumps({"named": pocl._find_name(device)[1], "target": info.target, "lanes": info.lanes}), flush=True)
 from gpusense.evaluation.proof import prove
 prove({"info": dataclasses.asdict(info)}, lambda said: print(json.dumps(said), flush=True))

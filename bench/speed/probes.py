@@ -175,7 +175,7 @@ class _OpenCL:
     def __init__(self, info: Any, items: int) -> None:
         import pyopencl as cl
 
-        from gpusense.backends.opencl.backend import list_devices
+        from gpusense.backends.opencl.devices import list_devices
 
         device = next(device for found, device in list_devices() if found.selection == info.selection)
         self._cl, self._context = cl, cl.Context([device])

@@ -1,7 +1,7 @@
 """A backend: a device that holds buffers and runs programs, and no science.
 
-A buffer is whatever the backend makes of it; models only pass buffers on. Kernels are named by the signature table.
-Every backend has every method. Methods of an ability that it lacks do nothing, where nothing is right, or say so.
+Buffers are opaque: models only pass them on. Kernels are named by the signature table. Every backend has every method.
+A method of an ability that it lacks does nothing, where that is correct, or raises an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class BackendInfo:
     """A device as a model sees it.
 
     Attributes:
-        selection: What selects this device again, such as ``"opencl:0:0"``.
+        selection: The selection string of this device, such as ``"opencl:0:0"``.
         backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
         name: The device's own name.
         kind: ``"cpu"`` or ``"gpu"``.
@@ -36,6 +36,12 @@ class BackendInfo:
         vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
         target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
         graphs: Whether the launches and copies of a call are gathered, and replayed as one graph once they repeat.
+
+    Example:
+        >>> from gpusense.backends import get_backend
+        >>> info = get_backend("numpy").info
+        >>> info.selection, info.kind, info.float64, info.graphs
+        ('numpy', 'cpu', True, False)
     """
 
     selection: str
@@ -53,7 +59,7 @@ class BackendInfo:
 
 
 class ProcessBound:
-    """A device that was opened in this process; drivers do not survive a fork."""
+    """A device that is bound to the process that opened it: drivers do not survive a fork."""
 
     info: BackendInfo
 
@@ -61,7 +67,7 @@ class ProcessBound:
         self._process = os.getpid()
 
     def check_process(self) -> None:
-        """Refuse to work in a forked child, where the driver would hang or corrupt memory.
+        """Refuse a forked child, where the driver would hang or corrupt memory.
 
         Raises:
             RuntimeError: this process is not the one that opened the device.
@@ -74,15 +80,15 @@ class ProcessBound:
 
 
 class Launcher(Protocol):
-    """A compiled kernel: call it with the global size and the arguments of its row, in order."""
+    """A compiled kernel, which is called with the global size and the arguments of its row in order."""
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
-        """Start one launch; buffers and scalars in the order of the signature table."""
+        """Start one launch with buffers and scalars in the order of the signature table."""
 
 
 @dataclass(frozen=True)
 class Adopted:
-    """An array of another library that lies in a device's memory, without a copy.
+    """An array of another library in a device's memory, without a copy.
 
     Attributes:
         buffer: Its numbers; only of a C-contiguous array.
@@ -90,7 +96,7 @@ class Adopted:
         dtype: Type of its numbers.
         strides: Bytes from one number to the next along each axis.
         contiguous: Whether it is C-contiguous.
-        to_host: Copies it, after all that was started before.
+        to_host: Copies it to the host, after all work that was started before.
         owner: The object that keeps the memory alive.
     """
 
@@ -103,14 +109,27 @@ class Adopted:
     owner: object
 
 
-class Recording(Protocol):
-    """A program whose arguments are bound, to be started again and again with the same memory and numbers."""
+class Recording(ABC):
+    """A program whose arguments are bound: it is started repeatedly with the same memory and numbers."""
 
+    @abstractmethod
     def __call__(self, stream: Any = None) -> None:
         """Start it on a stream of the device, or on its current one."""
 
+    @abstractmethod
     def wait(self) -> None:
         """Wait until all starts have ended."""
+
+    @abstractmethod
+    def explain(self) -> str:
+        """Return in one line how it is started: as one graph, or one by one, with the reason."""
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of launches or copies in words: ``"3 launches"``."""
+    if number == 1:
+        return f"1 {noun}"
+    return f"{number} {noun[:-1]}ies" if noun.endswith("y") else f"{number} {noun}es"
 
 
 class Backend(ABC):
@@ -145,12 +164,12 @@ class Backend(ABC):
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """Copy the head of a buffer into a C-contiguous array, after everything that was started before.
 
-        Without ``wait`` the array must live, and is not filled, until ``synchronize`` has returned.
+        Without ``wait`` the array must stay alive, and is not filled, until ``synchronize`` has returned.
         """
 
     @abstractmethod
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """Return ``count`` numbers of a buffer from number ``first`` on, without a copy, perhaps as another type.
+        """Return ``count`` numbers of a buffer from number ``first`` on as ``dtype``, without a copy.
 
         Raises:
             ValueError: parts cannot begin there; see ``alignment``.
@@ -160,7 +179,7 @@ class Backend(ABC):
 
     @abstractmethod
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """Return the kernel of a name, specialised by flags; it is compiled once and kept."""
+        """Return a kernel by its name, specialised by flags; it is compiled once and kept."""
 
     @abstractmethod
     def synchronize(self) -> None:
@@ -173,7 +192,7 @@ class Backend(ABC):
 
     def record(self, program: Program) -> Recording:
         """Bind the arguments of a program and start nothing; the caller must keep its buffers alive."""
-        return _Repeated(self, program)
+        return _ProgramRecording(self, program)
 
     def replay(self, recording: Recording) -> None:
         """Start a recording as part of the call that this thread gathers, or at once where it gathers none."""
@@ -184,31 +203,31 @@ class Backend(ABC):
         """Whether a bound call of few particles gains by a recording although its NumPy arrays must be copied."""
         return False
 
-    # ---- calls: where starting takes longer than small work lasts, the work of a call is gathered and started at once
+    # ---- calls: where starts take longer than small work, the work of a call is gathered and started together
 
     def gather(self) -> None:  # noqa: B027
-        """Let this thread's launches and copies wait from now on; ``start`` or ``synchronize`` starts them in order.
+        """Gather this thread's launches and copies from now on; ``start`` or ``synchronize`` starts them in order.
 
-        The order of all else is kept: a blocking copy first starts everything before it.
+        A blocking copy first starts everything before it, so the order of a call is kept.
         """
 
     def start(self) -> None:  # noqa: B027
-        """Start the launches and copies that wait."""
+        """Start the gathered launches and copies."""
 
     def scatter(self) -> None:  # noqa: B027
-        """Start the launches and copies that wait, and gather no more."""
+        """Start the gathered launches and copies, and gather no more."""
 
     @property
     def gathers(self) -> bool:
-        """Whether launches and copies of this thread wait now."""
+        """Whether launches and copies of this thread are gathered now."""
         return False
 
     def address(self, buffer: Buffer) -> int:
-        """Return a number that tells a buffer's memory from any other that is alive."""
+        """Return a number that identifies the memory of a buffer among buffers that are alive."""
         return id(buffer)
 
     def check_process(self) -> None:  # noqa: B027
-        """Refuse to work in a forked child of the process that opened the device.
+        """Refuse a forked child of the process that opened the device.
 
         Raises:
             RuntimeError: this process is such a child.
@@ -216,8 +235,12 @@ class Backend(ABC):
 
     # ---- arrays of other libraries in the memory of the device
 
+    def reads(self, array: object) -> bool:
+        """Return whether an array on a device is of a library whose arrays this device may take."""
+        return False
+
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """Return an array of another library as it is; a misaligned one is copied unless ``in_place``.
+        """Return an array of another library without a copy; a misaligned one is copied unless ``in_place``.
 
         Raises:
             TypeError: it is not in this device's memory, or does not hold numbers.
@@ -226,7 +249,7 @@ class Backend(ABC):
         raise TypeError(f"{name}: must be in host memory for {self.info.selection}, got an array on a device")
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """Allocate a buffer of ``count`` numbers, perhaps none, that can be lent: not memory shared with the host."""
+        """Allocate a buffer of ``count`` numbers, 0 included, that can be lent: not memory shared with the host."""
         return self.empty(count, dtype)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
@@ -238,8 +261,8 @@ class Backend(ABC):
         raise TypeError(f"{self.info.selection} does not lend buffers")
 
 
-class _Repeated:
-    """A recording of backends that bind arguments anew each time."""
+class _ProgramRecording(Recording):
+    """A recording of a backend that binds the arguments of each start."""
 
     def __init__(self, backend: Backend, program: Program) -> None:
         self._backend, self._program = backend, program
@@ -254,11 +277,15 @@ class _Repeated:
         """See Recording.wait."""
         self._backend.synchronize()
 
+    def explain(self) -> str:
+        """See Recording.explain."""
+        return f"{counted(len(self._program), 'launch')} one by one: {self._backend.info.selection} has no graphs"
+
 
 class Proxy(Backend):
-    """A backend that passes everything on to another one: the base of those that watch or count.
+    """A backend that forwards every method to another one: the base of backends that watch or count.
 
-    Launches of programs and recordings all go through ``compile``, so that a subclass that overrides it sees each.
+    Launches of programs and recordings all go through ``compile``, so a subclass that overrides it sees each launch.
     """
 
     def __init__(self, backend: Backend) -> None:
@@ -327,6 +354,10 @@ class Proxy(Backend):
     def check_process(self) -> None:
         """See Backend.check_process."""
         self._backend.check_process()
+
+    def reads(self, array: object) -> bool:
+        """See Backend.reads."""
+        return self._backend.reads(array)
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
         """See Backend.adopt."""

@@ -1,12 +1,12 @@
-"""Compiled kernels and verdicts on drivers on disk, so that only the first run on a device makes them.
+"""Compiled kernels and verdicts on drivers, kept on disk: only the first run on a device makes them.
 
 The folder is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else ``~/.cache/gpusense``;
 ``GPUSENSE_CACHE=off`` switches it off. An entry is one file that is named by a hash of its key, written by rename, and
 begins with a checksum of its contents; the oldest go when the folder holds more than it may. Where the folder cannot be
-written, a private temporary folder takes its place and one line of the log names both. A cache never stops a run.
+written, a private temporary folder takes its place and one line of the log names it. A cache never stops a run.
 
-PoCL and Warp keep compiled kernels in folders of their own, without checksums. Each process gives them an empty folder
-(see :mod:`gpusense.backends.scratch`), and copies kernels there from entries, and new ones back into entries.
+PoCL and Warp keep compiled kernels in folders without checksums. Each process gives them an empty folder (see
+:mod:`gpusense.backends.scratch`), and copies kernels there from entries, and new ones back into entries.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def cache_folder() -> Path | None:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gpusense"
     except RuntimeError:
-        # No home is known.
+        # The user has no home folder.
         return temporary_folder()
 
 
@@ -56,12 +56,12 @@ def temporary_folder() -> Path | None:
     try:
         folder = Path(tempfile.gettempdir()) / (f"gpusense-{os.getuid()}" if hasattr(os, "getuid") else "gpusense")
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
+        status = folder.lstat()
     except OSError:
         return None
     # Kernels are code: the folder must be owned by this user and writable by this user only.
-    mine = stat.S_ISDIR(found.st_mode) and (not hasattr(os, "getuid") or found.st_uid == os.getuid())
-    return folder if mine and not found.st_mode & 0o022 else None
+    is_owned = stat.S_ISDIR(status.st_mode) and (not hasattr(os, "getuid") or status.st_uid == os.getuid())
+    return folder if is_owned and not status.st_mode & 0o022 else None
 
 
 def _folders() -> Iterator[Path]:
@@ -98,6 +98,7 @@ def _report(folder: str, error: OSError) -> None:
 
 
 def _file(key: str) -> str:
+    """Return the name of an entry's file."""
     return f"{hashlib.sha256(key.encode()).hexdigest()}.bin"
 
 
@@ -110,7 +111,7 @@ def load_entry(key: str) -> bytes | None:
         except OSError:
             continue
         if data[:_HEAD] == _MAGIC + hashlib.sha256(data[_HEAD:]).digest():
-            # The oldest entries are the first to go.
+            # The least recently used entries are evicted first.
             with contextlib.suppress(OSError):
                 os.utime(path)
             return data[_HEAD:]
@@ -135,6 +136,11 @@ def discard_entry(key: str) -> None:
 
 
 def _write(folder: Path, name: str, data: bytes) -> None:
+    """Write a file by rename, and evict others where the folder holds too much.
+
+    Raises:
+        OSError: the folder does not take it.
+    """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
     try:
@@ -148,15 +154,16 @@ def _write(folder: Path, name: str, data: bytes) -> None:
 
 
 def _remove(path: Path) -> None:
+    """Remove a file, if that is possible."""
     with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
 
 
 def _shrink(folder: Path) -> None:
-    """Remove the least recently used entries beyond the bounds, and what killed processes left unfinished."""
+    """Evict the least recently used entries beyond the bounds, and the unfinished files of killed processes."""
     entries, begun = [], []
-    with os.scandir(folder) as found:
-        for entry in found:
+    with os.scandir(folder) as listing:
+        for entry in listing:
             try:
                 status = entry.stat(follow_symlinks=False)
             except OSError:

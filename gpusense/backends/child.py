@@ -1,4 +1,4 @@
-"""Work with a driver in a child process, which a driver may end or hang without harm to the user's process."""
+"""Child processes for work with a driver: one that crashes or hangs does no harm to the user's process."""
 
 from __future__ import annotations
 
@@ -21,37 +21,50 @@ _START = (
     "import sys, json; job = json.loads(sys.stdin.readline()); sys.path[:] = job['path']; "
     "from gpusense.backends.child import main; main(job)"
 )
-# Signals that come from outside: they say nothing of the driver.
+# Signals that come from outside: they are no failure of the driver.
 _FOREIGN = tuple(getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
-# Lines of a dying process that say nothing of the cause.
+# Lines of a dying process that do not name the cause.
 _NOISE = re.compile(r"^(\s*$|Stack dump|PLEASE submit|\s*#?\d+[.\s]|\d+ warnings? generated|Aborted| +File |Traceback)")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The reports of a child process, and how it ended.
+    """The reports and the end of a child process.
 
     Attributes:
-        said: What it reported, in order.
-        failure: How it failed, in one line; empty where it ended well.
+        said: Its reports, in order.
+        failure: The failure in one line; empty where it ended well.
         conclusive: False where something else than the driver may have ended it.
+        started: False where the system started no child.
     """
 
     said: list[dict[str, Any]]
     failure: str = ""
     conclusive: bool = True
+    started: bool = True
+
+
+def is_off() -> bool:
+    """Return whether ``$GPUSENSE_PROOF`` switches proofs off."""
+    return os.environ.get("GPUSENSE_PROOF", "").lower() in ("off", "0", "false", "no")
+
+
+def obstacle() -> str:
+    """Return why this program starts no children: its executable is no interpreter; empty where it is one."""
+    if getattr(sys, "frozen", False):
+        return "a frozen program has no interpreter for a child process"
+    if not re.match(r"(python|pypy)", os.path.basename(sys.executable or "").lower()):
+        return f"{sys.executable or 'this program'} is no Python interpreter that a child process could run"
+    return ""
 
 
 def can_start() -> bool:
-    """Return whether children can be started: whether the interpreter is a program that takes ``-c``."""
-    if os.environ.get("GPUSENSE_PROOF", "").lower() in ("off", "0", "false", "no"):
-        return False
-    name = os.path.basename(sys.executable or "").lower()
-    return bool(re.match(r"(python|pypy)", name)) and not getattr(sys, "frozen", False)
+    """Return whether children are to be started: proofs are not switched off, and there is an interpreter."""
+    return not is_off() and not obstacle()
 
 
 def time_limit() -> float:
-    """Return the seconds that a child may take: ``$GPUSENSE_PROOF_SECONDS``.
+    """Return the time limit of a child [s]: ``$GPUSENSE_PROOF_SECONDS``.
 
     Raises:
         ValueError: the variable is not a positive number.
@@ -71,7 +84,7 @@ def run(job: dict[str, Any]) -> Outcome:
 
     Args:
         job: ``do`` is the name of a function ``module:name``, which is called with the job and a function that reports
-            a dictionary; the rest is the function's own.
+            a dictionary; the rest belongs to the function.
     """
     path = [os.path.abspath(entry) for entry in sys.path]
     return run_text(["-P", "-W", "ignore", "-c", _START], {**job, "path": path})
@@ -81,21 +94,22 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
     """Run the interpreter in a child.
 
     Args:
-        arguments: The interpreter's own.
-        job: What the program finds on standard input, as one line of JSON.
+        arguments: The interpreter's arguments.
+        job: The program reads it from standard input, as one line of JSON.
         variables: Further variables of its environment.
     """
     # The child starts no children.
     environment = os.environ | {"GPUSENSE_PROOF": "off"} | (variables or {})
     command = [sys.executable, *arguments]
     limit = time_limit()
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
+    with contextlib.ExitStack() as stack:
         try:
+            out, errors = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=environment, start_new_session=True
             )
         except OSError as error:
-            return Outcome([], f"no child process can be started: {error}", conclusive=False)
+            return Outcome([], f"no child process can be started: {error}", conclusive=False, started=False)
         try:
             with contextlib.suppress(BrokenPipeError):
                 process.communicate(json.dumps(job).encode() + b"\n", timeout=limit)
@@ -113,7 +127,7 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the child, if it runs still, and what it started."""
+    """End the child, if it still runs, and its own children."""
     if process.poll() is None:
         with contextlib.suppress(OSError):
             if hasattr(os, "killpg"):
@@ -124,6 +138,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _read_reports(file: BinaryIO) -> list[dict[str, Any]]:
+    """Return the reports in a child's output."""
     file.seek(0)
     lines = file.read(1 << 20).decode("utf-8", "replace").splitlines()
     reports = []
@@ -137,16 +152,17 @@ def _read_reports(file: BinaryIO) -> list[dict[str, Any]]:
 
 
 def _last_words(file: BinaryIO) -> str:
-    """Return the line of standard error that says most about the end of a process."""
+    """Return the line of standard error that best names the cause of a process's end."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - (1 << 16), 0))
     lines = file.read().decode("utf-8", "replace").splitlines()
-    told = [line.strip() for line in lines if not _NOISE.match(line)]
-    errors = [line for line in told if re.search(r"\berror\b", line, re.IGNORECASE)]
-    return (errors or told or [""])[0 if errors else -1][:200]
+    words = [line.strip() for line in lines if not _NOISE.match(line)]
+    errors = [line for line in words if re.search(r"\berror\b", line, re.IGNORECASE)]
+    return (errors or words or [""])[0 if errors else -1][:200]
 
 
 def _describe(code: int, words: str) -> str:
+    """Return the end of a process in one line."""
     if code >= 0:
         return words or f"exit code {code}"
     try:
@@ -164,8 +180,8 @@ def main(job: dict[str, Any]) -> None:
         # A process that is expected to die leaves no image of its memory.
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
-    def report(said: dict[str, Any]) -> None:
-        sys.stdout.write(f"\n{_MARK}{json.dumps(said)}\n")
+    def report(values: dict[str, Any]) -> None:
+        sys.stdout.write(f"\n{_MARK}{json.dumps(values)}\n")
         sys.stdout.flush()
 
     module, _, name = job["do"].partition(":")

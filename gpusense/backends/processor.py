@@ -1,9 +1,10 @@
-"""The host's processor: its instruction sets, and a fingerprint for what is compiled for it."""
+"""The host: its instruction sets, its memory, and a fingerprint for code that is compiled for it."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import platform
 
 _CPUINFO = "/proc/cpuinfo"
@@ -25,9 +26,17 @@ def fingerprint() -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
+def host_memory() -> int:
+    """Return the bytes of the host's memory; 4 GiB where the system does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 4 << 30
+
+
 @functools.cache
 def _fields() -> dict[str, str]:
-    """Return what Linux says about the first processor."""
+    """Return the fields of the first processor in Linux's list."""
     try:
         with open(_CPUINFO, encoding="utf-8", errors="replace") as file:
             text = file.read(1 << 16)

@@ -1,10 +1,11 @@
 """Verdicts on devices: a child compiles and runs kernels of each family on a device before this process trusts it.
 
-A compiler that does not know a processor aborts, hangs or makes wrong code, and it does so in the process that asked.
-So the first time that a device, its driver, the processor and this version of gpusense are met, a child computes a
-small scene and compares it with NumPy. A family of kernels that fails is not used: vectors give way to narrower ones
-and then to scalar kernels, float64 is called absent, and where scalar kernels fail the device is unusable. The verdict
-is kept in the cache, and so is what the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver.
+A compiler that does not know a processor aborts, hangs or makes wrong code, in the process that calls it. So the first
+time that a device, its driver, the processor and this version of gpusense are met, a child computes a small scene and
+compares it with NumPy. A family of kernels that fails is not used: vectors give way to narrower ones and then to scalar
+kernels, float64 is called absent, and where scalar kernels fail the device is unusable. The verdict is kept in the
+cache, and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver. Where no child can
+be started, a device without a kept verdict is trusted, and the log says so.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from gpusense.backends.processor import fingerprint
 SCALAR, FLOAT64, VECTORS = "scalar kernels", "float64 kernels", "kernels in vectors"
 _PROVE = "gpusense.evaluation.proof:prove"
 _LOG = logging.getLogger("gpusense")
-# What helps against a failure, by what it says.
+# Remedies by the words of a failure.
 _REMEDIES = (
     (
         r'"ld" doesn\'t exist|linker command failed',
@@ -39,7 +40,7 @@ _REMEDIES = (
         "set GPUSENSE_PROOF_SECONDS higher if the machine is slow, or choose another device with GPUSENSE_BACKEND",
     ),
 )
-# Failures of the machine's state and not of the driver: verdicts by them are not kept.
+# Failures of the machine's state and not of the driver: their verdicts are not kept.
 _PASSING = re.compile(
     r"No space left|is full|quota|Permission denied|Read-only file|[Oo]ut of memory|MemoryError|allocate|takes \d+ MiB"
 )
@@ -54,8 +55,8 @@ class Verdict:
         usable: Whether models can run on it.
         lanes: Lanes of kernels in vectors that were proved; 1 where only scalar ones were.
         float64: Whether float64 kernels were proved.
-        reason: What failed, empty where nothing did.
-        remedy: What helps against it.
+        reason: The failures, empty where nothing failed.
+        remedy: What helps against them.
         rate: Calls of a scan per second, by which devices of one class are compared; 0 where it was not measured.
     """
 
@@ -72,7 +73,7 @@ _known: dict[str, Verdict] = {}
 
 
 def trust(info: BackendInfo) -> Verdict:
-    """Return a verdict that takes a driver by its word."""
+    """Return a verdict without proof: the driver has the abilities that it claims."""
     return Verdict(True, info.lanes, info.float64)
 
 
@@ -81,24 +82,27 @@ def unusable(reason: str) -> Verdict:
     return Verdict(False, 1, False, reason, remedy_for(reason))
 
 
-def verdict_on(info: BackendInfo, *, drivers: Any = None, anew: bool = False) -> Verdict:
+def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> Verdict:
     """Return the verdict on a device: the kept one, or a child's where there is none or it is to be made ``anew``.
 
     Args:
         info: The device.
-        drivers: The OpenCL drivers that the child loads; see ``opencl.drivers.as_job``.
+        setup: The preparation of the child; see ``registry.Library.child_setup``.
         anew: Whether the kept verdict is dropped.
     """
-    if not child.can_start():
+    if child.is_off():
         return trust(info)
-    key = _key(info)
+    key, obstacle = _key(info), child.obstacle()
     with _lock:
-        if anew:
+        if anew and not obstacle:
             _known.pop(key, None)
             discard_entry(key)
         verdict = _known.get(key) or _load(key)
-        if verdict is None:
-            verdict, conclusive = _prove(info, drivers)
+        if verdict is None and obstacle:
+            _LOG.info("gpusense: %s is trusted without a proof: %s", name_of(info), obstacle)
+            verdict = trust(info)
+        elif verdict is None:
+            verdict, conclusive = _prove(info, setup)
             if conclusive:
                 store_entry(key, json.dumps(dataclasses.asdict(verdict)).encode())
             if verdict.reason:
@@ -107,12 +111,16 @@ def verdict_on(info: BackendInfo, *, drivers: Any = None, anew: bool = False) ->
         return verdict
 
 
+def name_of(info: BackendInfo) -> str:
+    """Return a device as messages name it."""
+    return f"{info.selection} ({info.name}, {info.driver})"
+
+
 def summary(info: BackendInfo, verdict: Verdict) -> str:
-    """Return what failed on a device and what follows, in one line."""
-    what = f"{info.selection} ({info.name}, {info.driver})"
+    """Return the failures of a device and their consequence, in one line."""
     if not verdict.usable:
-        return f"{what} is unusable: {verdict.reason}; {verdict.remedy}"
-    return f"{what}: {verdict.reason}, and so these are not used; {verdict.remedy}"
+        return f"{name_of(info)} is unusable: {verdict.reason}; {verdict.remedy}"
+    return f"{name_of(info)}: {verdict.reason}, and so these are not used; {verdict.remedy}"
 
 
 def apply(info: BackendInfo, verdict: Verdict) -> BackendInfo:
@@ -121,7 +129,7 @@ def apply(info: BackendInfo, verdict: Verdict) -> BackendInfo:
 
 
 def remedy_for(reason: str) -> str:
-    """Return what helps against a failure."""
+    """Return the remedy for a failure."""
     return next((remedy for pattern, remedy in _REMEDIES if re.search(pattern, reason)), _OTHERWISE)
 
 
@@ -132,21 +140,29 @@ def _key(info: BackendInfo) -> str:
 
 
 def _load(key: str) -> Verdict | None:
-    kept = load_entry(key)
-    if kept is None:
+    """Return the kept verdict; None where there is none or it is damaged."""
+    payload = load_entry(key)
+    if payload is None:
         return None
     try:
-        return Verdict(**json.loads(kept))
+        return Verdict(**json.loads(payload))
     except (TypeError, ValueError):
         return None
 
 
-def _prove(info: BackendInfo, drivers: Any) -> tuple[Verdict, bool]:
-    """Try families of kernels in children until each is proved or given up; also whether the verdict is to be kept."""
+def _prove(info: BackendInfo, setup: Any) -> tuple[Verdict, bool]:
+    """Prove families of kernels in children until each is proved or dropped.
+
+    Returns:
+        The verdict, and whether it is to be kept.
+    """
     failures: list[str] = []
     conclusive = True
     while True:
-        outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(info), "drivers": drivers})
+        outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(info), "setup": setup})
+        if not outcome.started:
+            _LOG.warning("gpusense: %s is trusted without a proof: %s", name_of(info), outcome.failure)
+            return _verdict(info, failures, outcome), False
         failed, failure = _failure(outcome)
         if not failed:
             return _verdict(info, failures, outcome), conclusive
@@ -164,18 +180,18 @@ def _prove(info: BackendInfo, drivers: Any) -> tuple[Verdict, bool]:
 def _verdict(info: BackendInfo, failures: list[str], outcome: child.Outcome) -> Verdict:
     """Return the verdict on a device as it was proved."""
     reason = "; ".join(failures)
-    rate = next((float(said["rate"]) for said in outcome.said if "rate" in said), 0.0)
+    rate = next((float(report["rate"]) for report in outcome.said if "rate" in report), 0.0)
     return Verdict(True, info.lanes, info.float64, reason, remedy_for(reason) if reason else "", rate)
 
 
 def _failure(outcome: child.Outcome) -> tuple[str, str]:
-    """Return the family that failed, empty where none did, and how."""
+    """Return the family that failed, empty where none did, and its failure in words."""
     begun = ""
-    for said in outcome.said:
-        begun = str(said.get("begin", begun))
-        if "wrong" in said:
-            return begun, f"compute wrong numbers ({said['wrong']})"
-        if said.get("end"):
+    for report in outcome.said:
+        begun = str(report.get("begin", begun))
+        if "wrong" in report:
+            return begun, f"compute wrong numbers ({report['wrong']})"
+        if report.get("end"):
             # All families are proved; some drivers crash when their process exits.
             return "", ""
     if outcome.failure:

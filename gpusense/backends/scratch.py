@@ -1,7 +1,7 @@
-"""A folder of this process, in which drivers keep what they compile; it is removed when the process ends.
+"""A folder of this process for the compiled kernels of drivers, which is removed when the process ends.
 
-Drivers trust what they find in their folders: a file that another process left half-written, or that a disk has
-damaged, ends the run. So every process begins with an empty folder, and only files whose checksums hold are copied into
+Drivers do not check the files in their folders: one that another process left half-written, or that a disk has damaged,
+ends the run. So every process begins with an empty folder, and only files whose checksums hold are copied into
 it (see :mod:`gpusense.backends.cache`).
 """
 
@@ -97,10 +97,10 @@ def _lock(file: Any) -> None:
 
 
 def _check_room(folder: Path) -> None:
-    """See that the folder takes files; quotas do not show in the figures of its file system.
+    """Write a file to check the room of a folder; the figures of a file system do not show quotas.
 
     Raises:
-        OSError: it does not.
+        OSError: the folder does not take it.
     """
     probe = folder / "probe"
     with open(probe, "wb") as file:
@@ -112,7 +112,7 @@ def _check_room(folder: Path) -> None:
 
 
 def _remove(folder: Path, process: int, lock: Any) -> None:
-    # A forked child ends too.
+    """Remove the folder of this process; a forked child, which ends as well, leaves it."""
     if os.getpid() == process:
         lock.close()
         shutil.rmtree(folder, ignore_errors=True)

@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.backends.base import Backend, Buffer, Recording
 from gpusense.interface.launches import Program, flags_of
 
-# Programs that are kept.
+# Programs of earlier calls that are kept.
 _MOST_KEPT = 64
 # Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
 _ALIGNED = 64
@@ -51,7 +51,7 @@ class Workspace:
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
-        # Host arrays that copies under way read or write.
+        # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
         # Programs of earlier calls, by everything on which they depend.
         self._programs: dict[Hashable, _Kept] = {}
@@ -59,7 +59,7 @@ class Workspace:
         self._parts: dict[Hashable, list[Buffer]] = {}
 
     def __enter__(self) -> Workspace:
-        """Begin a call: where that is faster, the device starts its launches and copies at once."""
+        """Begin a call, whose launches and copies the device gathers where it can."""
         self._backend.gather()
         return self
 
@@ -67,17 +67,17 @@ class Workspace:
         try:
             self._backend.scatter()
         finally:
-            # Not before: gathered launches may write there.
+            # Not earlier: gathered launches may write the flag.
             if kind is not None:
                 self.abandon()
 
     def abandon(self) -> None:
-        """Forget the non-finite flag after an error: it is not the next call's."""
+        """Drop the non-finite flag after an error: the next call has a cleared one."""
         if self._buffers.pop(POSE_STATUS, None) is not None:
             self._forget()
 
     def start(self) -> None:
-        """Let the device begin with the work of the call so far."""
+        """Start the gathered work of the call."""
         self._backend.start()
 
     def run(
@@ -90,15 +90,15 @@ class Workspace:
         version: int,
         lasting: bool,
     ) -> frozenset[str]:
-        """Run a program of this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
+        """Run a program on this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
 
         Args:
             key: All sizes and flags on which the program depends, and all numbers that seldom change.
             numbers: Arguments that change from call to call.
-            buffers: Its buffers that are not of this workspace.
-            make: Makes the program.
-            version: Of the map's table: programs of other versions are dropped.
-            lasting: Whether these buffers stay for later calls.
+            buffers: Its buffers that are not of this workspace; None stands for no buffer.
+            make: Returns the program.
+            version: The version of the map's table; programs of other versions are dropped.
+            lasting: Whether these buffers stay alive for later calls.
 
         Returns:
             The flags of its launches.
@@ -114,7 +114,7 @@ class Workspace:
             return flags_of(program)
         # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
         fixed = tuple(numbers.items()) if records else ()
-        key = (records, key, fixed, *[backend.address(buffer) for buffer in buffers])
+        key = (records, key, fixed, *[0 if buffer is None else backend.address(buffer) for buffer in buffers])
         kept = self._programs.get(key)
         if kept is None:
             program = make()
@@ -135,8 +135,8 @@ class Workspace:
             name: Its name in this workspace.
             count: Numbers.
             dtype: Their type.
-            zero: Clear a new one.
-            lent: Allocate a new one such that it can be lent.
+            zero: Clear a new buffer.
+            lent: Allocate a new buffer that can be lent.
         """
         capacity, buffer = self._buffers.get((name, dtype), (0, None))
         if buffer is None or capacity < count:
@@ -199,7 +199,7 @@ class Workspace:
         if begin % self._backend.alignment == 0:
             yield self._backend.part(target, first, count, dtype)
             return
-        # The device cannot begin there.
+        # Parts cannot begin at this byte.
         buffer = self.empty(f"{name} lent", count, dtype, lent=True)
         yield buffer
         self._backend.copy(buffer, target, count * dtype.itemsize, to=begin)
@@ -215,7 +215,7 @@ class Workspace:
         self._busy.clear()
 
     def _forget(self) -> None:
-        """Forget programs and parts: a buffer of theirs is replaced."""
+        """Drop programs and parts: one of their buffers is replaced."""
         self._programs.clear()
         self._parts.clear()
 

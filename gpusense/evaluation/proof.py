@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.backends import Backend, get_backend, open_device, take_drivers
+from gpusense.backends import Backend, get_backend, open_device, set_up_child
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, info_of
 from gpusense.evaluation.tolerances import TOLERANCES, Tolerance, scan_tolerance
 from gpusense.models.scan.beam import BeamModel
@@ -51,12 +51,12 @@ def prove(job: dict[str, Any], report: Report) -> None:
     """Run each family of kernels that a device has; stop at the first that computes wrong numbers.
 
     Args:
-        job: ``info`` describes the device, with the lanes to try; ``drivers`` names the drivers that OpenCL loads.
+        job: ``info`` describes the device, with the lanes to try; ``setup`` prepares its library.
         report: Called with the family that begins, with the first difference above its tolerance, and at the end.
     """
     info = info_of(job)
-    if info.backend == "opencl" and "drivers" in job:
-        take_drivers(job["drivers"])
+    if "setup" in job:
+        set_up_child(info.backend, job["setup"])
     scene, numpy = Scene(), get_backend("numpy")
     report({"begin": SCALAR})
     device = open_device(info)

@@ -1,1 +1,1 @@
-"""What host and kernels agree on: signatures of kernels, flags, and specialised sources."""
+"""The interface of host and kernels: signatures, flags, launches, constants and specialised sources."""

@@ -1,4 +1,4 @@
-"""Where the kernel sources are, and how they are read and imported.
+"""The folder of the kernel sources, and the functions that read and import them.
 
 The kernels are written in the top-level folder ``kernels/`` of a checkout and ship inside the wheel as
 ``gpusense/kernels``. Both layouts, and an editable install of a checkout, give the same module names
@@ -21,7 +21,7 @@ def kernel_root() -> Path:
     """Return the folder that holds ``opencl/`` and ``warp/``.
 
     Raises:
-        FileNotFoundError: If the folder is neither inside the package nor beside it.
+        FileNotFoundError: the folder is neither inside the package nor beside it.
     """
     package = Path(__file__).resolve().parents[1]
     candidates = (package / "kernels", package.parent / "kernels")
@@ -39,7 +39,7 @@ def opencl_source(name: str) -> str:
         name: The file's name without its ending, with its folder if it lies in one: ``"beam"``, ``"lanes/beam"``.
 
     Raises:
-        FileNotFoundError: If there is no such file; the message lists the names of all files.
+        FileNotFoundError: there is no such file; the message lists the names of all files.
     """
     folder = kernel_root() / "opencl"
     try:
@@ -67,14 +67,14 @@ def warp_module(name: str) -> ModuleType:
         name: The file's name without its ending.
 
     Raises:
-        ModuleNotFoundError: If there is no such file, or the Warp library is not installed.
+        ModuleNotFoundError: there is no such file, or Warp is not installed.
     """
     _register_package()
     return importlib.import_module(f"{_PACKAGE}.warp.{name}")
 
 
 def _register_package() -> None:
-    """Import the kernel folder as the package ``gpusense.kernels``, wherever it lies."""
+    """Import the kernel folder as the package ``gpusense.kernels``, whatever its place."""
     with _LOCK:
         if _PACKAGE in sys.modules:
             return

@@ -1,12 +1,12 @@
-"""Which scenes have kernels that compute several particles or beams at once, for devices that ask for lanes."""
+"""The flag of kernels in vectors, which compute several particles or beams at once on devices that ask for lanes."""
 
 from __future__ import annotations
 
 from gpusense.interface import casters
 
-# A kernel has no such variant with these flags, some of them of its own, or without all of some set of those.
+# A kernel has no body in vectors with any of these flags, nor without all flags of one of its sets.
 _NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *casters.FLAGS}
-# Only sums to learn from have lanes of float64.
+# Kernels in vectors of float64: the sums of learning.
 _FLOAT64 = {"e_step"}
 _NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"}}
 _NEEDED: dict[str, tuple[set[str], ...]] = {
@@ -19,7 +19,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 
 
 def widened(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
-    """The flags of a launch on a device, with WIDE where it asks for lanes and the scene has such a kernel."""
+    """Return the flags of a launch, with WIDE where the device asks for lanes and the kernel has a body in vectors."""
     never = (_NEVER | _NEVER_OF.get(kernel, set())) - ({"FLOAT64"} if kernel in _FLOAT64 else set())
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED[kernel]):
         return frozenset(flags)

@@ -1,6 +1,6 @@
 """Launches: a kernel, its flags, its size, and its arguments by name.
 
-A program is a tuple of launches. Making one starts nothing: tests read it, backends run it or record it.
+A program is a tuple of launches. It is data: tests read it, backends run it or record it.
 """
 
 from __future__ import annotations
@@ -75,30 +75,31 @@ def flags_of(program: Program) -> frozenset[str]:
 
 
 class _Row:
-    """A row of the signature table, ready to bind arguments."""
+    """A row of the signature table that binds arguments."""
 
     def __init__(self, kernel: str, row: Kernel) -> None:
         self._kernel, self._row = kernel, row
         self.names = tuple(argument.name for argument in row.arguments)
         self.take = itemgetter(*self.names)
-        # Types that were checked once: calls repeat them.
+        # Types that passed the check, which calls repeat.
         self.accepted: set[tuple[type, ...]] = set()
 
     def check(self, types: tuple[type, ...]) -> None:
         """Hold the types of arguments to the row.
 
         Raises:
-            TypeError: a number in place of an array, or the other way round, or a real number in place of an integer.
+            TypeError: a number in place of a buffer, a buffer in place of a number, or a real number in place of an
+                integer.
         """
         for argument, kind in zip(self._row.arguments, types, strict=True):
             is_number = issubclass(kind, _NUMBERS)
             if argument.shape is not None:
-                rule, right = "a buffer", not is_number
+                rule, holds = "a buffer", not is_number
             elif argument.type == "int":
-                rule, right = "an integer", issubclass(kind, _INTEGERS)
+                rule, holds = "an integer", issubclass(kind, _INTEGERS)
             else:
-                rule, right = "a number", is_number
-            if not right:
+                rule, holds = "a number", is_number
+            if not holds:
                 raise TypeError(f"{self._kernel}: {argument.name} must be {rule}, got a {kind.__name__}")
         self.accepted.add(types)
 
@@ -107,14 +108,17 @@ _ROWS: dict[str, _Row] = {}
 
 
 def _row(kernel: str) -> _Row:
+    """Return the row of a kernel."""
     return _ROWS.setdefault(kernel, _Row(kernel, KERNELS[kernel]))
 
 
 def _names(kernel: str) -> tuple[str, ...]:
+    """Return the names of a kernel's arguments in the order of its row."""
     return _row(kernel).names
 
 
 def _difference(kernel: str, names: tuple[str, ...], arguments: dict[str, Any]) -> str:
+    """Return the message on missing and unknown arguments."""
     missing = [name for name in names if name not in arguments]
     unknown = [name for name in arguments if name not in names]
     parts = [f"missing {', '.join(missing)}" if missing else "", f"unknown {', '.join(unknown)}" if unknown else ""]

@@ -1,7 +1,7 @@
-"""The scene plan: what a scene does not need, why, and what leaving it out saves.
+"""The scene plan: the parts of a computation that a scene does not need, the reasons, and the savings.
 
-A spec of flags says what code a kernel has; tuned numbers are arguments. Everything here follows from the scene:
-parameters, scanner, map, the last scan and cloud. ``specialize=False`` keeps it all in, with the same numbers.
+Flags choose the code of a kernel; tuned numbers are arguments. The plan follows from the scene: parameters, scanner,
+map, the last scan and cloud. With ``specialize=False`` nothing is left out, and results are the same.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Omission:
-    """One thing left out.
+    """A part that is left out.
 
     Attributes:
         what: The part that a scene does not need.
         why: The reason, with the numbers that decide it.
-        saves: What is not computed, stored or moved.
+        saves: The computation, storage or copies that are saved.
     """
 
     what: str
@@ -27,7 +27,7 @@ class Omission:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a model computes and what it leaves out."""
+    """The code of a model, and the parts that it leaves out."""
 
     title: str
     code: frozenset[str]
@@ -48,7 +48,7 @@ ORDINARY_HEADINGS = Omission(
 
 
 def share(part: float, whole: float) -> str:
-    """A part as a percentage of the whole."""
+    """Return a part as a percentage of the whole."""
     return f"{100 * part / whole:.0f} %" if whole else "0 %"
 
 
@@ -61,20 +61,22 @@ def scene_omissions(
     precision: str,
     ring: bool = True,
 ) -> list[Omission]:
-    """What parameters, scanner and map make unnecessary, before any scan is seen.
+    """Return the parts that parameters, scanner and map make unnecessary, before any scan.
 
     Args:
         components: (parameter, its weight, cost of its component per particle-beam).
         mount: The scanner's pose on the robot.
         unknown: Policy for unknown cells.
-        outside: Policy for what lies outside the grid.
+        outside: Policy for the space outside the grid.
         precision: ``"float32"`` or ``"float64"``.
-        ring: Whether a ring of cells stands for what is outside.
+        ring: Whether a ring of cells around the grid stands for the space outside.
     """
-    found = [Omission(f"{name[2:]} component", f"{name} = 0", cost) for name, weight, cost in components if not weight]
+    omissions = [
+        Omission(f"{name[2:]} component", f"{name} = 0", cost) for name, weight, cost in components if not weight
+    ]
     if mount[:2] == (0.0, 0.0):
-        found.append(Omission("mount", "the scanner sits at the robot's origin", "a rotation per particle"))
-    found.append(
+        omissions.append(Omission("mount", "the scanner sits at the robot's origin", "a rotation per particle"))
+    omissions.append(
         Omission(
             "unknown branch",
             f"unknown cells are {unknown} by one rule, applied once to the map",
@@ -83,35 +85,35 @@ def scene_omissions(
     )
     if ring:
         why = f"a sentinel ring stands for what is outside ({outside})"
-        found.append(Omission("bounds tests", why, "four comparisons per step"))
+        omissions.append(Omission("bounds tests", why, "four comparisons per step"))
     if precision == "float32":
-        found.append(
+        omissions.append(
             Omission(
                 "float64", "positions are split into cell and fraction in float64", "half the bytes and wide units"
             )
         )
-    return found
+    return omissions
 
 
 def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None = None) -> list[Omission]:
-    """What the cloud of the last call makes unnecessary; nothing before there is one.
+    """Return the parts that the cloud of the last call makes unnecessary; none before the first call.
 
     Args:
         code: The flags of the last call.
-        least_ordered: Rays and particles from which a device puts the particles of a beam model in order; None for a
-            device or a model that never does.
+        least_ordered: Rays and particles from which the particles of a beam model are put in order; None where a device
+            or a model puts none in order.
     """
-    found = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
+    omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
     if "QUICK" in code:
-        found.append(
+        omissions.append(
             Omission(
                 "guard of each end point",
-                "cells are found by rounding, and again where one of 16 end points is near an edge",
+                "cells are omissions by rounding, and again where one of 16 end points is near an edge",
                 "a branch per particle-beam",
             )
         )
     if "INSIDE" in code:
-        found.append(
+        omissions.append(
             Omission(
                 "clamps to the table",
                 "no end point of the cloud leaves the table",
@@ -123,5 +125,5 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
         why = f"a launch has fewer than {rays} rays or {particles} particles"
         if "PER_BEAM" in code:
             why = "parts are wanted, particle by particle"
-        found.append(Omission("order of particles", why, "4 launches that sort by place and heading"))
-    return found
+        omissions.append(Omission("order of particles", why, "4 launches that sort by place and heading"))
+    return omissions

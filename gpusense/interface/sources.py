@@ -21,11 +21,11 @@ _CONDITION = re.compile(r"#if (!?)([A-Z0-9_]+)$")
 
 
 def prelude(*, float64: bool, doubles: bool = False) -> str:
-    """What every program begins with: no contraction, and the meaning of ``real``.
+    """Return the head of every program: it forbids contraction and defines ``real``.
 
     Args:
         float64: Whether ``real`` is float64.
-        doubles: Whether the program uses float64 whatever ``real`` is.
+        doubles: Whether the program uses float64 also where ``real`` is float32.
     """
     return _PRELUDE.format(
         extension="#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n" if float64 or doubles else "",
@@ -94,14 +94,14 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
 
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
-    """Whether a kernel file computes in float64 whatever the precision of the model."""
+    """Return whether a kernel file computes in float64 also where the model's precision is float32."""
     kept = (resolve(opencl_source(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
     texts = (re.sub(r"//.*", "", text) for text in kept)
     return any(re.search(r"\bdouble[24]?\b", text) for text in texts)
 
 
 def assemble(file: str, flags: frozenset[str]) -> str:
-    """Complete OpenCL C source of a kernel file for a set of flags."""
+    """Return the complete OpenCL C source of a kernel file for a set of flags."""
     parts = [prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))]
     for needed in required_files(file, flags):
         parts += [f'#line 1 "{needed}.cl"\n', resolve(opencl_source(needed), flags, f"{needed}.cl")]
@@ -109,7 +109,7 @@ def assemble(file: str, flags: frozenset[str]) -> str:
 
 
 def with_places(log: str, source: str) -> str:
-    """A compiler's log with places in the assembled source, ``<kernel>:114:``, as ``raycast.cl:48:``.
+    """Return a compiler's log in which places of the assembled source, ``<kernel>:114:``, read ``raycast.cl:48:``.
 
     Most drivers heed the ``#line`` directives of a source; NVIDIA's counts the lines of the whole.
     """
@@ -127,7 +127,7 @@ def with_places(log: str, source: str) -> str:
 
 
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
-    """The flags that change a kernel file's code, so that one program serves all specs that agree on them."""
+    """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
     text = "".join(opencl_source(needed) for needed in files)
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))

@@ -1,4 +1,4 @@
-"""The numbers of a mixture as kernels get them: which domain they are summed in, and how they are rounded."""
+"""The numbers of a mixture as arguments of kernels: the domain of their sum, and their rounding."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import math
 
 import numpy as np
 
-# Above this peak [1/m] an exponent's rounding errors could show beside a log density near 0.
+# Above this peak [1/m] the rounding errors of an exponent may exceed the tolerance beside a log density near 0.
 HIGH_PEAK = 64.0
-# A density that takes part in a linear sum must dwarf what underflow takes from the others, denormals or not.
+# A density in a linear sum must be far above the underflow of the others, with or without denormals.
 _SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
 
 
 def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
-    """Whether the uniform density is large enough, beside the peak of the others, to sum densities."""
+    """Return whether densities are summed: the uniform one is large enough beside the peak of the others."""
     return rand >= _SMALLEST_DENSITY[real] * max(peak, 1.0)
 
 
 def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
-    """The numbers of a mixture in a model's precision, then what rounding took from the first two of them.
+    """Return the numbers of a mixture in a model's precision, then the rounding errors of the first two.
 
     Raises:
-        ValueError: sigma_hit or lambda_short is beyond what the precision can hold.
+        ValueError: sigma_hit or lambda_short is too small or too large for the precision.
     """
     with np.errstate(over="ignore"):
         rounded = np.array(terms).astype(real)
@@ -34,5 +34,5 @@ def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
 
 
 def log_weight(weight: float) -> float:
-    """Logarithm of a mixture weight; -inf for 0."""
+    """Return the logarithm of a mixture weight; -inf for 0."""
     return math.log(weight) if weight > 0 else -math.inf

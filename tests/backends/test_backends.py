@@ -9,7 +9,7 @@ import pytest
 
 import gpusense as gs
 from gpusense import backends
-from gpusense.backends import get_backend
+from gpusense.backends import get_backend, listing, registry, selection
 from gpusense.backends.proof import Verdict
 
 
@@ -19,10 +19,11 @@ def fake_devices(*rows: tuple[str, str, str]) -> list[backends.Device]:
 
 
 def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, Verdict] | None = None) -> None:
-    """Let devices be present, and proved unless a verdict says otherwise."""
-    monkeypatch.setattr(backends, "_present", lambda name: ([d for d in listed if d.backend == name], []))
+    """Let devices be present beside NumPy, and proved unless a verdict says otherwise."""
+    rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
+    monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
     proved = Verdict(True, 1, True, rate=100.0)
-    monkeypatch.setattr(backends, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
+    monkeypatch.setattr(selection, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
 
 
 def test_devices_name_what_is_present_and_what_is_absent():
@@ -34,7 +35,12 @@ def test_devices_name_what_is_present_and_what_is_absent():
 
 
 def test_an_absent_library_is_listed_with_its_remedy(monkeypatch):
-    monkeypatch.setattr(backends, "_module", lambda name: (None, f"py{name} is not installed"))
+    load = registry.load
+    monkeypatch.setattr(
+        registry,
+        "load",
+        lambda entry: load(entry) if entry.name == "numpy" else (None, f"py{entry.name} is not installed"),
+    )
     by_backend = {device.backend: device for device in gs.devices()}
     assert by_backend["opencl"].reason == "pyopencl is not installed: pip install pyopencl pocl-binary-distribution"
     assert by_backend["warp"].reason == "pywarp is not installed: pip install warp-lang"
@@ -55,18 +61,18 @@ def test_an_absent_library_is_listed_with_its_remedy(monkeypatch):
 )
 def test_auto_takes_the_fastest_class_and_never_a_simulator(monkeypatch, present, chosen):
     use_devices(monkeypatch, fake_devices(*present))
-    assert backends._find("auto") == chosen
+    assert selection._find("auto") == chosen
 
 
 def test_a_backend_name_alone_prefers_a_gpu_and_refuses_simulators(monkeypatch):
     rows = [("opencl", "Oclgrind Simulator", "simulator"), ("opencl", "CPU", "cpu"), ("opencl", "GPU", "gpu")]
     use_devices(monkeypatch, fake_devices(*rows))
-    assert backends._find("opencl") == "opencl:2:0"
-    assert backends._find("opencl:oclgrind") == "opencl:0:0"
-    assert backends._find("opencl:1:0") == "opencl:1:0"
+    assert selection._find("opencl") == "opencl:2:0"
+    assert selection._find("opencl:oclgrind") == "opencl:0:0"
+    assert selection._find("opencl:1:0") == "opencl:1:0"
     use_devices(monkeypatch, fake_devices(rows[0]))
     with pytest.raises(ValueError, match="only simulators are present and must be named, got 'opencl'"):
-        backends._find("opencl")
+        selection._find("opencl")
 
 
 def test_a_driver_is_named_like_a_device(monkeypatch):
@@ -74,11 +80,11 @@ def test_a_driver_is_named_like_a_device(monkeypatch):
     rows = [("AMD EPYC", "Portable Computing Language 3.0"), ("AMD EPYC", "Intel(R) OpenCL 2026")]
     own = [backends.Device("opencl", name, "cpu", True, "", f"opencl:{i}:0", d) for i, (name, d) in enumerate(rows)]
     use_devices(monkeypatch, own)
-    assert backends._find("opencl:intel") == "opencl:1:0"
-    assert backends._find("opencl:portable") == backends._find("opencl:PoCL") == "opencl:0:0"
+    assert selection._find("opencl:intel") == "opencl:1:0"
+    assert selection._find("opencl:portable") == selection._find("opencl:PoCL") == "opencl:0:0"
     own[0] = backends.Device("opencl", "Intel Xeon", "cpu", True, "", "opencl:0:0", rows[0][1])
     own[1] = backends.Device("opencl", "Intel Xeon", "cpu", True, "", "opencl:1:0", rows[1][1])
-    assert backends._find("opencl:intel") == "opencl:1:0"
+    assert selection._find("opencl:intel") == "opencl:1:0"
 
 
 def test_of_one_class_the_faster_device_is_taken_if_it_is_noticeably_so(monkeypatch):
@@ -90,45 +96,45 @@ def test_of_one_class_the_faster_device_is_taken_if_it_is_noticeably_so(monkeypa
     ):
         verdicts = {d.selection: Verdict(True, 1, True, rate=rate) for d, rate in zip(rows, rates, strict=True)}
         use_devices(monkeypatch, rows, verdicts)
-        assert backends._find("auto") == backends._find("opencl") == chosen
+        assert selection._find("auto") == selection._find("opencl") == chosen
 
 
 def test_an_unusable_device_is_passed_over_unless_it_is_named(monkeypatch):
     rows = fake_devices(("opencl", "GPU", "gpu"), ("opencl", "CPU", "cpu"), ("warp", "CPU", "cpu"))
     bad = Verdict(False, 1, False, "scalar kernels hang", "update the driver")
     use_devices(monkeypatch, rows, {"opencl:0:0": bad})
-    assert backends._find("auto") == backends._find("opencl") == "opencl:1:0"
-    assert backends._find("opencl:0:0") == backends._find("opencl:GPU") == "opencl:0:0"
+    assert selection._find("auto") == selection._find("opencl") == "opencl:1:0"
+    assert selection._find("opencl:0:0") == selection._find("opencl:GPU") == "opencl:0:0"
     use_devices(monkeypatch, rows, {"opencl:0:0": bad, "opencl:1:0": bad})
-    assert backends._find("auto") == "warp:2:0"
-    assert backends._find("opencl") == "opencl:0:0"
+    assert selection._find("auto") == "warp:2:0"
+    assert selection._find("opencl") == "opencl:0:0"
     use_devices(monkeypatch, rows, dict.fromkeys(("opencl:0:0", "opencl:1:0", "warp:2:0"), bad))
-    assert backends._find("auto") == "numpy"
+    assert selection._find("auto") == "numpy"
 
 
 def test_opening_an_unusable_device_says_why(monkeypatch, needs):
     needs("opencl")
-    selection = next(d.selection for d in gs.devices() if d.backend == "opencl" and d.kind != "simulator")
+    name = next(d.selection for d in gs.devices() if d.backend == "opencl" and d.kind != "simulator")
     bad = Verdict(False, 1, False, "scalar kernels hang: no answer in 60 s", "update the driver")
-    monkeypatch.setattr(backends, "_verdict", lambda *a, **k: bad)
-    backends._open.cache_clear()
+    monkeypatch.setattr(listing, "verdict_on", lambda *a, **k: bad)
+    selection._open.cache_clear()
     try:
         with pytest.raises(
             ValueError, match=r"^backend: .* is unusable: scalar kernels hang.*; update the driver, got"
         ):
-            get_backend(selection)
-        (listed,) = [device for device in gs.devices() if device.selection == selection]
+            get_backend(name)
+        (listed,) = [device for device in gs.devices() if device.selection == name]
         assert not listed.available and listed.reason == "scalar kernels hang: no answer in 60 s; update the driver"
     finally:
-        backends._open.cache_clear()
+        selection._open.cache_clear()
 
 
 def test_a_gpu_of_opencl_is_taken_without_loading_warp(monkeypatch):
     asked = []
     rows = {"opencl": fake_devices(("opencl", "GPU", "gpu")), "warp": fake_devices(("warp", "GPU", "gpu"))}
-    monkeypatch.setattr(backends, "_present", lambda name: (asked.append(name) or rows[name], []))
-    monkeypatch.setattr(backends, "_verdict_of", lambda device: Verdict(True, 1, True))
-    assert backends._find("auto") == "opencl:0:0"
+    monkeypatch.setattr(listing, "present", lambda entry: (asked.append(entry.name) or rows[entry.name], []))
+    monkeypatch.setattr(selection, "_verdict_of", lambda device: Verdict(True, 1, True))
+    assert selection._find("auto") == "opencl:0:0"
     assert asked == ["opencl"]
 
 

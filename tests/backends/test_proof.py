@@ -173,6 +173,51 @@ def test_a_frozen_program_is_not_started(monkeypatch):
     assert not child.can_start()
 
 
+def test_a_system_that_starts_no_child_leaves_devices_usable(monkeypatch, caplog):
+    """It is no failure of the driver, which is trusted in this process; the next one proves it."""
+    monkeypatch.setattr(sys, "executable", "/nowhere/python3")
+    for _ in range(2):
+        assert verdict_on(INFO) == proof.trust(INFO)
+    (line,) = caplog.messages
+    assert "opencl:0:0 (Some device, Driver 1) is trusted without a proof: no child process can be started: " in line
+    assert caplog.records[0].levelname == "WARNING"
+    assert proof._load(proof._key(INFO)) is None
+
+
+def test_no_room_for_the_output_of_a_child_is_no_failure_of_a_driver(monkeypatch, caplog):
+    def full(*arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(child.tempfile, "TemporaryFile", full)
+    assert verdict_on(INFO) == proof.trust(INFO)
+    assert "no child process can be started: [Errno 28] No space left on device" in caplog.messages[-1]
+
+
+def test_settings_that_failed_before_the_last_child_stay_off(monkeypatch, caplog):
+    outcomes = iter([Outcome([{"begin": VECTORS}], ABORT), Outcome([], "no child", conclusive=False, started=False)])
+    monkeypatch.setattr(child, "run", lambda job: next(outcomes))
+    verdict = verdict_on(INFO)
+    assert (verdict.usable, verdict.lanes) == (True, 8) and "kernels in vectors of 16 end the process" in verdict.reason
+
+
+def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog):
+    """Unless a program with an interpreter has proved them."""
+    caplog.set_level("INFO")
+    tried = driver({(VECTORS, 16): ABORT})
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    for _ in range(2):
+        assert verdict_on(INFO, anew=True) == proof.trust(INFO)
+    (record,) = caplog.records
+    assert record.levelname == "INFO" and "is trusted without a proof: a frozen program has no" in record.getMessage()
+    monkeypatch.delattr(sys, "frozen")
+    proof._known.clear()
+    proved = verdict_on(INFO)
+    assert proved.lanes == 8 and len(tried) == 2
+    proof._known.clear()
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    assert verdict_on(INFO, anew=True) == proved and len(tried) == 2
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon"])
 def test_the_time_limit_is_a_number_of_seconds(monkeypatch, text):
     monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", text)

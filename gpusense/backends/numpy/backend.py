@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import importlib
-import os
 from typing import Any
 
 import numpy as np
 
 from gpusense.backends.base import Backend, BackendInfo, Launcher
+from gpusense.backends.processor import host_memory
 from gpusense.interface.signatures import KERNELS
 
 
-def _memory() -> int:
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):
-        return 4 << 30
+def describe() -> BackendInfo:
+    """Return the host as a model sees it."""
+    memory = host_memory()
+    return BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
 
 
 class NumpyBackend(Backend):
     """Runs the reference kernels on the host."""
 
-    def __init__(self) -> None:
-        memory = _memory()
-        self.info = BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
+    def __init__(self, info: BackendInfo | None = None) -> None:
+        self.info = describe() if info is None else info
 
     def upload(self, array: np.ndarray, out: np.ndarray | None = None, *, wait: bool = True) -> np.ndarray:
         """See Backend.upload."""

@@ -1,4 +1,4 @@
-"""Arrays of pyopencl in a device's memory: taken as they are, and made of results."""
+"""Arrays of pyopencl in a device's memory: as inputs without a copy, and as results."""
 
 from __future__ import annotations
 
@@ -12,31 +12,33 @@ import pyopencl.array
 from gpusense._util.checks import show
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.opencl.memory import driver_errors
-from gpusense.backends.opencl.replay import is_unordered
 
 
-def queue_of(given: object) -> cl.CommandQueue:
-    """A user's queue, checked.
+def check_in_order(queue: cl.CommandQueue, name: str) -> None:
+    """Refuse a queue that is not an in-order queue.
 
     Raises:
-        ValueError: its commands may be done in another order than theirs.
+        ValueError: its commands may run in another order than they were queued.
     """
-    assert isinstance(given, cl.CommandQueue)
-    if is_unordered(given):
-        raise ValueError("backend: must be a queue that does commands in their order, got one that does not")
-    return given
+    if queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
+        raise ValueError(f"{name}: must be a queue that does commands in their order, got one that does not")
+
+
+def is_array(candidate: object) -> bool:
+    """Return whether an object is an array of pyopencl."""
+    return isinstance(candidate, pyopencl.array.Array)
 
 
 def alignment_of(device: cl.Device) -> int:
-    """Parts of buffers begin at multiples of so many bytes."""
+    """Return the number of bytes at whose multiples parts of buffers begin."""
     return max(int(device.mem_base_addr_align) // 8, 1)
 
 
 def part_of(buffer: cl.Buffer, first: int, size: int, alignment: int) -> cl.Buffer:
-    """Some bytes of a buffer.
+    """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy.
 
     Raises:
-        ValueError: the device cannot begin there.
+        ValueError: parts cannot begin at this byte.
     """
     if first == 0 or size == 0:
         return buffer
@@ -53,13 +55,13 @@ def part_of(buffer: cl.Buffer, first: int, size: int, alignment: int) -> cl.Buff
 
 
 def _plain(buffer: Any) -> Any:
-    """A buffer of a memory pool, which its array keeps, as any other; an empty array has none."""
-    known = buffer is None or isinstance(buffer, cl.Buffer)
-    return buffer if known else cl.Buffer.from_int_ptr(buffer.int_ptr, retain=True)
+    """Return a buffer of a memory pool, which its array keeps alive, as a plain one; an empty array has none."""
+    is_plain = buffer is None or isinstance(buffer, cl.Buffer)
+    return buffer if is_plain else cl.Buffer.from_int_ptr(buffer.int_ptr, retain=True)
 
 
 def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in_place: bool) -> Adopted:
-    """See Sharing.adopt. What another queue was given to do with the array is waited for."""
+    """See Backend.adopt. The commands of another queue on the array are waited for."""
     if array.context != queue.context:
         raise TypeError(
             f"{name}: must be of the context of {selection}'s queue, got an array of another: make the model with "
@@ -86,20 +88,20 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
             with driver_errors():
                 array = array.copy(queue=queue)
         buffer = part_of(_plain(array.base_data), array.offset, array.nbytes, alignment)
-    held = array
+    source = array
 
     def to_host() -> np.ndarray:
         with driver_errors():
             if contiguous:
-                return np.asarray(held.get(queue=queue))
-            whole = _plain(held.base_data)
+                return np.asarray(source.get(queue=queue))
+            whole = _plain(source.base_data)
             numbers = np.empty(whole.size, np.uint8)
             cl.enqueue_copy(queue, numbers, whole)
-        return np.ndarray(held.shape, held.dtype, numbers, held.offset, held.strides).copy()
+        return np.ndarray(source.shape, source.dtype, numbers, source.offset, source.strides).copy()
 
     return Adopted(buffer, tuple(map(int, array.shape)), array.dtype, tuple(array.strides), contiguous, to_host, array)
 
 
 def lent(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], dtype: np.dtype) -> pyopencl.array.Array:
-    """See Sharing.lend."""
+    """See Backend.lend."""
     return pyopencl.array.Array(queue, shape, dtype, data=buffer if math.prod(shape) else None)

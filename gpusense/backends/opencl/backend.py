@@ -7,7 +7,6 @@ import functools
 import re
 import threading
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,36 +16,27 @@ from gpusense.backends.base import Adopted, Backend, BackendInfo, Buffer, Proces
 from gpusense.backends.cache import ProgramCache
 from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
-from gpusense.backends.opencl.devices import (
-    absent_drivers,
-    info_of,
-    list_devices,
-    shares_memory,
-    trouble_of,
-)
-from gpusense.backends.opencl.drivers import as_job as drivers_as_job
+from gpusense.backends.opencl.devices import shares_memory
 from gpusense.backends.opencl.launch import Launch
 from gpusense.backends.opencl.memory import DeviceBuffer, SharedBuffer, driver_errors
-from gpusense.backends.opencl.replay import Repeated
+from gpusense.backends.opencl.replay import OpenCLRecording
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant, uses_double, with_places
 
-__all__ = ["OpenCLBackend", "absent_drivers", "backend_of", "drivers_as_job", "info_of", "list_devices", "trouble_of"]
-
-# One driver's own clearing hangs beyond 2 GiB.
+# The fill command of one driver hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
-# Bytes of copies to a GPU that take NVIDIA's driver nearly twice as long where they are not waited for.
+# NVIDIA's driver takes nearly twice as long over copies to a GPU between these sizes [bytes] if they do not block.
 _SLOW = (64 << 10, 256 << 10)
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
 def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
-    """Return where programs are kept; None for PoCL, whose kernels are kept one by one.
+    """Return the cache of programs; None for PoCL, whose kernels are kept one by one.
 
-    Asked for a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size. That
-    takes three times as long as all it does unasked.
+    For a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size, which takes
+    three times as long as everything else.
     """
     return None if pocl.is_pocl(device) else ProgramCache(info)
 
@@ -54,8 +44,8 @@ def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
 class OpenCLBackend(ProcessBound, Backend):
     """One OpenCL device: a context, an in-order queue and the programs compiled for it.
 
-    A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, copies are
-    NumPy's instead: they wait for all commands before them, and are done when they return.
+    A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, NumPy
+    copies instead: it waits for all commands before the copy, which has ended when it returns.
     """
 
     def __init__(self, info: BackendInfo, device: cl.Device, queue: cl.CommandQueue | None = None) -> None:
@@ -67,26 +57,27 @@ class OpenCLBackend(ProcessBound, Backend):
         self._context = cl.Context([device]) if queue is None else queue.context
         self._queue = cl.CommandQueue(self._context) if queue is None else queue
         self._shared = shares_memory(device)
-        # Commands that were queued, and how many of these are known to have ended. Garbage may be collected anywhere.
+        # Numbers of commands that were queued, and that are known to have ended. Garbage may be collected anywhere.
         self._count = threading.RLock()
         self._queued = self._ended = 0
         self.alignment = arrays.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
-        self._programs: dict[tuple[str, frozenset[str]], cl.Program] = {}
+        # Each with the key of its entry in the cache.
+        self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
         self._keys = ProgramCache(info)
         self._cache = _program_cache(info, device)
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
-        # Ranges are the same bits everywhere only if division is rounded correctly; GPUs must be asked for it.
+        # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
         if self._pocl is not None:
-            # PoCL writes the number of warnings to the terminal. It tells kernels apart by their options, not by the
-            # processor they are for.
+            # PoCL writes the number of warnings to the terminal. Its hash of a kernel has the options in it, not the
+            # processor.
             self.options += ["-w", f"-DTARGET_{re.sub(r'[^a-z0-9]', '_', info.target)}"]
 
     @property
     def queue(self) -> cl.CommandQueue:
-        """Where commands go: arrays of pyopencl that are made with it stay where they are."""
+        """The in-order queue of all commands; arrays of pyopencl that are made with it are used in place."""
         return self._queue
 
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
@@ -120,12 +111,18 @@ class OpenCLBackend(ProcessBound, Backend):
         return buffer
 
     def _check_size(self, size: int) -> None:
+        """Refuse a buffer that is larger than the device's largest.
+
+        Raises:
+            MemoryError: it is.
+        """
         if size > self.info.max_buffer:
             raise MemoryError(
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
             )
 
     def _clear(self, buffer: cl.Buffer, size: int) -> None:
+        """Queue the clearing of a buffer of ``size`` bytes."""
         if size <= 4 * _CLEARED_WORDS:
             cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
             return
@@ -150,12 +147,16 @@ class OpenCLBackend(ProcessBound, Backend):
         size = np.dtype(dtype).itemsize
         return arrays.part_of(buffer, first * size, count * size, self.alignment)
 
+    def reads(self, array: object) -> bool:
+        """See Backend.reads."""
+        return arrays.is_array(array)
+
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
         """See Backend.adopt."""
         return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """See Backend.blank; not memory that is shared, of which arrays may not outlive the backend's launches."""
+        """See Backend.blank; arrays of shared memory could not outlive the backend's launches."""
         size = max(count, 1) * np.dtype(dtype).itemsize
         self._check_size(size)
         with driver_errors():
@@ -181,10 +182,10 @@ class OpenCLBackend(ProcessBound, Backend):
         """See Backend.replays."""
         return self.info.kind == "gpu"
 
-    def record(self, program: Program) -> Repeated:
+    def record(self, program: Program) -> OpenCLRecording:
         """See Backend.record."""
         launches = [self.compile(one.kernel, one.flags).bind(one.size, one.arguments) for one in program]
-        return Repeated(self._queue, launches, self._counted)
+        return OpenCLRecording(self._queue, launches, self._counted)
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch:
         """See Backend.compile."""
@@ -206,7 +207,7 @@ class OpenCLBackend(ProcessBound, Backend):
             self._pocl.save()
 
     def _settle(self) -> None:
-        """Wait until no command of this thread can be under way."""
+        """Wait until every command has ended that this thread may have queued."""
         if self._ended != self._queued:
             self.synchronize()
 
@@ -216,37 +217,37 @@ class OpenCLBackend(ProcessBound, Backend):
         self._counted(1)
 
     def _counted(self, launches: int) -> None:
+        """Count queued launches."""
         with self._count:
             self._queued += launches
 
     def _launcher(self, kernel: str, flags: frozenset[str]) -> Launch:
+        """Return a kernel of a program that is built where that has not happened yet."""
         row = KERNELS[kernel]
         flags = relevant(row.file, flags)
-        program = self._programs.get((row.file, flags))
-        if program is None:
-            program = self._programs[row.file, flags] = self._build(row.file, flags)
-        return Launch(self, new_kernel(program, kernel), row, flags, self._kernel_runs(row.file, flags))
+        if (row.file, flags) not in self._programs:
+            self._programs[row.file, flags] = self._build(row.file, flags)
+        program, key = self._programs[row.file, flags]
+        first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
+        return Launch(self, new_kernel(program, kernel), row, flags, first)
 
-    def _kernel_runs(self, file: str, flags: frozenset[str]) -> Callable[[], None] | None:
-        """Return what is to be called when a kernel of a program is launched for the first time."""
-        if self._pocl is None:
-            return None
-        return functools.partial(self._pocl.mark, self._program_key(assemble(file, flags)))
+    def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
+        """Build the program of a kernel file; return it with its key in the cache.
 
-    def _program_key(self, source: str) -> str:
-        return self._keys.key(source, self.options)
-
-    def _build(self, file: str, flags: frozenset[str]) -> cl.Program:
+        Raises:
+            ValueError: the device lacks float64 and the program needs it.
+            RuntimeError: the driver does not compile it.
+        """
         if "FLOAT64" in flags and not self.info.float64:
             raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
         if not self.info.float64 and uses_double(file, flags):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
+        key = self._keys.key(source, self.options)
         if (program := self._kept(source)) is not None:
-            return program
-        kept = contextlib.nullcontext() if self._pocl is None else self._pocl.building(self._program_key(source))
+            return program, key
         try:
-            with kept:
+            with contextlib.nullcontext() if self._pocl is None else self._pocl.building(key):
                 program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
             log = with_places(str(error), source)
@@ -255,10 +256,10 @@ class OpenCLBackend(ProcessBound, Backend):
             binaries: Any = program.get_info(cl.program_info.BINARIES)
             devices: Any = program.get_info(cl.program_info.DEVICES)
             self._cache.store(source, self.options, binaries[devices.index(self._device)])
-        return program
+        return program, key
 
     def _kept(self, source: str) -> cl.Program | None:
-        """The program as an earlier run compiled it, where there is one that the driver still takes."""
+        """Return the program as an earlier run compiled it; None where there is none that the driver accepts."""
         binary = None if self._cache is None else self._cache.load(source, self.options)
         if self._cache is None or binary is None:
             return None
@@ -269,16 +270,8 @@ class OpenCLBackend(ProcessBound, Backend):
             return None
 
     def _built(self, program: cl.Program) -> cl.Program:
+        """Compile a program, or load its binary."""
         with warnings.catch_warnings(), without_caches():
             # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
             warnings.simplefilter("ignore", cl.CompilerWarning)
             return program.build(self.options, [self._device])
-
-
-def backend_of(queue: cl.CommandQueue, info: BackendInfo) -> OpenCLBackend:
-    """Return a backend that works on a user's queue, and so on the arrays that were made with it.
-
-    Raises:
-        ValueError: the queue does not do commands in their order.
-    """
-    return OpenCLBackend(info, queue.device, arrays.queue_of(queue))

@@ -1,4 +1,4 @@
-"""pyopencl's own caches, which are left out: a folder that cannot be written, or a damaged file there, ends the run.
+"""pyopencl's caches, which are switched off: a folder that cannot be written, or a damaged file, ends the run.
 
 pyopencl keeps code that sets kernels' arguments in a database, and programs in files, both without checksums. Programs
 are kept by :mod:`gpusense.backends.cache`, and that code is made in a millisecond.
@@ -17,7 +17,7 @@ from typing import Any
 
 import pyopencl as cl
 
-# Whether pyopencl's caches are off; it has no other way to switch them off once it is imported.
+# Whether pyopencl's caches are off; once it is imported it has no other switch.
 _SWITCH = "_PYOPENCL_NO_CACHE"
 _lock = threading.RLock()
 
@@ -26,7 +26,7 @@ def _open_database() -> None:
     """Import the module that opens the database; where that fails the caches are off for the whole process."""
     if getattr(cl, _SWITCH, True):
         return
-    # What could not be made whole says so again when it is collected.
+    # An object whose construction failed reports that again when it is collected.
     hook, sys.unraisablehook = sys.unraisablehook, lambda *_: None
     try:
         importlib.import_module("pyopencl.invoker")
@@ -49,7 +49,7 @@ def new_kernel(program: Any, name: str) -> cl.Kernel:
 
 @contextlib.contextmanager
 def without_caches() -> Iterator[None]:
-    """Switch pyopencl's caches off, and back on."""
+    """Switch pyopencl's caches off, and restore them on leaving."""
     with _lock:
         before = getattr(cl, _SWITCH, None)
         if before is None:

@@ -1,4 +1,4 @@
-"""OpenCL devices of this machine, and what a backend must know of them."""
+"""OpenCL devices of this machine, and their properties that a backend needs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from gpusense.backends.opencl import drivers, pocl, pocl_kernels
 
 
 def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
-    """All OpenCL devices of this machine, simulators included, in the order of the platforms."""
-    found = []
+    """Return all OpenCL devices of this machine, simulators included, in the order of the platforms."""
+    listed = []
     try:
         platforms = drivers.platforms()
     except RuntimeError:
@@ -20,11 +20,12 @@ def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
             devices = platform.get_devices()
         except cl.Error:
             continue
-        found += [(_describe(f"opencl:{p}:{d}", device), device) for d, device in enumerate(devices)]
-    return found
+        listed += [(_describe(f"opencl:{p}:{d}", device), device) for d, device in enumerate(devices)]
+    return listed
 
 
 def _describe(selection: str, device: cl.Device) -> BackendInfo:
+    """Return a device as a model sees it."""
     return BackendInfo(
         selection=selection,
         backend="opencl",
@@ -40,7 +41,7 @@ def _describe(selection: str, device: cl.Device) -> BackendInfo:
 
 
 def trouble_of(device: cl.Device) -> str:
-    """Return why no kernel can be compiled for a device, where that is known beforehand; else an empty text."""
+    """Return why no kernel can be compiled for a device, where that is known without a proof; else an empty text."""
     if not pocl.is_pocl(device):
         return ""
     if absent := pocl.lacking_for(device):
@@ -59,16 +60,16 @@ def absent_drivers() -> list[tuple[str, str]]:
 
 
 def info_of(device: cl.Device) -> BackendInfo:
-    """A device as a model sees it; a part of one is told by its name alone."""
+    """Return a device as a model sees it; the selection of a part of a device is its name."""
     listed = (info for info, other in list_devices() if other == device)
     return next(listed, None) or _describe(f"opencl:{device.name.strip()}", device)
 
 
 def _lanes(device: cl.Device) -> int:
-    """Lanes of kernels that have bodies in vectors.
+    """Return the lanes of kernels that have bodies in vectors.
 
     PoCL compiles loops in kernels as they are written. Intel's driver makes vectors of neighbouring work-items, but
-    explicit ones were up to three times as fast there, too. Other drivers for processors were not measured.
+    kernels in vectors were up to three times as fast there. Other drivers for processors were not measured.
     """
     known = pocl.is_pocl(device) or device.platform.name.startswith("Intel")
     if not known or not device.type & cl.device_type.CPU:
@@ -77,7 +78,7 @@ def _lanes(device: cl.Device) -> int:
 
 
 def shares_memory(device: cl.Device) -> bool:
-    """Whether host and device may look at the same memory between commands, and neither is far from it: a processor."""
+    """Return whether host and device may access the same memory between commands, and both are near it."""
     try:
         if not device.type & cl.device_type.CPU or not device.host_unified_memory:
             return False

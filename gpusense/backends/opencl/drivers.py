@@ -1,4 +1,4 @@
-"""OpenCL drivers of this machine: which of them the loader gets to load, and with which folders.
+"""The OpenCL drivers of this machine that the loader loads, and their folders.
 
 A driver is a library that an ``.icd`` file names. The loader inside pyopencl's wheel reads the system's files,
 ``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``, and those beside pyopencl, where PoCL's wheel has its own. It loads all
@@ -6,15 +6,14 @@ drivers when it is asked for the first time, so a driver that dies at that point
 wanted. Hence a child loads them first, and a driver that it does not survive is left out.
 
 Intel's runtime for processors comes as a wheel too, but its ``.icd`` file names a folder that exists on no user's
-machine. One of our own takes its place: the variable is extended by a folder that holds this file and the system's,
-before the loader is asked, and is as it was afterwards. Loading the library by its path would need a loader of our own;
-writing beside pyopencl would change files that another package owns.
+machine. A new ``.icd`` file takes its place: while the loader loads, the variable names a folder with this file and the
+system's. Loading the library by its path would need another loader; writing beside pyopencl would change files that
+another package owns.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.metadata
 import json
 import logging
@@ -30,14 +29,14 @@ import pyopencl as cl
 
 from gpusense._version import __version__
 from gpusense.backends import child
-from gpusense.backends.cache import load_entry, store_entry
+from gpusense.backends.cache import discard_entry, load_entry, store_entry
 from gpusense.backends.opencl import pocl_kernels
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
 _SYSTEM = "/etc/OpenCL/vendors"
 _INTEL = ("intel-opencl-rt", "libintelocl.so")
-# Asks the loader for all devices. It is all that the child runs, so that it starts in some 20 ms.
+# Asks the loader for all devices. The child runs nothing else, so that it starts in some 20 ms.
 _LOAD = """
 import ctypes, json, sys
 loader = ctypes.CDLL(json.loads(sys.stdin.readline())["loader"])
@@ -58,7 +57,7 @@ class Driver:
 
     Attributes:
         file: The file; Intel's library itself where the file is made here.
-        library: What the loader is to load.
+        library: The library that the loader loads.
     """
 
     file: Path
@@ -67,10 +66,10 @@ class Driver:
 
 @dataclass(frozen=True)
 class Choice:
-    """The drivers that the loader is given.
+    """The drivers that the loader loads.
 
     Attributes:
-        drivers: The drivers, where they are not those that it finds by itself; else None.
+        drivers: The drivers, where the loader does not find them by itself; else None.
         left_out: Drivers that end the process, with the reason.
         failure: Why none can be loaded; empty where some can.
     """
@@ -81,9 +80,9 @@ class Choice:
 
 
 _lock = threading.RLock()
+# The choice of this process: a parent's, or that of a trial. Once drivers are loaded it does not change.
+_choice: Choice | None = None
 _loaded = False
-# What a parent has named.
-_taken: Choice | None = None
 
 
 def platforms() -> list[cl.Platform]:
@@ -96,10 +95,10 @@ def platforms() -> list[cl.Platform]:
     with _lock:
         if _loaded:
             return _ask()
-        found = choice()
-        if found.failure:
-            raise RuntimeError(f"OpenCL's drivers {found.failure}")
-        with _environment(_variables(found.drivers)):
+        chosen = choice()
+        if chosen.failure:
+            raise RuntimeError(f"OpenCL's drivers {chosen.failure}")
+        with _environment(_variables(chosen.drivers)):
             listed = _ask()
             # PoCL reads its variables when it is first asked for devices.
             for platform in listed:
@@ -110,6 +109,7 @@ def platforms() -> list[cl.Platform]:
 
 
 def _ask() -> list[cl.Platform]:
+    """Return the platforms of the loaded drivers; none where there is no driver."""
     try:
         return list(cl.get_platforms())
     except cl.LogicError:
@@ -117,12 +117,25 @@ def _ask() -> list[cl.Platform]:
 
 
 def choice() -> Choice:
-    """Return which drivers the loader is given: those that a child has loaded before, or a parent has named."""
-    return _chosen() if _taken is None else _taken
+    """Return the drivers that the loader loads: a child has loaded them before, or a parent has named them."""
+    global _choice
+    with _lock:
+        if _choice is None:
+            _choice = _chosen()
+        return _choice
 
 
-@functools.cache
-def _chosen() -> Choice:
+def renew() -> None:
+    """Load all drivers in a child again, whatever its kept verdict; a process that has loaded drivers keeps them."""
+    global _choice
+    with _lock:
+        chosen = _chosen(anew=True)
+        if not _loaded:
+            _choice = chosen
+
+
+def _chosen(*, anew: bool = False) -> Choice:
+    """Return the choice by the kept verdict, or by a child's where there is none or it is made ``anew``."""
     present = _registered()
     intel = _intel(present)
     drivers = (*present, intel) if intel is not None else tuple(present)
@@ -130,44 +143,50 @@ def _chosen() -> Choice:
     if not child.can_start() or not _loader():
         return Choice(wanted)
     key = _key(drivers)
-    kept = load_entry(key)
-    if kept is None:
-        found, conclusive = _tried(drivers, wanted)
+    if anew:
+        discard_entry(key)
+    payload = load_entry(key)
+    if payload is None:
+        chosen, conclusive = _tried(drivers, wanted)
         if conclusive:
-            store_entry(key, json.dumps({"left_out": found.left_out, "failure": found.failure}).encode())
-        for name, reason in found.left_out:
+            store_entry(key, json.dumps({"left_out": chosen.left_out, "failure": chosen.failure}).encode())
+        for name, reason in chosen.left_out:
             _LOG.warning("gpusense: the OpenCL driver %s is left out: it %s", name, reason)
-        return found
-    known = json.loads(kept)
-    left_out = tuple((name, reason) for name, reason in known["left_out"])
-    return Choice(_without(drivers, left_out) if left_out else wanted, left_out, known["failure"])
+        return chosen
+    verdict = json.loads(payload)
+    left_out = tuple((name, reason) for name, reason in verdict["left_out"])
+    return Choice(_without(drivers, left_out) if left_out else wanted, left_out, verdict["failure"])
 
 
 def as_job() -> list[tuple[str, str]] | None:
-    """Return the drivers that this process loads, for a child that is to load the same ones."""
+    """Return the drivers that this process loads, for a child that loads the same ones."""
     drivers = choice().drivers
     return None if drivers is None else [(str(driver.file), driver.library) for driver in drivers]
 
 
 def take(job: list[tuple[str, str]] | None) -> None:
     """Load the drivers of :func:`as_job` in this process, which is a child."""
-    global _taken
-    _taken = Choice(None if job is None else tuple(Driver(Path(file), library) for file, library in job))
+    global _choice
+    _choice = Choice(None if job is None else tuple(Driver(Path(file), library) for file, library in job))
 
 
 def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tuple[Choice, bool]:
-    """Load all drivers in a child, and where it dies each alone; also whether the verdict is worth keeping."""
+    """Load all drivers in a child, and where it dies each alone.
+
+    Returns:
+        The choice, and whether it is to be kept.
+    """
     together = _try(wanted)
     if not together.failure or not together.conclusive:
-        # A child that was not started, or was killed from outside, says nothing against a driver.
+        # A child that was not started, or was killed from outside, is no failure of a driver.
         return Choice(wanted), together.conclusive
     alone = [(str(driver.file), outcome) for driver in drivers if (outcome := _try((driver,))).failure]
     left_out = tuple((name, outcome.failure) for name, outcome in alone)
     conclusive = together.conclusive and all(outcome.conclusive for _, outcome in alone)
-    kept = _without(drivers, left_out)
-    if not left_out or (kept and _try(kept).failure):
+    others = _without(drivers, left_out)
+    if not left_out or (others and _try(others).failure):
         return Choice(None, (), f"cannot be loaded together: {together.failure}"), conclusive
-    return Choice(kept, left_out), conclusive
+    return Choice(others, left_out), conclusive
 
 
 def _try(drivers: tuple[Driver, ...] | None) -> child.Outcome:
@@ -187,11 +206,13 @@ def _loader() -> str:
 
 
 def _without(drivers: tuple[Driver, ...], left_out: tuple[tuple[str, str], ...]) -> tuple[Driver, ...]:
+    """Return the drivers that are not left out."""
     names = {name for name, _ in left_out}
     return tuple(driver for driver in drivers if str(driver.file) not in names)
 
 
 def _key(drivers: tuple[Driver, ...]) -> str:
+    """Return the key of the verdict: drivers, their files, and everything else that decides how they load."""
     parts = ["drivers", __version__, cl.VERSION_TEXT, fingerprint()]
     parts += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(("OCL_", "OPENCL_"))]
     for driver in drivers:
@@ -208,9 +229,9 @@ def _registered() -> list[Driver]:
     if place.is_file():
         # A single file or library stands for all drivers.
         return [Driver(place, _library(place) if place.suffix == ".icd" else str(place))]
-    found = [Driver(file, _library(file)) for file in sorted(place.glob("*.icd"))]
-    found += [Driver(file, _library(file)) for file in sorted(beside.glob("*.icd"))]
-    return [driver for driver in found if driver.library]
+    files = [*sorted(place.glob("*.icd")), *sorted(beside.glob("*.icd"))]
+    drivers = [Driver(file, _library(file)) for file in files]
+    return [driver for driver in drivers if driver.library]
 
 
 def _place() -> Path:
@@ -244,29 +265,29 @@ def _intel(present: list[Driver]) -> Driver | None:
 
 
 def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> dict[str, str]:
-    """Return variables with which the loader loads just these drivers, and PoCL keeps kernels in this process's folder.
+    """Return the variables by which the loader loads these drivers only, and PoCL keeps kernels in scratch.
 
     Raises:
         OSError: no folder takes files.
     """
-    found = {}
+    variables = {}
     with contextlib.suppress(OSError):
-        found["POCL_CACHE_DIR"] = str(pocl_kernels.pocl_kernels().folder if kernels else scratch_folder() / "try")
+        variables["POCL_CACHE_DIR"] = str(pocl_kernels.pocl_kernels().folder if kernels else scratch_folder() / "try")
     if drivers is None:
-        return found
+        return variables
     names = "-".join(f"{i}{driver.file.stem}" for i, driver in enumerate(drivers)) or "none"
     folder = scratch_folder() / "vendors" / re.sub(r"\W", "_", names)[:100]
     folder.mkdir(parents=True, exist_ok=True)
     for i, driver in enumerate(drivers):
-        # The loader goes by the folder's own order, which is of no use; a number tells files of one name apart.
+        # The loader takes files in the order of the folder. The number keeps files of one name apart.
         (folder / f"{i}-{driver.file.stem}.icd").write_text(driver.library + "\n", encoding="utf-8")
-    # Below a folder without ``.libs`` the loader finds nothing beside pyopencl; those drivers are in ours.
-    return found | {"OCL_ICD_VENDORS": str(folder), "PYOPENCL_HOME": str(folder)}
+    # With this home the loader finds nothing beside pyopencl; those drivers are in the folder too.
+    return variables | {"OCL_ICD_VENDORS": str(folder), "PYOPENCL_HOME": str(folder)}
 
 
 @contextlib.contextmanager
 def _environment(variables: dict[str, str]) -> Iterator[None]:
-    """Set variables, and set them back."""
+    """Set variables, and restore them on leaving."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

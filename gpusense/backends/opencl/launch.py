@@ -1,4 +1,4 @@
-"""Launches of one OpenCL kernel: arguments bound by the signature table."""
+"""Launches of one OpenCL kernel: arguments are bound by the signature table."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Enqueuer(Protocol):
 
 
 class Launch:
-    """Binds arguments by the signature table and enqueues."""
+    """A kernel that binds arguments by the signature table and queues its launch."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class Launch:
             self._lanes, self._group = (lanes_of(flags) if row.wide else 1), row.wide_group
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
-        # With types set, pyopencl sets all arguments in 1 us; without, a single number takes 6 us.
+        # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.
         self._types = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
         with without_caches():
             kernel.set_arg_types(self._types)
@@ -49,13 +49,13 @@ class Launch:
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         """See Launcher.__call__."""
         self._before_first()
-        # Arguments belong to the kernel object, so two threads must not interleave here.
+        # Arguments belong to the kernel object, so two threads must not interleave.
         with self._lock, driver_errors():
             self._kernel.set_args(*arguments)
             self._backend.enqueue(self._kernel, *self._sizes(size))
 
     def bind(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> BoundLaunch:
-        """Set arguments of a kernel object of its own, and start nothing."""
+        """Set the arguments of a new kernel object, and start nothing."""
         self._before_first()
         kernel = new_kernel(self._kernel.program, self._kernel.function_name)
         with without_caches():
@@ -64,6 +64,7 @@ class Launch:
         return BoundLaunch(kernel, *self._sizes(size), arguments)
 
     def _before_first(self) -> None:
+        """Call back before the first launch."""
         if self._first is not None:
             self._first()
             self._first = None

@@ -1,4 +1,4 @@
-"""Memory of an OpenCL device, and what its driver says where something fails."""
+"""Memory of an OpenCL device, and the errors of its driver."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pyopencl as cl
 
 _LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
 _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
-# Bytes: a cache line, and more than any type of a kernel asks for.
+# Bytes: a cache line, and at least the alignment of each type of a kernel.
 _ALIGNMENT = 128
 
 
@@ -24,20 +24,19 @@ class SharedBuffer(cl.SVMAllocation):
     def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
         flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
         super().__init__(context, size, _ALIGNMENT, flags)
-        # By address, since a view of this object that it keeps would be a cycle.
+        # By address: an attribute that is a view of this object would be a cycle.
         self.bytes = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
         self._settle = settle
 
     def __del__(self) -> None:
-        # Unlike a buffer, the driver does not keep it for what was started. To free it through the queue, pyopencl's
-        # other way, ended in a corrupted heap with PoCL 3.
-        # What could not be made has nothing to wait for.
+        # The driver does not keep it alive for queued commands, as it does a buffer. Freed through the queue, as
+        # pyopencl can also do, it ended in a corrupted heap with PoCL 3. Without an allocation there is no attribute.
         if (settle := getattr(self, "_settle", None)) is not None:
             settle()
 
 
 class driver_errors:
-    """Turns the driver's codes into MemoryError, or a RuntimeError that says the device is gone."""
+    """Context in which the driver's codes become MemoryError, or RuntimeError where the device is gone."""
 
     def __enter__(self) -> None:
         return None

@@ -4,11 +4,12 @@ PoCL has its library of OpenCL functions compiled for several processors, and ta
 the machine has. Before version 5 it compiles kernels for the processor that LLVM names instead, and the two need not
 fit: to LLVM 14 a Zen 4 is a ``znver3``, without the AVX-512 of the library, and a Zen 5 is ``generic``, which is no
 processor at all (pocl issue 1049). Vectors are then passed in other registers than the callee expects, and the compiler
-aborts the process. Version 5 compiles kernels for the processor that its library was compiled for, which always fits.
-For older versions the same is done here.
+aborts the process. Version 5 compiles kernels for the processor of its library, which always fits. This module does the
+same for older versions.
 
 They have no setting for it: the environment variable POCL_LLVM_CPU_NAME came with version 5 too, options of the build
-are checked against a list, and the device's own name overrules them. So the name is replaced where PoCL keeps it.
+are checked against a list, and the name of the device's processor overrules them. So that name is replaced in PoCL's
+memory.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Library(NamedTuple):
-    """A library of PoCL's.
+    """A library of OpenCL functions in PoCL.
 
     Attributes:
         name: The end of its file's name.
@@ -47,7 +48,7 @@ def _sets(words: str) -> frozenset[str]:
     return frozenset(words.split())
 
 
-# PoCL takes the last one of which a processor has all that it needs (getX86KernelLibName in PoCL 3).
+# PoCL takes the last one whose needs a processor meets (getX86KernelLibName in PoCL 3).
 LIBRARIES = (
     Library("sse2", _sets(""), "x86-64"),
     Library("ssse3", _sets("ssse3 cx16"), "core2"),
@@ -63,15 +64,15 @@ LIBRARIES = (
         _sets("avx2 fma f16c abm bmi1 bmi2 avx512bw avx512cd avx512dq avx512vl"),
     ),
 )
-# The words of a device's description in which its names are looked for.
+# Words of a device's description that are searched for names, and the longest name.
 _WORDS = 256
 _NAME = 24
-# The first version that chooses the processor by its library.
+# The first version that compiles for the processor of its library.
 _FITTING = (5, 0)
 
 
 def is_pocl(device: cl.Device) -> bool:
-    """Return whether a device is one of PoCL's."""
+    """Return whether PoCL is a device's driver."""
     return "Portable Computing Language" in device.platform.name
 
 
@@ -117,11 +118,11 @@ def fit_target(device: cl.Device) -> str | None:
 def _flags(device: cl.Device) -> frozenset[str]:
     """Return the processor's instruction sets as PoCL sees them.
 
-    The width of its vectors says whether LLVM found AVX and AVX-512, which Linux may list otherwise.
+    The width of its vectors follows from LLVM's list, in which AVX and AVX-512 may differ from Linux's.
     """
     width = device.native_vector_width_float
-    found = frozenset(name for name, needed in (("avx", 8), ("avx512f", 16)) if width >= needed)
-    return instruction_sets() - {"avx", "avx512f"} | found
+    wide = frozenset(name for name, needed in (("avx", 8), ("avx512f", 16)) if width >= needed)
+    return instruction_sets() - {"avx", "avx512f"} | wide
 
 
 def _is_misfit(device: cl.Device) -> bool:
@@ -133,9 +134,9 @@ def _is_misfit(device: cl.Device) -> bool:
 
 
 def _has_libraries() -> bool:
-    """Return whether PoCL's libraries for several processors are here, rather than one for the machine it was made on.
+    """Return whether PoCL has libraries for several processors, rather than one for the machine that compiled it.
 
-    They are looked for where PoCL looks: from the place of its own code.
+    PoCL looks for them relative to its code.
     """
     try:
         with open("/proc/self/maps", encoding="utf-8", errors="replace") as file:
@@ -150,8 +151,8 @@ def _has_libraries() -> bool:
 def _find_name(device: cl.Device) -> tuple[int, str]:
     """Return where the device's description holds the address of its processor's name, and the name.
 
-    The address stands behind that of the target's name, ``x86_64-...``. Memory is read through Linux, which answers an
-    address that is none with an error. Where the two are not found the name is empty.
+    The address follows that of the target's name, ``x86_64-...``. Memory is read through Linux, which answers an
+    invalid address with an error. The name is empty where there is no such pair.
     """
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
@@ -173,6 +174,7 @@ def _find_name(device: cl.Device) -> tuple[int, str]:
 
 
 def _text(memory: int, address: int) -> str:
+    """Return the text at an address; empty where the address is invalid."""
     try:
         return os.pread(memory, _NAME, address).split(b"\0")[0].decode("ascii", "replace")
     except (OSError, OverflowError):
@@ -180,7 +182,7 @@ def _text(memory: int, address: int) -> str:
 
 
 def _replace(place: int, name: str) -> None:
-    """Point to a new string, of the allocator that PoCL would free it with."""
+    """Replace a pointer by one to a new string, of the allocator with which PoCL would free it."""
     copy = ctypes.CDLL(None).strdup
     copy.restype, copy.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
     ctypes.c_uint64.from_address(place).value = copy(name.encode())

@@ -1,8 +1,8 @@
-"""Kernels that PoCL has compiled, kept between processes with checksums.
+"""Kernels that PoCL has compiled: kept between processes, with checksums.
 
 PoCL keeps a program's kernels in files below ``<folder>/XX/YYY...``, named by a hash of the source and the options, and
-loads whatever lies there. It is given this process's own folder. The folder of a program is copied there from an entry
-of the cache before the program is built, and back into an entry after its kernels have run.
+loads them without a check. Its folder is one of this process. The folder of a program is copied there from an entry of
+the cache before the program is built, and back into an entry after its kernels have run.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from pathlib import Path
 from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
 from gpusense.backends.scratch import scratch_folder
 
-# What PoCL reads again: programs, and kernels for one size of groups.
+# Files that PoCL reads again: programs, and kernels for one size of groups.
 _ENDINGS = (".bc", ".so")
 
 
 class PoclKernels:
-    """The kernels of this process."""
+    """The compiled kernels of this process."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._lock = threading.RLock()
-        # By the keys of entries: the folders of a program, the files that its entry holds, programs to look at.
+        # By the keys of entries: the folders of a program, the files that its entry holds, programs to save.
         self._folders: dict[str, set[str]] = {}
         self._saved: dict[str, frozenset[str]] = {}
         self._changed: set[str] = set()
@@ -38,7 +38,7 @@ class PoclKernels:
 
     @contextlib.contextmanager
     def building(self, key: str) -> Iterator[None]:
-        """Bring what the entry of a program holds before it is built, and see where PoCL puts it."""
+        """Restore the entry of a program before it is built, and note the folders that PoCL makes for it."""
         with self._lock:
             if key not in self._folders:
                 self._folders[key] = self._restore(key)
@@ -48,34 +48,36 @@ class PoclKernels:
             self._changed.add(key)
 
     def mark(self, key: str) -> None:
-        """Say that a kernel of a program runs for the first time, and so is compiled."""
+        """Note that a kernel of a program runs for the first time, for which PoCL compiles it."""
         with self._lock:
             self._changed.add(key)
 
     @property
     def changed(self) -> bool:
-        """Return whether kernels were compiled since the last :meth:`save`."""
+        """Whether kernels were compiled since the last :meth:`save`."""
         return bool(self._changed)
 
     def save(self) -> None:
-        """Put what was compiled into entries of the cache; what was started must have ended."""
+        """Put compiled kernels into entries of the cache; all launches must have ended."""
         with self._lock:
             changed, self._changed = self._changed, set()
             for key in changed:
                 names = frozenset(self._files(key))
                 if names - self._saved.get(key, frozenset()):
-                    # What cannot be read is compiled anew next time.
+                    # The next process compiles kernels anew that cannot be read.
                     with contextlib.suppress(OSError):
                         store_entry(key, pack({name: (self.folder / name).read_bytes() for name in names}))
                         self._saved[key] = names
 
     def _save_all(self) -> None:
+        """Save the kernels of all programs as the process ends; a forked child saves none."""
         if os.getpid() != self._process:
             return
         self._changed |= self._folders.keys()
         self.save()
 
     def _restore(self, key: str) -> set[str]:
+        """Write the files of an entry, and return their folders."""
         payload = load_entry(key)
         if payload is None:
             return set()
@@ -90,14 +92,15 @@ class PoclKernels:
 
     def _listed(self) -> set[str]:
         """Return the folders of all programs."""
-        found = set()
+        folders = set()
         with contextlib.suppress(OSError):
             for first in os.scandir(self.folder):
                 if len(first.name) == 2 and first.is_dir():
-                    found |= {f"{first.name}/{second.name}" for second in os.scandir(first.path)}
-        return found
+                    folders |= {f"{first.name}/{second.name}" for second in os.scandir(first.path)}
+        return folders
 
     def _files(self, key: str) -> Iterator[str]:
+        """Yield the files of a program that PoCL reads again."""
         for folder in self._folders[key]:
             for path in (self.folder / folder).rglob("*"):
                 if path.suffix in _ENDINGS and not path.name.startswith("temp"):

@@ -1,4 +1,4 @@
-"""Recordings: launches with the same arguments each time, each a kernel object of its own."""
+"""Recordings: launches whose arguments stay set, each with a kernel object for itself."""
 
 from __future__ import annotations
 
@@ -10,12 +10,9 @@ from typing import Any
 import pyopencl as cl
 
 from gpusense._util.checks import show
+from gpusense.backends.base import Recording, counted
+from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.memory import driver_errors
-
-
-def is_unordered(queue: cl.CommandQueue) -> bool:
-    """Whether a queue's commands may be done in another order than theirs."""
-    return bool(queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE)
 
 
 @dataclass(frozen=True)
@@ -28,25 +25,25 @@ class BoundLaunch:
     arguments: tuple[Any, ...]
 
 
-class Repeated:
-    """See Recording; a stream is a queue of the same context."""
+class OpenCLRecording(Recording):
+    """Launches that are queued together; a stream is a queue of the same context."""
 
     def __init__(self, queue: cl.CommandQueue, launches: list[BoundLaunch], count: Callable[[int], None]) -> None:
         self._queue, self._launches, self._count = queue, launches, count
-        # Queues of others on which they were started since the last wait.
+        # Queues of users on which they were started since the last wait.
         self._used: list[cl.CommandQueue] = []
         self._lock = threading.Lock()
 
     def __call__(self, stream: Any = None) -> None:
         """See Recording.__call__."""
         queue = self._queue if stream is None else self._checked(stream)
-        # Two threads' launches must not be mixed.
+        # Launches of two threads must not interleave.
         with self._lock, driver_errors():
             if stream is not None and queue not in self._used:
                 self._used.append(queue)
             for launch in self._launches:
                 cl.enqueue_nd_range_kernel(queue, launch.kernel, launch.size, launch.group)
-            # Without this a driver may wait for more before it begins.
+            # Without this a driver may wait for further commands before it begins.
             queue.flush()
         self._count(len(self._launches))
 
@@ -63,13 +60,22 @@ class Repeated:
             for queue in used:
                 queue.finish()
 
+    def explain(self) -> str:
+        """See Recording.explain."""
+        return f"{counted(len(self._launches), 'launch')} one by one, their arguments stay set: OpenCL has no graphs"
+
     def _checked(self, stream: Any) -> cl.CommandQueue:
+        """Return a user's queue for the stream of a call.
+
+        Raises:
+            TypeError: it is no queue, or one of another context or device.
+            ValueError: it is not an in-order queue.
+        """
         same = isinstance(stream, cl.CommandQueue) and (stream.context, stream.device) == (
             self._queue.context,
             self._queue.device,
         )
         if not same:
             raise TypeError(f"stream: must be a queue of the model's context and device, got {show(stream)}")
-        if is_unordered(stream):
-            raise ValueError("stream: must be a queue that does commands in their order, got one that does not")
+        check_in_order(stream, "stream")
         return stream

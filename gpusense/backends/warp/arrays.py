@@ -1,4 +1,4 @@
-"""Arrays of other libraries on a CUDA device, as Warp sees them without a copy."""
+"""Arrays of other libraries on a CUDA device as Warp's, without a copy."""
 
 from __future__ import annotations
 
@@ -12,22 +12,32 @@ from gpusense._util.checks import check_gradients, show
 from gpusense.backends.base import Adopted, Buffer
 
 
+def has_protocol(array: object) -> bool:
+    """Return whether Warp can take an array: by DLPack or the CUDA array interface."""
+    return hasattr(array, "__dlpack__") or hasattr(array, "__cuda_array_interface__")
+
+
 def adopted(array: Any, device: wp.Device, name: str) -> Adopted:
-    """See Sharing.adopt."""
-    found = _seen(array, device, name)
-    if found.device != device:
-        raise TypeError(f"{name}: must be on warp:{device.alias}, got an array on {found.device.alias}")
+    """See Backend.adopt."""
+    view = _view(array, device, name)
+    if view.device != device:
+        raise TypeError(f"{name}: must be on warp:{device.alias}, got an array on {view.device.alias}")
     try:
-        dtype = np.dtype(wp.dtype_to_numpy(found.dtype))
+        dtype = np.dtype(wp.dtype_to_numpy(view.dtype))
     except TypeError as error:
-        raise TypeError(f"{name}: must hold float32 or float64, got {found.dtype.__name__}") from error
-    buffer = found
-    if found.is_contiguous and found.ndim != 1:
-        buffer = _flat(found.ptr, found.size, found.dtype, device.alias) if found.size else found.flatten()
-    return Adopted(buffer, tuple(found.shape), dtype, tuple(found.strides), found.is_contiguous, found.numpy, found)
+        raise TypeError(f"{name}: must hold float32 or float64, got {view.dtype.__name__}") from error
+    buffer = view
+    if view.is_contiguous and view.ndim != 1:
+        buffer = _flat(view.ptr, view.size, view.dtype, device.alias) if view.size else view.flatten()
+    return Adopted(buffer, tuple(view.shape), dtype, tuple(view.strides), view.is_contiguous, view.numpy, view)
 
 
-def _seen(array: Any, device: wp.Device, name: str) -> wp.array:
+def _view(array: Any, device: wp.Device, name: str) -> wp.array:
+    """Return an array of any library as Warp's.
+
+    Raises:
+        TypeError: its gradients are recorded, or it holds other numbers than Warp takes.
+    """
     if isinstance(array, wp.array):
         return array
     if hasattr(array, "__dlpack__"):
@@ -40,18 +50,18 @@ def _seen(array: Any, device: wp.Device, name: str) -> wp.array:
     dtype = {"<f4": wp.float32, "<f8": wp.float64, "<i4": wp.int32, "<i8": wp.int64}.get(interface["typestr"])
     if dtype is None:
         raise TypeError(f"{name}: must hold float32 or float64, got {show(interface['typestr'])}")
-    found = wp.array(
+    view = wp.array(
         ptr=interface["data"][0], dtype=dtype, shape=interface["shape"], strides=interface.get("strides"),
         device=device, copy=False,
     )  # fmt: skip
-    found._gpusense_owner = array
+    view._gpusense_owner = array
     if interface.get("stream") is not None:
-        # What another stream still writes must be there; of DLPack's arrays their own library sees to that.
-        wp.synchronize_device(found.device)
-    return found
+        # The writes of another stream must have ended; libraries with DLPack see to that themselves.
+        wp.synchronize_device(view.device)
+    return view
 
 
 @functools.lru_cache(maxsize=64)
 def _flat(address: int, count: int, dtype: Any, device: str) -> Buffer:
-    """Memory on the device as a flat buffer that does not own it."""
+    """Return memory on the device as a flat buffer that does not own it."""
     return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)

@@ -13,11 +13,12 @@ import numpy as np
 import warp as wp
 
 from gpusense.backends.base import Adopted, Backend, BackendInfo, ProcessBound, Recording
-from gpusense.backends.numpy.backend import _memory
-from gpusense.backends.warp.arrays import adopted
+from gpusense.backends.warp.arrays import adopted, has_protocol
+from gpusense.backends.warp.graphs import GraphCache
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
 from gpusense.backends.warp.pieces import SharedLaunch, shared
-from gpusense.backends.warp.queue import Graphs, Queue, Recorded
+from gpusense.backends.warp.queue import CallQueue
+from gpusense.backends.warp.recording import WarpRecording
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
 from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.launches import Program
@@ -25,31 +26,6 @@ from gpusense.interface.signatures import KERNELS, Kernel
 from gpusense.interface.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
-
-
-def list_devices() -> list[tuple[BackendInfo, str]]:
-    """Warp's devices of this machine and their names within Warp."""
-    initialize()
-    return [(_describe(device), device.alias) for device in wp.get_devices()]
-
-
-def _describe(device: wp.Device) -> BackendInfo:
-    memory, driver = _memory(), f"Warp {wp.__version__}"
-    if device.is_cuda:
-        memory = int(device.total_memory)
-        driver += " CUDA {}.{}".format(*wp.get_cuda_driver_version())
-    return BackendInfo(
-        selection=f"warp:{device.alias}",
-        backend="warp",
-        name=device.name,
-        kind="gpu" if device.is_cuda else "cpu",
-        driver=driver,
-        memory=memory,
-        max_buffer=memory,
-        float64=True,
-        vector_loops=not device.is_cuda,
-        graphs=device.is_cuda,
-    )
 
 
 class WarpBackend(ProcessBound, Backend):
@@ -62,11 +38,11 @@ class WarpBackend(ProcessBound, Backend):
         initialize()
         self.info = info
         self._device = wp.get_device(device)
-        self._graphs = Graphs(self._device)
-        # One for each thread of a call, and those that no call has now.
+        self._graphs = GraphCache(self._device)
+        # The queue of each thread that gathers a call, and the queues that no call uses.
         self._thread = threading.local()
-        self._queues: list[Queue] = []
-        # By the flags that change code, and by those that were asked for.
+        self._queues: list[CallQueue] = []
+        # By the flags that change code, and by all flags of a launch.
         self._launchers: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
         self._asked: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
 
@@ -83,7 +59,7 @@ class WarpBackend(ProcessBound, Backend):
                 self._flush(queue)
             wp.copy(buffer, host_view(array), count=array.size)
             if wait:
-                # Page-locked host memory is still being read when the copy returns.
+                # The copy returns while the device still reads page-locked host memory.
                 self._wait()
         return buffer
 
@@ -128,8 +104,12 @@ class WarpBackend(ProcessBound, Backend):
             return view
         return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
 
+    def reads(self, array: object) -> bool:
+        """See Backend.reads."""
+        return self.info.kind == "gpu" and has_protocol(array)
+
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """See Backend.adopt; all that lies on the device can be used in place."""
+        """See Backend.adopt; every array on the device can be used in place."""
         return adopted(array, self._device, name)
 
     def blank(self, count: int, dtype: np.dtype) -> wp.array:
@@ -139,11 +119,11 @@ class WarpBackend(ProcessBound, Backend):
     def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
         """See Backend.copy."""
         if not size:
-            # To Warp a count of 0 is all.
+            # Warp takes a count of 0 as the whole array.
             return
         queue = self.gathering()
         if queue is not None:
-            # After all that was gathered before.
+            # The copy comes after all that was gathered before.
             self._flush(queue)
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
@@ -187,9 +167,9 @@ class WarpBackend(ProcessBound, Backend):
         try:
             queue = self._queues.pop()
         except IndexError:
-            queue = Queue(self._device, SCALARS)
+            queue = CallQueue(self._device, SCALARS)
         if not queue.settled:
-            # An error ended the call before, and something of it may be under way.
+            # An error ended the last call of this queue, parts of which may be under way.
             self._wait()
         queue.begin()
         self._thread.queue = queue
@@ -215,15 +195,15 @@ class WarpBackend(ProcessBound, Backend):
         """See Backend.gathers."""
         return self.gathering() is not None
 
-    def record(self, program: Program) -> Recorded:
+    def record(self, program: Program) -> WarpRecording:
         """See Backend.record; launches know their buffers by address and keep none alive."""
         steps = [self.compile(one.kernel, one.flags).step(one.size, one.arguments) for one in program]
-        return Recorded(self._device, self._graphs, [step for step in steps if step is not None])
+        return WarpRecording(self._device, self._graphs, [step for step in steps if step is not None])
 
     def replay(self, recording: Recording) -> None:
         """See Backend.replay."""
         queue = self.gathering()
-        if queue is None or not isinstance(recording, Recorded):
+        if queue is None or not isinstance(recording, WarpRecording):
             recording()
         else:
             queue.steps.append(recording)
@@ -232,28 +212,33 @@ class WarpBackend(ProcessBound, Backend):
         """See Backend.address."""
         return int(buffer.ptr or 0)
 
-    def gathering(self) -> Queue | None:
-        """What this thread gathers in, if it does."""
+    def gathering(self) -> CallQueue | None:
+        """Return the queue in which this thread gathers a call; None where it gathers none."""
         return getattr(self._thread, "queue", None)
 
-    def _flush(self, queue: Queue) -> None:
-        """Start what was gathered."""
+    def _flush(self, queue: CallQueue) -> None:
+        """Start the steps of a queue."""
         if queue.steps:
             steps, queue.steps = queue.steps, []
             self._graphs.start(steps)
 
     def _wait(self) -> None:
-        """Wait for the current stream; the processor has none and works at once."""
+        """Wait for the current stream; on the processor, which has none, launches have ended when they return."""
         if self._device.is_cuda:
             wp.synchronize_stream(self._device)
 
     def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launch | SharedLaunch:
+        """Compile a kernel.
+
+        Raises:
+            RuntimeError: Warp does not compile it.
+        """
         group = row.group if self._device.is_cuda else 1
         with settings():
-            made = warp_module(row.file).make(kernel, flags)
+            compiled = warp_module(row.file).make(kernel, flags)
             try:
-                load(made.module, self._device, group)
+                load(compiled.module, self._device, group)
             except Exception as error:
                 raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
-        launch = Launch(self._device, made, row, group, self.gathering)
+        launch = Launch(self._device, compiled, row, group, self.gathering)
         return launch if self._device.is_cuda else shared(launch, row)

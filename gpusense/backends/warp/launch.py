@@ -1,16 +1,17 @@
-"""Launches of Warp kernels: arguments bound by the signature table, at once or gathered, and the arrays behind them."""
+"""Launches of Warp kernels, started at once or gathered: arguments are bound by the signature table."""
 
 from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from gpusense.backends.warp.queue import Queue
+from gpusense.backends.warp.queue import CallQueue
+from gpusense.backends.warp.steps import Step
 from gpusense.interface.signatures import Argument, Kernel
 
 SCALARS = {
@@ -30,10 +31,10 @@ _VECTORS = {
 
 
 class Launch:
-    """Binds arguments by the signature table and launches.
+    """A kernel that binds arguments by the signature table and launches.
 
-    A recorded launch is kept, and a call sets what changed since the last one: a fraction of the time that a new
-    launch takes. It knows buffers by their address, so it keeps none alive. Every thread has its own.
+    Each thread keeps a recorded launch, and a call sets the arguments that changed since the last one, in a fraction of
+    the time that a new launch takes. The recorded launch holds addresses of buffers, so it keeps none alive.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class Launch:
         kernel: wp.Kernel,
         row: Kernel,
         group: int,
-        gathering: Callable[[], Queue | None],
+        gathering: Callable[[], CallQueue | None],
     ) -> None:
         self._device, self._kernel, self._group, self._gathering = device, kernel, group, gathering
         self._binds = [_binding(argument) for argument in row.arguments]
@@ -86,39 +87,40 @@ class Launch:
 
 
 def _keys(arguments: tuple[Any, ...]) -> list[Any]:
-    """Return numbers as they are, and arrays by their memory."""
+    """Return the keys of arguments: numbers themselves, addresses and sizes of arrays."""
     return [(value.ptr, value.size) if isinstance(value, wp.array) else value for value in arguments]
 
 
-class LaunchStep:
-    """A launch that is gathered; see Step."""
+class LaunchStep(Step):
+    """A launch that is gathered."""
+
+    launches = 1
 
     def __init__(self, launch: Launch, size: tuple[int, ...], arguments: tuple[Any, ...], keys: list[Any]) -> None:
-        self._given = (size, arguments, keys)
-        self._launch = launch
-        self.key: Hashable = (id(launch), size, *keys)
+        self._launch, self._bound = launch, (size, arguments, keys)
+        self.key = (id(launch), size, *keys)
 
     def start(self, stream: wp.Stream | None) -> None:
         """See Step.start."""
-        self._launch.start(*self._given, stream)
+        self._launch.start(*self._bound, stream)
 
 
 def slice_of(buffer: wp.array, begin: int, count: int) -> wp.array:
-    """Numbers of a buffer, without a copy; the caller keeps it alive."""
-    # An array of nothing has no address.
+    """Return ``count`` numbers of a buffer from ``begin`` on, without a copy; the caller must keep the buffer alive."""
+    # An empty array has no address.
     start = (buffer.ptr or 0) + begin * wp.types.type_size_in_bytes(buffer.dtype)
     return wp.array(ptr=start, dtype=buffer.dtype, shape=(count,), device=buffer.device)
 
 
 def _binding(argument: Argument) -> Callable[[Any], Any]:
-    """What turns a value into an argument of a kernel."""
+    """Return the function that converts a value to an argument of a kernel."""
     if argument.shape is None:
         return float if argument.type in ("real", "double") else int
     return functools.partial(_view, width=argument.width)
 
 
 def _view(buffer: wp.array, width: int) -> wp.array:
-    """The buffer's memory as numbers or vectors; made once, kept by the buffer, and not its owner."""
+    """Return the buffer's memory as numbers or vectors: a view that does not own it, and that the buffer keeps."""
     views = buffer.__dict__.setdefault("_gpusense_views", {})
     if width not in views:
         dtype = buffer.dtype if width == 1 else _VECTORS[buffer.dtype, width]
@@ -128,5 +130,5 @@ def _view(buffer: wp.array, width: int) -> wp.array:
 
 
 def host_view(array: np.ndarray) -> wp.array:
-    """A C-contiguous host array as Warp sees it, without a copy; the caller keeps it alive."""
+    """Return a C-contiguous host array as Warp's, without a copy; the caller must keep it alive."""
     return wp.array(ptr=array.ctypes.data, dtype=SCALARS[array.dtype], shape=(array.size,), device="cpu")

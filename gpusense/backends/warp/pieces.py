@@ -1,8 +1,8 @@
 """Launches on the processor that several threads share.
 
-Warp runs a launch on the processor in the calling thread. Large launches over particles are therefore cut into pieces,
-each with its own part of the arrays, that threads of ours run side by side: Warp releases Python's lock while a kernel
-runs, and its kernels keep no state. A particle's result does not depend on the piece.
+Warp runs a launch on the processor in the calling thread. So large launches over particles are cut into pieces, each
+with its part of the arrays, which several threads run side by side: Warp releases Python's lock while a kernel runs,
+and its kernels keep no state. A particle's result does not depend on the piece.
 """
 
 from __future__ import annotations
@@ -15,60 +15,60 @@ import os
 import threading
 from typing import Any
 
+from gpusense.backends.warp.graphs import HELPERS
 from gpusense.backends.warp.launch import Launch, LaunchStep, slice_of
-from gpusense.backends.warp.queue import HELPERS
 from gpusense.interface.signatures import Argument, Kernel
 
 # The axes of a launch that threads may share, and the argument that counts each.
 _SHARED = {"particle": "particles", "block": "blocks"}
-# Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: threads
-# that others hold up take fewer.
+# Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: a thread
+# that is held up takes fewer.
 _PIECE_WORK = 1 << 16
 _PIECES = 2
 
 
 def shared(launch: Launch, row: Kernel) -> Launch | SharedLaunch:
-    """The launch, in pieces where several threads may share it."""
+    """Return the launch, cut into pieces where several threads may share it."""
     return launch if _threads() == 1 or not _independent(row) else SharedLaunch(launch, row)
 
 
 def _shared_axis(row: Kernel) -> str | None:
-    """The axis of a launch, particles or blocks of pairs, that threads may share."""
+    """Return the axis of a launch, particles or blocks of pairs, that threads may share; None without one."""
     return next((axis for axis in _SHARED if axis in row.launch), None)
 
 
 def _has_rows(argument: Argument, axis: str) -> bool:
-    """Whether an argument has one row for each index of an axis."""
+    """Return whether an argument has one row for each index of an axis."""
     return argument.shape is not None and argument.shape.split(" ")[0] == _SHARED[axis]
 
 
 def _independent(row: Kernel) -> bool:
-    """Whether a kernel writes to nothing but the rows of its own particles or blocks."""
+    """Return whether each work-item writes only to the rows of its particle or block."""
     axis = _shared_axis(row)
     return axis is not None and all(_has_rows(argument, axis) for argument in row.arguments if argument.output)
 
 
 @functools.cache
 def _threads() -> int:
-    """Processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.cache
 def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
-    """The threads of a process, all launches'; the calling thread works as well."""
+    """Return the threads of a process for all launches; the calling thread works as well."""
     return concurrent.futures.ThreadPoolExecutor(_threads() - 1, HELPERS)
 
 
 class SharedLaunch:
-    """A launch over particles or blocks of pairs, cut into pieces that several threads take one after the other."""
+    """A launch over particles or blocks of pairs in pieces, which several threads take one after the other."""
 
     def __init__(self, launch: Launch, row: Kernel) -> None:
         self._launch, self._row = launch, row
         self._name = _shared_axis(row) or ""
         self._axis = row.launch.index(self._name)
         self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
-        # Which scan a particle belongs to follows from its number in the whole launch.
+        # The scan of a particle follows from its number in the whole launch.
         self._ahead = next((i for i, argument in enumerate(row.arguments) if argument.name == "ahead"), None)
         self._work = [
             i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
@@ -99,14 +99,14 @@ class SharedLaunch:
                 )
 
         helpers = []
-        # Where there are no more threads to be had, those that there are do the work.
+        # Where the system starts no more threads, the present ones do the work.
         with contextlib.suppress(RuntimeError):
             for _ in range(min(_threads(), count) - 1):
                 helpers.append(_pool(os.getpid()).submit(pieces))
         try:
             pieces()
         finally:
-            # Whatever happened, nobody may still write when this returns: what has not begun never does.
+            # No thread may write any more when this returns, not even after an error: further pieces are dropped.
             with lock:
                 begins = iter(())
             _finish(helpers)
@@ -119,19 +119,19 @@ class SharedLaunch:
         return self._launch.step(size, arguments)
 
     def _rows(self, arguments: tuple[Any, ...]) -> list[tuple[int, int]]:
-        """The arrays that hold something of every particle or block, and how many numbers of each."""
+        """Return the indices of arrays with rows of particles or blocks, each with the numbers of a row."""
         named = {argument.name: value for argument, value in zip(self._row.arguments, arguments, strict=True)}
-        found = []
+        rows = []
         for i, argument in enumerate(self._row.arguments):
             if argument.shape is not None and _has_rows(argument, self._name):
                 factors = argument.shape.split(" * ")[1:]
                 each = math.prod(int(factor) if factor.isdigit() else int(named[factor]) for factor in factors)
                 if arguments[i].size >= argument.width * each * arguments[self._count]:
-                    found.append((i, argument.width * each))
-        return found
+                    rows.append((i, argument.width * each))
+        return rows
 
     def _piece(self, arguments: tuple[Any, ...], rows: list[tuple[int, int]], begin: int, count: int) -> list[Any]:
-        """The arguments of a launch of some particles."""
+        """Return the arguments of a launch of ``count`` particles from ``begin`` on."""
         cut = list(arguments)
         cut[self._count] = count
         if self._ahead is not None:
@@ -142,7 +142,7 @@ class SharedLaunch:
 
 
 def _finish(helpers: list[concurrent.futures.Future[None]]) -> None:
-    """Wait for all helpers, interrupted or not; those that have not begun are cancelled."""
+    """Cancel helpers that have not begun, and wait for the others even when interrupted."""
     interrupted: BaseException | None = None
     for helper in helpers:
         helper.cancel()

@@ -1,4 +1,4 @@
-"""Warp, started in silence and with its own settings left as they are."""
+"""Warp's start without output, and its settings, which are restored after each use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LOG = logging.getLogger("gpusense")
 
 @functools.cache
 def initialize() -> None:
-    """Start Warp in silence; the list of devices says that there is no CUDA driver.
+    """Start Warp without its greeting and without its warning that there is no CUDA driver.
 
     Where Warp's own folder of kernels cannot be made, which would end the run, this process's folder takes its place.
     """
@@ -54,7 +54,7 @@ def _folder() -> Path:
 
 @contextlib.contextmanager
 def settings(*, kernels: bool = True) -> Iterator[None]:
-    """Set Warp up without greeting and progress, and with this process's folder of kernels; then as it was before."""
+    """Switch off Warp's greeting and progress and set this process's folder of kernels; restore all on leaving."""
     with LOCK:
         changed: dict[str, Any]
         if hasattr(wp.config, "log_level"):
@@ -83,15 +83,16 @@ def load(module: wp.Module, device: wp.Device, group: int) -> None:
     host = fingerprint() if device.is_cpu else f"{device.arch}"
     # The name holds a hash of the module's code.
     key = "\n".join(["warp", wp.__version__, __version__, device.name, host, name])
-    kept = _restore(key)
+    restored = _restore(key)
     wp.load_module(module, device=device, block_dim=group)
     files = {f"{name}/{path.name}": path for path in (_folder() / name).glob("*") if path.is_file()}
-    if files.keys() - kept:
+    if files.keys() - restored:
         with contextlib.suppress(OSError):
             store_entry(key, pack({file: path.read_bytes() for file, path in files.items()}))
 
 
 def _restore(key: str) -> set[str]:
+    """Write the files of an entry into this process's folder, and return their names."""
     payload = load_entry(key)
     if payload is None:
         return set()
@@ -106,21 +107,21 @@ def _restore(key: str) -> set[str]:
 
 @contextlib.contextmanager
 def _filtered_stderr() -> Iterator[None]:
-    """Hold back what native code writes to standard error, and pass on all but the absence of a CUDA driver."""
+    """Filter the standard error of native code: the line on the absence of a CUDA driver is dropped."""
     with contextlib.ExitStack() as stack:
         try:
-            held = stack.enter_context(tempfile.TemporaryFile())
+            output = stack.enter_context(tempfile.TemporaryFile())
             saved = os.dup(2)
         except OSError:
             yield
             return
-        os.dup2(held.fileno(), 2)
+        os.dup2(output.fileno(), 2)
         try:
             yield
         finally:
             os.dup2(saved, 2)
             os.close(saved)
-            held.seek(0)
-            for line in held:
+            output.seek(0)
+            for line in output:
                 if _NO_DRIVER not in line:
                     os.write(2, line)

@@ -47,25 +47,43 @@ def bind(
             raise TypeError(f"{name}: must be an array, whose numbers every call reads anew, got {checks.show(array)}")
         if type(array).__module__.startswith("jax"):
             raise TypeError(f"{name}: must be an array whose numbers can change, got one of JAX, where none do")
-    info, likelihood = pipeline.backend.info, pipeline.setting.peer is None
-    # The host classes readings for other programs' weights, and places poses where float64 is missing. Processors score
-    # scans that the host prepares by kernels in vectors.
-    if arrays.on_device(poses) and arrays.on_device(ranges) and likelihood and info.float64 and info.kind == "gpu":
+    in_host = [name for name, array in (("poses", poses), ("ranges", ranges)) if not arrays.on_device(array)]
+    obstacle = _host_task(pipeline)
+    if not in_host and not obstacle and pipeline.backend.info.kind == "gpu":
         return DeviceCall(pipeline, lock, poses, ranges, out)
     host = _HostCall(pipeline, score, poses, ranges, out)
-    if likelihood and host.is_short():
+    if len(in_host) == 1:
+        obstacle = obstacle or f"{in_host[0]} are in host memory"
+    elif not in_host:
+        obstacle = obstacle or "processors score scans that the host prepares"
+    host.reason = obstacle or host.long_reason()
+    if not host.reason:
         try:
             return _StagedCall(host, lock)
         except MemoryError:
             # The ordinary call needs but a part of the map's table.
-            pass
+            host.reason = "the table of the whole map does not fit the device"
     return host
 
 
+def _host_task(pipeline: ScanPipeline) -> str:
+    """Return the preparation of a scan that only the host can do; empty where the device can do all of it."""
+    if pipeline.setting.peer is not None:
+        return "the host classes the readings for another program's weights"
+    if not pipeline.backend.info.float64:
+        return "the host places the poses, as the device has no float64"
+    return ""
+
+
 class _HostCall(BoundCall):
-    """An ordinary call of ``log_likelihood``."""
+    """An ordinary call of ``log_likelihood``.
+
+    Attributes:
+        reason: Why no program is recorded.
+    """
 
     waits = True
+    reason = ""
 
     def __init__(self, pipeline: ScanPipeline, score: Callable[..., Any], poses: Any, ranges: Any, out: Any) -> None:
         backend, real, beams = pipeline.backend, pipeline.real, pipeline.scanner.count
@@ -90,19 +108,27 @@ class _HostCall(BoundCall):
             raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
         return self._score(*self.arrays, out=self.out)
 
+    def explain(self) -> str:
+        """See BoundCall.explain."""
+        return f"the ordinary call: {self.reason}"
+
     def check(self) -> None:
         """See BoundCall.check."""
 
-    def is_short(self) -> bool:
-        """Return whether arrays are NumPy's, all is small, and the device gains by a recording."""
-        backend = self.pipeline.backend
-        if not backend.replays or not backend.info.float64:
-            return False
+    def long_reason(self) -> str:
+        """Return why arrays in host memory are not copied with a recorded program; empty for those of a short call."""
         poses, ranges = self.arrays
-        short = all(type(a) is np.ndarray and a.dtype in (np.float32, np.float64) for a in (poses, ranges, self.out))
-        short = short and _DOUBLE.itemsize * (poses.size + ranges.size) <= _LARGEST
-        small = self.pipeline.grid.cells.size <= _MOST_CELLS
-        return short and small and 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]
+        if not self.pipeline.backend.replays:
+            return f"{self.pipeline.backend.info.selection} starts launches fast enough without a recording"
+        if not all(type(a) is np.ndarray and a.dtype in (np.float32, np.float64) for a in (poses, ranges, self.out)):
+            return "only NumPy arrays of float32 or float64 are copied with a recorded program"
+        if _DOUBLE.itemsize * (poses.size + ranges.size) > _LARGEST:
+            return f"poses and ranges take more than {_LARGEST >> 10} KiB"
+        if self.pipeline.grid.cells.size > _MOST_CELLS:
+            return f"the map has more than {_MOST_CELLS} cells"
+        if not 0 < len(poses) * len(ranges) < LEAST_ORDERED[0]:
+            return f"{len(poses)} poses times {len(ranges)} readings are no short call"
+        return ""
 
 
 class _Pack:
@@ -179,6 +205,10 @@ class _StagedCall(BoundCall):
             backend.upload(status, outputs.parts[1])
         # Its message names the pose that is not finite.
         return self._host()
+
+    def explain(self) -> str:
+        """See BoundCall.explain."""
+        return f"NumPy arrays are copied with each call: {self._device.explain()}"
 
     def check(self) -> None:
         """See BoundCall.check."""

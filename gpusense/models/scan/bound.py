@@ -56,6 +56,13 @@ class BoundCall(ABC):
         """
 
     @abstractmethod
+    def explain(self) -> str:
+        """Return in one line how a call is started: ``"one CUDA graph of 3 launches"``, or the reason for none.
+
+        A graph is captured at the second call, so ask after two calls.
+        """
+
+    @abstractmethod
     def check(self) -> None:
         """Wait until all calls have ended.
 
@@ -113,6 +120,12 @@ class DeviceCall(BoundCall):
         """See BoundCall.__call__."""
         self._current()(stream)
         return self.out
+
+    def explain(self) -> str:
+        """See BoundCall.explain."""
+        if self._recording is None:
+            return "nothing is recorded: the map has changed, and its new table did not fit the device"
+        return self._recording.explain()
 
     def begin(self) -> None:
         """Start the recording, as part of the call that this thread gathers."""

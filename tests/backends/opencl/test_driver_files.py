@@ -15,6 +15,8 @@ from support import fake_driver
 pytest.importorskip("pyopencl")
 from gpusense.backends.opencl import drivers
 
+_CHOICE = drivers.choice
+
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
@@ -31,7 +33,9 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(drivers, "_SYSTEM", str(vendors))
     monkeypatch.setattr(drivers.cl, "__file__", str(beside.parent / "__init__.py"))
-    monkeypatch.setattr(drivers, "_chosen", drivers._chosen.__wrapped__)
+    monkeypatch.setattr(drivers, "_choice", None)
+    monkeypatch.setattr(drivers, "_loaded", False)
+    monkeypatch.setattr(drivers, "choice", lambda: drivers._chosen())
     monkeypatch.setattr(drivers, "scratch_folder", lambda: tmp_path)
     return tmp_path
 
@@ -97,6 +101,54 @@ def test_half_a_wheel_is_none(machine, intel, monkeypatch, problem):
 
         monkeypatch.setattr(drivers.importlib.metadata, "files", absent)
     assert drivers.choice() == drivers.Choice(None)
+
+
+@pytest.fixture
+def trials(machine, monkeypatch):
+    """Let children run, as a list of failures in turn says; return the list of drivers that each has loaded."""
+    failures, loaded = [], []
+
+    def run_text(arguments, job, variables):
+        loaded.append(named(variables) if "OCL_ICD_VENDORS" in variables else "all")
+        return drivers.child.Outcome([], failures.pop(0))
+
+    monkeypatch.setenv("GPUSENSE_PROOF", "on")
+    monkeypatch.setattr(drivers, "_loader", lambda: "libOpenCL.so")
+    monkeypatch.setattr(drivers.child, "run_text", run_text)
+    return failures, loaded
+
+
+def test_a_verdict_on_loading_is_kept_and_made_anew_when_asked(trials, monkeypatch, caplog):
+    """``gpusense devices --prove`` tries the loading of drivers again."""
+    failures, loaded = trials
+    failures += ["ends the process", "", "ends the process", ""]
+    monkeypatch.setattr(drivers, "choice", _CHOICE)
+    chosen = drivers.choice()
+    ((name, reason),) = chosen.left_out
+    assert name.endswith("pocl.icd") and reason == "ends the process"
+    assert len(loaded) == 4 and loaded[0] == "all" and caplog.messages[0].endswith("is left out: it ends the process")
+    monkeypatch.setattr(drivers, "_choice", None)
+    assert drivers.choice() == chosen and len(loaded) == 4
+    # The driver was repaired.
+    failures.append("")
+    drivers.renew()
+    assert drivers.choice() == drivers.Choice(None) and loaded[4:] == ["all"]
+    monkeypatch.setattr(drivers, "_choice", None)
+    assert drivers.choice() == drivers.Choice(None) and len(loaded) == 5
+
+
+def test_a_process_keeps_the_drivers_that_it_has_loaded(trials, monkeypatch):
+    """Its selection strings, and those of its children, count the devices of these drivers."""
+    failures, loaded = trials
+    monkeypatch.setattr(drivers, "choice", _CHOICE)
+    failures.append("")
+    chosen = drivers.choice()
+    monkeypatch.setattr(drivers, "_loaded", True)
+    failures += ["ends the process", "", "ends the process", ""]
+    drivers.renew()
+    assert drivers.choice() is chosen and len(loaded) == 5
+    monkeypatch.setattr(drivers, "_choice", None)
+    assert len(drivers.choice().left_out) == 1 and len(loaded) == 5
 
 
 def test_variables_are_set_back(monkeypatch):

@@ -12,8 +12,7 @@ import pytest
 from support.scan_calls import BEAM, BEAMS, COUNT, FIELD, GRID, MODELS, NEAR, SCANNER, cloud, mixed, scan
 
 import gpusense as gs
-from gpusense import backends
-from gpusense.backends import get_backend, proof
+from gpusense.backends import get_backend, proof, selection
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import run
 
@@ -240,7 +239,7 @@ def test_backends_of_queues(queue):
     assert get_backend(other) is not device
     del device
     gc.collect()
-    assert queue.int_ptr not in backends._OF_QUEUES
+    assert queue.int_ptr not in selection._BACKENDS_OF_QUEUES
     properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
     with pytest.raises(ValueError, match="backend: must be a queue that does commands in their order"):
         get_backend(cl.CommandQueue(queue.context, properties=properties))
@@ -260,7 +259,7 @@ def test_a_queue_of_an_unusable_device_is_refused_with_the_reason(queue, monkeyp
     for make in (get_backend, lambda backend: FIELD(GRID, NEAR, backend=backend)):
         with pytest.raises(ValueError, match=f"^backend: {re.escape(message)}, got a queue of it$"):
             make(another)
-    assert another.int_ptr not in backends._OF_QUEUES
+    assert another.int_ptr not in selection._BACKENDS_OF_QUEUES
     monkeypatch.undo()
     assert get_backend(another).info == info
 
@@ -297,10 +296,10 @@ def test_results_that_cannot_be_written(queue, there):
 
 def test_arrays_of_other_places(queue, there, needs):
     """Each message names the remedy."""
-    for selection in ("numpy", needs("warp"), needs("opencl")):
-        expected = "must be of the context of" if selection.startswith("opencl") else "must be in host memory for"
+    for name in ("numpy", needs("warp"), needs("opencl")):
+        expected = "must be of the context of" if name.startswith("opencl") else "must be in host memory for"
         with pytest.raises(TypeError, match=rf"^poses: {expected} .*backend=<the array's queue>"):
-            FIELD(GRID, SCANNER, backend=selection).log_likelihood(there(cloud(1)), scan(1))
+            FIELD(GRID, SCANNER, backend=name).log_likelihood(there(cloud(1)), scan(1))
     with pytest.raises(TypeError, match=r"^ranges: must be in host memory for numpy"):
         FIELD(GRID, SCANNER, backend="numpy").log_likelihood(cloud(1), there(scan(1)))
 

@@ -16,13 +16,13 @@ def gathering(needs, monkeypatch):
     needs("warp")
     import warp as wp
 
-    from gpusense.backends.warp.queue import Graphs
+    from gpusense.backends.warp.graphs import GraphCache
 
     installed(monkeypatch)
     monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
     device = get_backend("warp:cpu")
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, graphs=True))
-    monkeypatch.setattr(device, "_graphs", Graphs(device._device))
+    monkeypatch.setattr(device, "_graphs", GraphCache(device._device))
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
     return device, started

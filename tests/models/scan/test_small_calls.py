@@ -255,11 +255,11 @@ def test_threads_gather_on_their_own(gathering, monkeypatch):
 def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering, monkeypatch):
     import warp as wp
 
-    from gpusense.backends.warp import queue as _warp_queue
+    from gpusense.backends.warp import graphs as _warp_graphs
 
     device, started = gathering
-    monkeypatch.setattr(_warp_queue, "_MOST_GRAPHS", 2)
-    monkeypatch.setattr(_warp_queue, "_MOST_SEEN", 2)
+    monkeypatch.setattr(_warp_graphs, "_MOST_GRAPHS", 2)
+    monkeypatch.setattr(_warp_graphs, "_MOST_SEEN", 2)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     model.log_likelihood(cloud(0), scan(0))
     for count in (300, 200, 100, 50):
@@ -267,7 +267,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering,
             model.log_likelihood(cloud(count, count), scan(1))
     # Two that are in use are not given up for others, which they would be given up for in turn.
     assert len(device._graphs._graphs) == 2 and len(device._graphs._seen) <= 2 and len(started) == 4
-    monkeypatch.setattr(_warp_queue, "_STALE", 2)
+    monkeypatch.setattr(_warp_graphs, "_STALE", 2)
     for _ in range(4):
         model.log_likelihood(cloud(50, 50), scan(1))
     assert len(device._graphs._graphs) == 2 and len(started) > 4
@@ -279,7 +279,11 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering,
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(cloud(1, 77), scan(1)))
     for _ in range(3):
         assert differing(model.log_likelihood(cloud(1, 77), scan(1)), expected) == 0
-    assert device._graphs.failure == "no graphs here"
+    assert list(device._graphs._refused.values()) == ["the driver captured no graph: no graphs here"]
+    # The graphs of other calls are used as before.
+    before = len(started)
+    model.log_likelihood(cloud(50, 50), scan(1))
+    assert len(started) == before + 1
 
 
 def test_an_error_forgets_no_memory_that_launches_still_need(gathering, monkeypatch):

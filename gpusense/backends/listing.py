@@ -1,0 +1,148 @@
+"""The devices of this machine with the verdicts on them, and the backends that are absent with the remedies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from gpusense.backends import proof, registry
+from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.proof import Verdict
+from gpusense.backends.registry import BY_NAME, ENTRIES, Entry, Library
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device of this machine, or one that it could have.
+
+    Attributes:
+        backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
+        name: The name of the device, or of the absent part.
+        kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
+        available: Whether a model can run on it.
+        reason: Why not, with the remedy; empty where it is available. Where only some kernels can run, why the others
+            cannot.
+        selection: The value of ``backend=``; empty where it is absent.
+        driver: The name and version of the compiler's driver; empty where kernels are not compiled.
+        lanes: Particles or beams that one work-item computes at once; 1 leaves that to the compiler.
+        target: The processor for which the driver compiles; empty where it is not known.
+        float64: Whether models with ``precision="float64"`` can run on it.
+
+    Example:
+        >>> import gpusense as gs
+        >>> numpy = gs.devices()[0]
+        >>> numpy.name, numpy.kind, numpy.available, numpy.selection
+        ('NumPy reference', 'cpu', True, 'numpy')
+    """
+
+    backend: str
+    name: str
+    kind: str
+    available: bool
+    reason: str
+    selection: str
+    driver: str = ""
+    lanes: int = 1
+    target: str = ""
+    float64: bool = True
+
+
+def devices(*, anew: bool = False) -> list[Device]:
+    """Return every device of this machine, and every backend that is absent with the reason and the remedy.
+
+    A device that was not met before is proved first, which takes some seconds; see :mod:`gpusense.backends.proof`.
+
+    Args:
+        anew: Load all drivers and prove all devices again, as after a change that the keys of verdicts do not show.
+
+    Example:
+        >>> import gpusense as gs
+        >>> [device.selection for device in gs.devices() if device.backend == "numpy"]
+        ['numpy']
+    """
+    return [device for entry in ENTRIES for device in _devices_of(entry, anew=anew)]
+
+
+def present(entry: Entry) -> tuple[list[Device], list[Device]]:
+    """Return the devices of a backend, on which there need be no verdict yet, and its absent parts."""
+    library, absent = _absence(entry)
+    return ([] if library is None else [_device(info, library) for info, _ in library.list_devices()]), absent
+
+
+def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
+    """Return the library, the description and the handle of a device by its selection string.
+
+    Raises:
+        ValueError: the library cannot be imported, or has no such device.
+    """
+    library, reason = registry.load(BY_NAME[selection.partition(":")[0]])
+    if library is None:
+        raise ValueError(f"backend: {reason}, got {selection!r}")
+    for info, handle in library.list_devices():
+        if info.selection == selection:
+            return library, info, handle
+    raise ValueError(f"backend: must be a device that is present, got {selection!r}")
+
+
+def verdict_on(info: BackendInfo, handle: Any, library: Library, *, anew: bool = False) -> Verdict:
+    """Return the verdict on a device; simulators are slow and selected by name only, so they are trusted."""
+    if not BY_NAME[info.backend].compiles or library.is_simulator(info):
+        return proof.trust(info)
+    if trouble := library.trouble(handle):
+        return proof.unusable(trouble)
+    return proof.verdict_on(info, setup=library.child_setup(), anew=anew)
+
+
+def open_device(info: BackendInfo) -> Backend:
+    """Open a device without a verdict, with the lanes and precisions that ``info`` says.
+
+    Raises:
+        RuntimeError: its selection string means another device.
+    """
+    library, other, handle = lookup(info.selection)
+    if (other.name, other.driver) != (info.name, info.driver):
+        raise RuntimeError(f"{info.selection} is {other.name} ({other.driver}), not {info.name} ({info.driver})")
+    return library.open(info, handle)
+
+
+def short_driver(driver: str) -> str:
+    """Return a driver's name as users know it."""
+    return driver.replace("Portable Computing Language", "PoCL")
+
+
+def _devices_of(entry: Entry, *, anew: bool) -> list[Device]:
+    """Return the devices of one backend with the verdicts on them, and its absent parts."""
+    library, absent = _absence(entry, anew=anew)
+    if library is None:
+        return absent
+    rows = [(info, verdict_on(info, handle, library, anew=anew)) for info, handle in library.list_devices()]
+    return [*(_device(info, library, verdict) for info, verdict in rows), *absent]
+
+
+def _absence(entry: Entry, *, anew: bool = False) -> tuple[Library | None, list[Device]]:
+    """Return the library of a backend, and its absent parts: itself, drivers, devices."""
+    library, reason = registry.load(entry)
+    if library is None:
+        return None, [_absent(entry, f"{entry.name} (absent)", "cpu", f"{reason}: {entry.install}")]
+    if anew:
+        library.renew()
+    absent = [_absent(entry, *part) for part in library.absent()]
+    if not absent and not library.list_devices():
+        absent.append(_absent(entry, f"{entry.name} (no device)", "cpu", f"{library.no_device()}: {entry.install}"))
+    return library, absent
+
+
+def _absent(entry: Entry, name: str, kind: str, reason: str) -> Device:
+    return Device(entry.name, name, kind, False, reason, "")
+
+
+def _device(info: BackendInfo, library: Library, verdict: Verdict | None = None) -> Device:
+    """Return a device as users see it; without a verdict it is taken to be available."""
+    verdict = proof.trust(info) if verdict is None else verdict
+    reason = f"{verdict.reason}; {verdict.remedy}" if verdict.reason else ""
+    kind = "simulator" if library.is_simulator(info) else info.kind
+    driver = info.driver if BY_NAME[info.backend].compiles else ""
+    return Device(
+        info.backend, info.name, kind, verdict.usable, reason, info.selection, driver, verdict.lanes, info.target,
+        verdict.float64,
+    )  # fmt: skip

@@ -1,0 +1,22 @@
+"""NumPy as the registry sees it."""
+
+from __future__ import annotations
+
+from gpusense.backends.base import Backend, BackendInfo
+from gpusense.backends.numpy.backend import NumpyBackend, describe
+from gpusense.backends.registry import Library
+
+
+class NumpyLibrary(Library):
+    """One device: the host."""
+
+    def list_devices(self) -> list[tuple[BackendInfo, None]]:
+        """See Library.list_devices."""
+        return [(describe(), None)]
+
+    def open(self, info: BackendInfo, handle: None) -> Backend:
+        """See Library.open."""
+        return NumpyBackend(info)
+
+
+LIBRARY = NumpyLibrary()

@@ -1,0 +1,184 @@
+"""CUDA graphs: a call that repeats an earlier one, to the last pointer and number, is one start.
+
+A graph keeps pointers and numbers, so steps of equal keys need no more than the graph of the first ones.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
+
+_LOG = logging.getLogger("gpusense")
+
+# Graphs, keys of calls that were started once, and keys of calls that the driver does not capture, which are kept.
+_MOST_GRAPHS, _MOST_SEEN = 256, 512
+# The least recently used graph is evicted after this number of calls without it, in multiples of ``_MOST_GRAPHS``: a
+# capture takes longer than the starts that it replaces.
+_STALE = 16
+# Longer calls take so long that their starts do not matter.
+_MOST_STEPS = 64
+# Captures that fail one after the other until no more are tried.
+_MOST_FAILURES = 3
+# Prefix of the names of threads that share launches on the processor.
+HELPERS = "gpusense pieces"
+# Reasons for calls without a graph.
+FIRST = "a graph is captured when it is started again"
+SHORT = "a graph would save nothing"
+
+
+class Capture(NamedTuple):
+    """A try to capture steps.
+
+    Attributes:
+        graph: The graph; None where there is none.
+        reason: Why there is none.
+        final: Whether the driver refuses these steps, so that another try is of no use.
+    """
+
+    graph: Any
+    reason: str = ""
+    final: bool = False
+
+
+class GraphCache:
+    """Graphs of the calls of one device that repeat, and captures for recordings.
+
+    Attributes:
+        refusal: Why no graph is captured any more; empty while captures are tried.
+    """
+
+    def __init__(self, device: wp.Device) -> None:
+        self.refusal = ""
+        self._device = device
+        # The least recently used first, each with the number of the call that used it last.
+        self._graphs: dict[Hashable, tuple[Any, int]] = {}
+        self._calls = 0
+        self._seen: dict[Hashable, None] = {}
+        self._refused: dict[Hashable, str] = {}
+        self._failures = 0
+        self._lock = threading.Lock()
+        self._stream: wp.Stream | None = None
+
+    def start(self, steps: list[Step]) -> None:
+        """Start the steps of a call in their order."""
+        if len(steps) < 2:
+            reason = SHORT
+        elif len(steps) > _MOST_STEPS:
+            reason = f"a call of more than {_MOST_STEPS} launches and copies gains nothing by a graph"
+        elif self.refusal and not self._graphs:
+            reason = self.refusal
+        else:
+            key = tuple([step.key for step in steps])
+            # A graph must not be started by two threads at once.
+            with self._lock:
+                self._calls += 1
+                graph, _ = self._graphs.pop(key, (None, 0))
+                reason = ""
+                if graph is None:
+                    graph, reason, _ = self._captured(key, steps)
+                if graph is not None:
+                    _remember(self._graphs, key, (graph, self._calls), _MOST_GRAPHS)
+                    wp.capture_launch(graph)
+                    return
+                _remember(self._seen, key, None, _MOST_SEEN)
+        _note(steps, one_by_one, reason)
+        start_each(steps, None)
+
+    def capture(self, steps: list[Step]) -> Capture:
+        """Capture the steps of a recording and start none of them."""
+        if len(steps) < 2:
+            return Capture(None, SHORT, True)
+        with self._lock:
+            return self._capture(steps)
+
+    def _captured(self, key: Hashable, steps: list[Step]) -> Capture:
+        """Capture a call that was started before and has no graph."""
+        if self._seen.pop(key, key) is not None:
+            return Capture(None, FIRST)
+        if key in self._refused:
+            return Capture(None, self._refused[key], True)
+        if not self._has_room():
+            return Capture(None, f"{_MOST_GRAPHS} other calls have graphs that are in use")
+        capture = self._capture(steps)
+        if capture.final:
+            _remember(self._refused, key, capture.reason, _MOST_SEEN)
+        if capture.graph is not None:
+            _note(steps, as_graph)
+        return capture
+
+    def _has_room(self) -> bool:
+        """Return whether another graph may be kept."""
+        if len(self._graphs) < _MOST_GRAPHS:
+            return True
+        _, used = next(iter(self._graphs.values()))
+        return self._calls - used > _STALE * _MOST_GRAPHS
+
+    def _capture(self, steps: list[Step]) -> Capture:
+        """Capture steps where nothing prevents it.
+
+        During a capture Warp refuses to let other threads wait for the device, so only a thread that is alone captures.
+        Threads that share launches on the processor wait for no device.
+        """
+        if self.refusal:
+            return Capture(None, self.refusal, True)
+        if others := _other_threads():
+            return Capture(None, f"another thread is alive: {', '.join(others)}")
+        try:
+            graph = self._captured_graph(steps)
+        except RuntimeError as error:
+            return self._failed(str(error))
+        self._failures = 0
+        return Capture(graph)
+
+    def _captured_graph(self, steps: list[Step]) -> Any:
+        """Return the graph of steps.
+
+        Raises:
+            RuntimeError: the driver does not capture them.
+        """
+        if self._device.is_cuda and self._stream is None:
+            self._stream = wp.Stream(self._device)
+        where = {"stream": self._stream} if self._device.is_cuda else {"device": self._device}
+        wp.capture_begin(**where, force_module_load=False)
+        try:
+            start_each(steps, self._stream)
+        finally:
+            graph = wp.capture_end(**where)
+        return graph
+
+    def _failed(self, error: str) -> Capture:
+        """Give up the graph of some steps, and after several failures in a row all graphs."""
+        self._failures += 1
+        reason = f"the driver captured no graph: {error}"
+        if self._failures >= _MOST_FAILURES:
+            reason = self.refusal = f"no graph is captured after {self._failures} failures in a row: {error}"
+        _LOG.warning("gpusense: launches on %s are started one by one: %s", self._device, reason)
+        return Capture(None, reason, True)
+
+
+def _note(steps: list[Step], words: Callable[..., str], *reason: str) -> None:
+    """Let steps that report it note how their call is started."""
+    listeners = [step for step in steps if step.reports]
+    if listeners:
+        started = words(steps, *reason)
+        for step in listeners:
+            step.note(started)
+
+
+def _other_threads() -> list[str]:
+    """Return the names of threads that may wait for the device."""
+    this = threading.current_thread()
+    return [one.name for one in threading.enumerate() if one is not this and not one.name.startswith(HELPERS)]
+
+
+def _remember(entries: dict[Hashable, Any], key: Hashable, value: Any, most: int) -> None:
+    """Keep a value as the newest of at most ``most``."""
+    entries[key] = value
+    if len(entries) > most:
+        del entries[next(iter(entries))]

@@ -1,0 +1,71 @@
+"""Steps of a call on a Warp device: launches, copies and recordings, which can wait to be started."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Sequence
+
+import warp as wp
+
+from gpusense.backends.base import counted
+
+
+class Step(ABC):
+    """Work that a stream does.
+
+    Attributes:
+        key: The work and its memory: steps of equal keys are the same.
+        launches: Launches in it.
+        copies: Copies in it.
+        reports: Whether it reports how the call with it is started.
+    """
+
+    key: Hashable
+    launches: int = 0
+    copies: int = 0
+    reports: bool = False
+
+    @abstractmethod
+    def start(self, stream: wp.Stream | None) -> None:
+        """Start it on a stream, or on the device's current one."""
+
+    def note(self, started: str) -> None:  # noqa: B027
+        """Note how the call with this step is started."""
+
+
+class Copy(Step):
+    """A copy of the first numbers of an array into another."""
+
+    copies = 1
+
+    def __init__(self, target: wp.array, source: wp.array, count: int) -> None:
+        self._arguments = (target, source, count)
+        self.key = (target.ptr, source.ptr, count)
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """See Step.start."""
+        target, source, count = self._arguments
+        wp.copy(target, source, count=count, stream=stream)
+
+
+def start_each(steps: Sequence[Step], stream: wp.Stream | None) -> None:
+    """Start steps one by one in their order."""
+    for step in steps:
+        step.start(stream)
+
+
+def contents(steps: Sequence[Step]) -> str:
+    """Return the launches and copies of steps in words: ``"3 launches and 2 copies"``."""
+    launches = counted(sum(step.launches for step in steps), "launch")
+    copies = sum(step.copies for step in steps)
+    return f"{launches} and {counted(copies, 'copy')}" if copies else launches
+
+
+def as_graph(steps: Sequence[Step]) -> str:
+    """Return in words that steps are started as one graph."""
+    return f"one CUDA graph of {contents(steps)}"
+
+
+def one_by_one(steps: Sequence[Step], reason: str) -> str:
+    """Return in words that steps are started one by one, and why."""
+    return f"{contents(steps)} one by one: {reason}"

@@ -1,0 +1,191 @@
+"""Defaults of ``Backend``, and ``Proxy``, which forwards everything to another backend."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpusense.backends import Backend, get_backend
+from gpusense.backends.base import Proxy, Recording, counted
+from gpusense.interface.launches import Launch
+
+INT, REAL = np.dtype(np.int32), np.dtype(np.float32)
+FILL = "fill_field"
+
+
+class Plain(Backend):
+    """A backend with abstract methods only: buffers are arrays, and launches are listed."""
+
+    info = get_backend("numpy").info
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+
+    def upload(self, array, out=None, *, wait=True):
+        self.calls.append(("upload", wait))
+        return array.copy() if out is None else out
+
+    def empty(self, count, dtype, *, zero=False):
+        self.calls.append(("empty", count, zero))
+        return np.zeros(count, dtype)
+
+    def download(self, buffer, out, *, wait=True):
+        self.calls.append(("download", wait))
+        return out
+
+    def part(self, buffer, first, count, dtype):
+        self.calls.append(("part", first, count))
+        return buffer[first : first + count]
+
+    def compile(self, kernel, flags):
+        return lambda size, *arguments: self.calls.append((kernel, flags, size, arguments))
+
+    def synchronize(self):
+        self.calls.append(("synchronize",))
+
+
+class Watching(Proxy):
+    """A proxy that lists the kernels that are launched."""
+
+    def __init__(self, backend: Backend) -> None:
+        super().__init__(backend)
+        self.kernels: list[str] = []
+
+    def compile(self, kernel, flags):
+        launcher = super().compile(kernel, flags)
+
+        def watched(size, *arguments):
+            self.kernels.append(kernel)
+            launcher(size, *arguments)
+
+        return watched
+
+
+def program(*kernels: str) -> tuple[Launch, ...]:
+    return tuple(Launch(kernel, frozenset({"A"}), (i,), (i, "b")) for i, kernel in enumerate(kernels))
+
+
+def test_a_program_is_started_launch_by_launch():
+    device = Plain()
+    device.run(program("one", "two"))
+    assert device.calls == [("one", {"A"}, (0,), (0, "b")), ("two", {"A"}, (1,), (1, "b"))]
+
+
+def test_a_recording_starts_nothing_until_it_is_called():
+    device = Plain()
+    recording = device.record(program("one", "two"))
+    assert isinstance(recording, Recording) and device.calls == []
+    recording()
+    device.replay(recording)
+    assert [call[0] for call in device.calls] == ["one", "two"] * 2
+    recording.wait()
+    assert device.calls[-1] == ("synchronize",)
+    assert recording.explain() == "2 launches one by one: numpy has no graphs"
+    with pytest.raises(TypeError, match="stream: must be None on numpy, got 3"):
+        recording(3)
+
+
+def test_abilities_that_a_backend_lacks():
+    """They do nothing where that is correct; else the message names the device."""
+    device, array = Plain(), np.zeros(3)
+    device.gather()
+    device.start()
+    device.scatter()
+    device.check_process()
+    assert (device.gathers, device.replays, device.reads(array), device.alignment) == (False, False, False, 1)
+    assert device.address(array) == id(array) and device.calls == []
+    assert device.blank(2, INT).shape == (2,) and device.calls == [("empty", 2, False)]
+    with pytest.raises(TypeError, match="poses: must be in host memory for numpy, got an array on a device"):
+        device.adopt(array, "poses")
+    with pytest.raises(TypeError, match="numpy does not copy between buffers"):
+        device.copy(array, array, 8)
+    with pytest.raises(TypeError, match="numpy does not lend buffers"):
+        device.lend(array, (3,), REAL)
+
+
+def public(kind: type) -> set[str]:
+    return {name for name in vars(kind) if not name.startswith("_")}
+
+
+def test_a_proxy_defines_every_method():
+    """But those that start programs, which use ``compile``."""
+    assert public(Backend) - public(Proxy) == {"run", "record", "replay"}
+    for name in public(Backend) & public(Proxy):
+        mine, theirs = getattr(Proxy, name), getattr(Backend, name)
+        if callable(theirs):
+            assert inspect.signature(mine) == inspect.signature(theirs), name
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "options"),
+    [
+        ("upload", (1, 2), {"wait": False}),
+        ("empty", (1, 2), {"zero": True}),
+        ("download", (1, 2), {"wait": False}),
+        ("part", (1, 2, 3, 4), {}),
+        ("compile", (1, 2), {}),
+        ("synchronize", (), {}),
+        ("gather", (), {}),
+        ("start", (), {}),
+        ("scatter", (), {}),
+        ("address", (1,), {}),
+        ("check_process", (), {}),
+        ("reads", (1,), {}),
+        ("adopt", (1, "poses"), {"in_place": True}),
+        ("blank", (1, 2), {}),
+        ("copy", (1, 2, 3), {"begin": 4, "to": 5}),
+        ("lend", (1, 2, 3), {}),
+    ],
+)
+def test_a_proxy_forwards_methods(name, arguments, options, monkeypatch):
+    device, seen = Plain(), []
+
+    def method(*positional, **named):
+        seen.append((positional, named))
+        return "result"
+
+    monkeypatch.setattr(device, name, method, raising=False)
+    result = getattr(Proxy(device), name)(*arguments, **options)
+    assert seen == [(arguments, options)]
+    assert result in ("result", None)
+
+
+def test_a_proxy_forwards_properties():
+    class Able(Plain):
+        alignment = 256
+        gathers = replays = True
+
+    proxy = Proxy(Able())
+    assert (proxy.info, proxy.alignment, proxy.gathers, proxy.replays) == (Plain.info, 256, True, True)
+
+
+def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):
+    """Of real devices: the results are theirs, and every launch goes through ``compile``."""
+    device = Watching(get_backend(backend))
+    squared = device.upload(np.arange(6, dtype=INT))
+    density, table = device.upload(np.arange(10, dtype=REAL)), device.empty(7 * 6, REAL, zero=True)
+    arguments = (squared, density, table, 3, 2, 9, 0.0, 0, 0, 2, 3, 14, 6)
+    one = Launch(FILL, frozenset(), (2, 3), arguments)
+    device.run((one, one))
+    assert device.kernels == [FILL] * 2
+    recording = device.record((one,))
+    assert device.kernels == [FILL] * 2
+    for _ in range(3):
+        recording()
+    device.replay(recording)
+    recording.wait()
+    assert device.kernels == [FILL] * 6
+    found = device.download(table, np.empty((7, 6), REAL))[2:-2, 2:-2]
+    np.testing.assert_array_equal(found, np.arange(6).reshape(3, 2))
+    assert get_backend(device) is device
+
+
+@pytest.mark.parametrize(
+    ("number", "noun", "text"),
+    [(0, "launch", "0 launches"), (1, "launch", "1 launch"), (3, "launch", "3 launches"), (2, "copy", "2 copies")],
+)
+def test_numbers_in_words(number, noun, text):
+    assert counted(number, noun) == text

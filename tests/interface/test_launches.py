@@ -1,0 +1,88 @@
+"""Launches bind arguments by name, and hold them to the signature table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpusense.interface.launches import Launch, flags_of, launch
+from gpusense.interface.signatures import KERNELS
+
+KERNEL = "fill_field"
+BUFFER = object()
+VALUES = dict(
+    squared=BUFFER, density=BUFFER, table=BUFFER, rows=3, cols=2, cap=9, beyond=0.5, from_col=0, from_row=0, width=2,
+    height=3, begin=14, stride=6,
+)  # fmt: skip
+
+
+def bind(**changes) -> Launch:
+    return launch(KERNEL, ("FLOAT64",), (2, 3), **{**VALUES, **changes})
+
+
+def test_arguments_are_in_the_order_of_the_row_whatever_their_order():
+    names = [argument.name for argument in KERNELS[KERNEL].arguments]
+    assert set(names) == set(VALUES)
+    bound = bind()
+    assert bound.arguments == tuple(VALUES[name] for name in names)
+    assert launch(KERNEL, ["FLOAT64"], (2, 3), **dict(reversed(VALUES.items()))) == bound
+    assert (bound.kernel, bound.flags, bound.size) == (KERNEL, frozenset({"FLOAT64"}), (2, 3))
+
+
+def test_named_is_the_inverse():
+    assert bind().named() == VALUES
+    assert launch(KERNEL, (), (2, 3), **bind(cap=4).named()).named() == {**VALUES, "cap": 4}
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_every_kernel_takes_the_names_of_its_row(kernel):
+    row = KERNELS[kernel].arguments
+    values = {one.name: BUFFER if one.shape is not None else 1 for one in row}
+    assert launch(kernel, (), (1,), **values).named() == values
+
+
+def test_missing_and_unknown_arguments_are_named():
+    fewer = {name: value for name, value in VALUES.items() if name not in ("cap", "stride")}
+    rule = f"^{KERNEL}: arguments must be those of its signature, got "
+    with pytest.raises(TypeError, match=rule + "missing cap, stride$"):
+        launch(KERNEL, (), (2, 3), **fewer)
+    with pytest.raises(TypeError, match=rule + "unknown colour$"):
+        bind(colour=1)
+    with pytest.raises(TypeError, match=rule + "missing cap, stride and unknown cape, width_$"):
+        launch(KERNEL, (), (2, 3), **fewer, cape=1, width_=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "rule"),
+    [
+        ("table", 3, "a buffer, got a int"),
+        ("table", np.float32(3), "a buffer, got a float32"),
+        ("cap", 3.0, "an integer, got a float"),
+        ("cap", np.float64(3), "an integer, got a float64"),
+        ("cap", BUFFER, "an integer, got a object"),
+        ("beyond", BUFFER, "a number, got a object"),
+        ("beyond", np.zeros(1), "a number, got a ndarray"),
+        ("beyond", "1", "a number, got a str"),
+    ],
+)
+def test_a_mistyped_argument_is_named(name, value, rule):
+    for _ in range(2):
+        with pytest.raises(TypeError, match=rf"^{KERNEL}: {name} must be {rule}$"):
+            bind(**{name: value})
+    bind()
+
+
+@pytest.mark.parametrize(("name", "value"), [("cap", np.int64(3)), ("beyond", 3), ("beyond", np.float32(3))])
+def test_numbers_of_numpy_and_integers_for_real_numbers_are_taken(name, value):
+    assert bind(**{name: value}).named()[name] is value
+
+
+def test_an_unknown_kernel():
+    with pytest.raises(KeyError, match="no_kernel"):
+        launch("no_kernel", (), (1,))
+
+
+def test_flags_of_a_program_are_those_of_all_launches():
+    first, second = bind(), launch(KERNEL, ("LINEAR", "LOG_TABLE"), (1, 1), **VALUES)
+    assert flags_of((first, second)) == {"FLOAT64", "LINEAR", "LOG_TABLE"}
+    assert flags_of(()) == frozenset()

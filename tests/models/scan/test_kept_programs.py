@@ -1,0 +1,54 @@
+"""Programs of earlier calls are repeated with the numbers of the call."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.scan_calls import FIELD, GRID, MODELS, NEAR, cloud, mixed
+
+from gpusense.backends import Backend, get_backend
+from gpusense.backends.base import Proxy
+from gpusense.evaluation.tolerances import differing
+from gpusense.interface.signatures import KERNELS
+
+GUARD = [argument.name for argument in KERNELS["score_field"].arguments].index("guard")
+
+
+class Guards(Proxy):
+    """A backend that lists the bounds of rounding errors with which likelihood fields are read."""
+
+    def __init__(self, backend: Backend) -> None:
+        super().__init__(backend)
+        self.guards: list[float] = []
+
+    def compile(self, kernel, flags):
+        launcher = super().compile(kernel, flags)
+
+        def listed(size, *arguments):
+            if kernel == "score_field":
+                self.guards.append(arguments[GUARD])
+            launcher(size, *arguments)
+
+        return listed
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+def test_the_bound_of_rounding_errors_follows_the_longest_reading(backend, gpu, as_gpu):
+    """End points of longer readings have larger errors: a kept program is started with the bound of the scan."""
+    as_gpu(gpu)
+    device = Guards(get_backend(backend))
+    model = FIELD(GRID, NEAR, backend=device)
+    lengths = [0.5, 4.0, 0.5, 4.0, 4.01]
+    for length in lengths:
+        model.log_likelihood(cloud(1), np.full(NEAR.count, length), per_beam=gpu)
+    needed = [model._pipeline._guard * (length / GRID.resolution + 2) for length in lengths]
+    assert device.guards == pytest.approx(needed, rel=1e-15)
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_scans_in_any_order_have_the_bits_of_first_calls(kind, backend):
+    model = kind(GRID, NEAR, backend=backend)
+    for seed in (1, 2, 1, 3):
+        scan = mixed(seed)
+        expected = kind(GRID, NEAR, backend=backend).log_likelihood(cloud(seed), scan)
+        assert differing(model.log_likelihood(cloud(seed), scan), expected) == 0

@@ -1,4 +1,4 @@
-"""Ways to find expected ranges, for ``RayCaster(caster=...)`` and ``BeamModel(caster=...)``."""
+"""Casters: methods for expected ranges, for ``RayCaster(caster=...)`` and ``BeamModel(caster=...)``."""
 
 from gpusense.tables.casters import CASTERS, Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
 

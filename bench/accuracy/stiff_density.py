@@ -84,7 +84,7 @@ def sweep(precision: str, shares: np.ndarray, weights: tuple[float, ...], places
         exact, naive = (exact_hit, naive_log_hit) if hit else (exact_short, naive_log_short)
         truth = [exact(float(a), float(b), shape) for a, b in zip(z, expected, strict=True)]
         with np.errstate(all="ignore"):
-            found = log_density(model._components, z, expected, model._terms)
+            found = log_density(model._pipeline.mixture.flags, z, expected, model._pipeline.mixture.terms)
         ours.append(in_eps(found, truth, precision).max())
         top = (real.type(RANGE_MAX),) if hit else ()
         textbook.append(in_eps(naive(z, expected, real.type(shape), *top), truth, precision).max())

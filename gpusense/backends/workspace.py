@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Backend, Buffer, Recording
 from gpusense.interface.launches import Program, flags_of
 
 # Programs of earlier calls that are kept.
@@ -19,6 +18,33 @@ _ALIGNED = 64
 POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
+class _Kept:
+    """A program of an earlier call.
+
+    Attributes:
+        flags: Flags of its launches.
+        recording: Its recording, which holds no buffers; None where launches are bound anew.
+    """
+
+    def __init__(
+        self, program: Program, flags: frozenset[str], recording: Recording | None, numbers: dict[str, float]
+    ) -> None:
+        self.flags, self.recording, self._numbers = flags, recording, numbers
+        self._program = program if recording is None else ()
+        # Launches and arguments that change from call to call.
+        self._places = [(i, j, name) for i, one in enumerate(self._program) for j, name in one.places(numbers)]
+
+    def with_numbers(self, numbers: dict[str, float]) -> Program:
+        """Return the program with the numbers of a call."""
+        if numbers == self._numbers:
+            return self._program
+        program = list(self._program)
+        for i, j, name in self._places:
+            arguments = program[i].arguments
+            program[i] = program[i]._replace(arguments=(*arguments[:j], numbers[name], *arguments[j + 1 :]))
+        return tuple(program)
+
+
 class Workspace:
     """Named buffers that only grow, and programs that use them."""
 
@@ -27,8 +53,8 @@ class Workspace:
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
-        # Programs of earlier calls or their recordings, with their flags, by everything on which they depend.
-        self._programs: dict[Hashable, tuple[Any, frozenset[str]]] = {}
+        # Programs of earlier calls, by everything on which they depend.
+        self._programs: dict[Hashable, _Kept] = {}
         self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
 
@@ -55,12 +81,20 @@ class Workspace:
         self._backend.start()
 
     def run(
-        self, key: Hashable, buffers: Iterable[Buffer], make: Callable[[], Program], *, version: int, lasting: bool
+        self,
+        key: Hashable,
+        numbers: dict[str, float],
+        buffers: Iterable[Buffer],
+        make: Callable[[], Program],
+        *,
+        version: int,
+        lasting: bool,
     ) -> frozenset[str]:
         """Run a program on this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
 
         Args:
-            key: All sizes, numbers and flags on which the program depends.
+            key: All sizes and flags on which the program depends, and all numbers that seldom change.
+            numbers: Arguments that change from call to call.
             buffers: Its buffers that are not of this workspace; None stands for no buffer.
             make: Returns the program.
             version: The version of the map's table; programs of other versions are dropped.
@@ -78,21 +112,21 @@ class Workspace:
             program = make()
             backend.run(program)
             return flags_of(program)
-        key = (records, key, *[0 if buffer is None else backend.address(buffer) for buffer in buffers])
-        entry = self._programs.get(key)
-        if entry is None:
+        # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
+        fixed = tuple(numbers.items()) if records else ()
+        key = (records, key, fixed, *[0 if buffer is None else backend.address(buffer) for buffer in buffers])
+        kept = self._programs.get(key)
+        if kept is None:
             program = make()
-            # A recording keeps no buffer alive; addresses of buffers are in its key.
-            work: Any = backend.record(program) if records else program
-            entry = work, flags_of(program)
+            kept = _Kept(program, flags_of(program), backend.record(program) if records else None, numbers)
             if len(self._programs) >= _MOST_KEPT:
                 del self._programs[next(iter(self._programs))]
-            self._programs[key] = entry
-        if records:
-            backend.replay(entry[0])
+            self._programs[key] = kept
+        if kept.recording is not None:
+            backend.replay(kept.recording)
         else:
-            backend.run(entry[0])
-        return entry[1]
+            backend.run(kept.with_numbers(numbers))
+        return kept.flags
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost.

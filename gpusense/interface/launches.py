@@ -5,7 +5,7 @@ A program is a tuple of launches. It is data: tests read it, backends run it or 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -31,6 +31,10 @@ class Launch(NamedTuple):
     flags: frozenset[str]
     size: tuple[int, ...]
     arguments: tuple[Any, ...]
+
+    def places(self, names: Container[str]) -> list[tuple[int, str]]:
+        """Return the positions and names of those arguments of a set of names that the kernel has."""
+        return [(place, name) for place, name in enumerate(_names(self.kernel)) if name in names]
 
     def named(self) -> dict[str, Any]:
         """Return the arguments by name."""

@@ -91,11 +91,6 @@ class Peer:
     constant_term: float
     outside: str
 
-    @property
-    def beam_lead(self) -> float:
-        """Old name of ``constant_term``."""
-        return self.constant_term
-
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
         """Convert readings to the peer's classes: NaN is left out, +inf is a max reading, all others are ranges.
 

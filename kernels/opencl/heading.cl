@@ -5,7 +5,7 @@
 // the constants.
 
 // Up to this heading the counts of quarter turns have 20 bits.
-#define LIMIT 1048576.0
+#define LARGEST_HEADING 1048576.0
 #define TWO_OVER_PI 0.6366197723675814
 // 1.5 * 2^52: a sum with it is rounded to an integer.
 #define ROUNDER 6755399441055744.0
@@ -68,7 +68,7 @@ double2 pair_product_float64(const double2 a, const double2 b) {
     return two_sum_float64(product, error + (a.x * b.y + a.y * b.x));
 }
 
-// Reduce a heading of at most LIMIT.
+// Reduce a heading of at most LARGEST_HEADING.
 Turn reduce_ordinary(const double theta) {
     const double count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER;
     // The first product and difference are exact, and so are the next two products.
@@ -82,7 +82,7 @@ Turn reduce_ordinary(const double theta) {
 }
 
 #if HUGE_HEADINGS
-// Reduce a heading above LIMIT, up to the largest number.
+// Reduce a heading above LARGEST_HEADING, up to the largest number.
 Turn reduce_huge(const double theta) {
     const ulong bits = as_ulong(fabs(theta));
     const ulong mantissa = (bits & 0xFFFFFFFFFFFFFUL) | 0x10000000000000UL;
@@ -122,7 +122,7 @@ Turn reduce_huge(const double theta) {
 // Return (cosine, sine) of a heading; for a heading that is not finite they have no meaning but are not NaN.
 double2 cos_sin(const double theta) {
 #if HUGE_HEADINGS
-    const Turn turn = fabs(theta) <= LIMIT ? reduce_ordinary(theta) : reduce_huge(theta);
+    const Turn turn = fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta);
 #else
     const Turn turn = reduce_ordinary(theta);
 #endif

@@ -14,7 +14,7 @@ import warp as wp
 from . import error_free
 
 # Up to this heading the counts of quarter turns have 20 bits.
-LIMIT = wp.constant(wp.float64(1048576.0))
+LARGEST_HEADING = wp.constant(wp.float64(1048576.0))
 TWO_OVER_PI = wp.constant(wp.float64(0.6366197723675814))
 # 1.5 * 2^52: a sum with it is rounded to an integer.
 ROUNDER = wp.constant(wp.float64(6755399441055744.0))
@@ -65,7 +65,7 @@ def functions(flags):
     two_sum, pair_product = transformations.two_sum, transformations.pair_product
     HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
-    # Reduce a heading of at most LIMIT to quarter turns modulo 4 and the sum of two numbers.
+    # Reduce a heading of at most LARGEST_HEADING to quarter turns modulo 4 and the sum of two numbers.
     @wp.func
     def reduce_ordinary(theta: wp.float64):
         count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER
@@ -75,7 +75,7 @@ def functions(flags):
         low = (first.y + second.y) - count * QUARTER_4
         return int(count) & 3, two_sum(second.x, low)
 
-    # Reduce a heading above LIMIT, up to the largest number.
+    # Reduce a heading above LARGEST_HEADING, up to the largest number.
     @wp.func
     def reduce_huge(theta: wp.float64):
         bits = wp.cast(wp.abs(theta), wp.uint64)
@@ -130,7 +130,7 @@ def functions(flags):
         quadrant = int(0)
         rest = wp.vec2d()
         if HUGE_HEADINGS:
-            if wp.abs(theta) <= LIMIT:
+            if wp.abs(theta) <= LARGEST_HEADING:
                 quadrant, rest = reduce_ordinary(theta)
             else:
                 quadrant, rest = reduce_huge(theta)

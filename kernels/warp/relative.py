@@ -16,7 +16,7 @@ QUARTER, QUARTER_LOW = wp.constant(wp.float64(1.5707963267948966)), wp.constant(
 HALF_TURN, MINUS_HALF_TURN = wp.constant(wp.float64(3.141592653589793)), wp.constant(wp.float64(-3.141592653589793))
 ZERO, FOUR = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(4.0))
 MINUS_FOUR = wp.constant(wp.float64(-4.0))
-LIMIT = wp.constant(wp.float64(1048576.0))
+LARGEST_HEADING = wp.constant(wp.float64(1048576.0))
 
 
 @functools.cache
@@ -37,7 +37,7 @@ def make(name, flags):
         quadrant = int(0)
         rest = wp.vec2d()
         if HUGE_HEADINGS:
-            if wp.abs(theta) <= LIMIT:
+            if wp.abs(theta) <= LARGEST_HEADING:
                 quadrant, rest = reduce_ordinary(theta)
             else:
                 quadrant, rest = reduce_huge(theta)

@@ -197,6 +197,7 @@ print(gs.RayCaster(grid, 10.0, backend={backend!r}).cast([[2.5, 1.5, 1.570796326
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["opencl", "warp"])
 def test_two_processes_may_start_with_a_cold_cache_at_once(needs, family, tmp_path):
     places = ("GPUSENSE_CACHE_DIR", "POCL_CACHE_DIR", "XDG_CACHE_HOME", "WARP_CACHE_PATH")

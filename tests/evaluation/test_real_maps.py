@@ -98,6 +98,7 @@ def test_end_points_on_edges_do_not_breach(data_dir):
     assert [check for check in checks if not check.passed] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMPARED)
 def test_backends_agree(data_dir, name):
     """Distances, squares, ranges to the bit, and both models in both precisions, with the truth and pairwise."""
@@ -108,6 +109,7 @@ def test_backends_agree(data_dir, name):
     assert {"distance transform", "float32 beam model, beams"} <= {check.quantity for check in checks}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMPARED)
 def test_ranges_are_numpys(data_dir, name):
     scene, backends = scene_of(data_dir, name)
@@ -143,6 +145,7 @@ def test_yaw_of_a_map_turns_its_poses(data_dir):
     assert np.quantile(np.abs(ranges[0] - ranges[1]), 0.999) < 1e-9
 
 
+@pytest.mark.slow
 def test_distance_transform_of_120_million_cells(gigantic, opencl):
     """Exact at 100 000 places all over the map and its corners, by a search among all obstacles; no memory for more."""
     obstacles = gigantic.obstacles()
@@ -158,6 +161,7 @@ def test_distance_transform_of_120_million_cells(gigantic, opencl):
     assert np.count_nonzero(found == 0) == len(walls)
 
 
+@pytest.mark.slow
 def test_models_on_120_million_cells(gigantic, opencl):
     """Particles all over the map, so that none of it is left out: log-likelihoods against the float64 truth."""
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.08, count=51, range_max=30.0)
@@ -178,6 +182,7 @@ def test_models_on_120_million_cells(gigantic, opencl):
         assert differing(launch.parts, parts[:, gs.classify(ranges, scanner) == gs.Reading.HIT]) == 0
 
 
+@pytest.mark.slow
 def test_ranges_on_120_million_cells(gigantic, opencl):
     """OpenCL with the whole map prepared against NumPy, which prepares a window for each cluster of poses."""
     random, bearings = np.random.default_rng(2), np.linspace(-math.pi, math.pi, 40)

@@ -7,6 +7,7 @@ nothing else ever chooses them.
 
 from __future__ import annotations
 
+import pytest
 from support.checkers import check, complaints, run
 
 _WORK = """
@@ -190,6 +191,7 @@ def test_oclgrind_detects_a_write_out_of_bounds():
     assert any("Invalid write" in line for line in complaints(run(_OUT_OF_BOUNDS)))
 
 
+@pytest.mark.slow
 def test_every_warp_kernel_runs_clean_and_right_with_bounds_checks(needs):
     needs("warp")
     check(run(_WORK, "warp:cpu"))

@@ -112,7 +112,7 @@ def test_constants_are_those_that_were_derived_in_all_three_languages(needs):
     assert sine_error < -56 and cosine_error < -59
     expected = {f"S{i}": value for i, value in enumerate(sine)} | {f"C{i}": value for i, value in enumerate(cosine)}
     expected |= {f"QUARTER_{i}": value for i, value in enumerate(quarters, 1)}
-    expected |= {"QUARTER": pair[0], "QUARTER_LOW": pair[1], "TWO_OVER_PI": 2 / math.pi, "LIMIT": 2.0**20}
+    expected |= {"QUARTER": pair[0], "QUARTER_LOW": pair[1], "TWO_OVER_PI": 2 / math.pi, "LARGEST_HEADING": 2.0**20}
     expected |= {"ROUNDER": 1.5 * 2.0**52}
     text, warp = opencl_source("heading"), warp_module("heading")
     defined = {name: float(value) for name, value in re.findall(r"^#define (\w+) (\S+)$", text, re.MULTILINE)}
@@ -168,7 +168,7 @@ def launch(
     """Return the kernel's outputs on a device."""
     count, dtype = len(given_poses), np.dtype(real)
     flags = set(names) | ({"FLOAT64"} if real == "float64" else set())
-    if (np.abs(given_poses[:, 2]) > heading.LIMIT).any():
+    if (np.abs(given_poses[:, 2]) > heading.LARGEST_HEADING).any():
         flags.add("HUGE_HEADINGS")
     if given_poses.dtype == np.float32:
         flags.add("POSES_FLOAT32")

@@ -173,19 +173,19 @@ class _ModelRunner:
         return None if size is None else int(size)
 
 
-def _ranges(method: Caster) -> Make:
+def _ranges(caster: Caster) -> Make:
     def make(scene: Scene, backend: Backend, precision: str) -> Runner:
         limit, bearings = scene.scanner.range_max, scene.scanner.bearings
-        caster = RayCaster(scene.grid, limit, method=method, backend=backend, precision=precision)
-        return _ModelRunner(caster, lambda poses: caster.cast(poses, bearings))
+        ray_caster = RayCaster(scene.grid, limit, caster=caster, backend=backend, precision=precision)
+        return _ModelRunner(ray_caster, lambda poses: ray_caster.cast(poses, bearings))
 
     return make
 
 
-def _beam(method: Caster, share: int = 1, **options: Any) -> Make:
+def _beam(caster: Caster, share: int = 1, **options: Any) -> Make:
     def make(scene: Scene, backend: Backend, precision: str) -> Runner:
         model = BeamModel(
-            scene.grid, scene.scanner, scene.beam, backend=backend, precision=precision, caster=method,
+            scene.grid, scene.scanner, scene.beam, backend=backend, precision=precision, caster=caster,
             beams=_beams(scene, share), **options,
         )  # fmt: skip
         return _ModelRunner(model, lambda poses: model.log_likelihood(poses, scene.readings))

@@ -107,7 +107,7 @@ class BeamModel(ScanModel):
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize,
             z_max=max(p.z_max for p in mixtures) if table is None else 1.0, max_depends=max_depends,
-            constant_term=0.0 if peer is None else peer.beam_lead,
+            constant_term=0.0 if peer is None else peer.constant_term,
             # Where max readings depend on the pose, the kernel finds impossible ranges.
             possible=max_depends or any(p.z_hit or p.z_short or p.z_rand for p in mixtures),
         )  # fmt: skip

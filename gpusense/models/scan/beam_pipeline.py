@@ -98,7 +98,7 @@ class BeamPipeline(ScanPipeline):
             scans.scans, scans.most_rays, scans.most_readings, frozenset(flags),
             dict(ray=given["ray"], reading=given["reading"], first=first, start=start),
             dict(counts=counts, fixed_of=given.get("fixed_of", self._terms), fixed=fixed),
-            (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings), fixed),
+            (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings)),
         )  # fmt: skip
 
     def sensing(self) -> Sensing:
@@ -154,11 +154,11 @@ class BeamPipeline(ScanPipeline):
             **caster.knobs, **self._constants, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
-            sums = dict(fixed_of=readings.sums["fixed_of"], fixed=readings.sums["fixed"])
+            common |= self.numbers(scoring)
             return (
                 launch(
-                    "score_beams", scoring.flags, (count,), **common, **sums, log_p=scoring.log_p,
-                    temperature=self.setting.temperature, ahead=0,
+                    "score_beams", scoring.flags, (count,), **common, fixed_of=readings.sums["fixed_of"],
+                    log_p=scoring.log_p, temperature=self.setting.temperature, ahead=0,
                 ),
             )  # fmt: skip
         order = self.nothing if scoring.tiles.order is None else scoring.tiles.order.order

@@ -119,7 +119,6 @@ class FieldPipeline(ScanPipeline):
         if not self.specialize:
             high[~finite] = cells[~finite, None]
         longest = float(np.maximum.reduce(lengths))
-        # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, and 1.5 eps.
         arrays = dict(point=high, point_low=low)
         if self.backend.info.kind == "gpu":
             arrays["guard"] = (self._guard * (self._longest_of_blocks(lengths, scans) + 2)).astype(self.real)
@@ -137,7 +136,7 @@ class FieldPipeline(ScanPipeline):
             scans.scans, scans.most_rays, scans.most_readings, frozenset({"SCANS"} if several else ()),
             dict(point=given["point"], point_low=given["point_low"], guard=given.get("guard"), start=start),
             dict(counts=counts, fixed_of=given.get("fixed_of", self._terms), fixed=fixed),
-            (scans.scans, scans.most_readings, len(scans.readings), fixed), longest + 2,
+            (scans.scans, scans.most_readings, len(scans.readings)), longest + 2,
         )  # fmt: skip
 
     def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:
@@ -185,6 +184,14 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.layout."""
         return readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1
 
+    def numbers(self, scoring: Scoring) -> dict[str, float]:
+        """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
+        numbers = super().numbers(scoring)
+        if scoring.tiles is None:
+            # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
+            numbers["guard"] = self._guard * scoring.readings.reach
+        return numbers
+
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""
         placed, readings, parts = scoring.placed, scoring.readings, scoring.parts
@@ -197,12 +204,11 @@ class FieldPipeline(ScanPipeline):
         if scoring.tiles is None:
             # Vectors of particles hold those of one scan.
             size = readings.scans * -(-per_scan // _GROUP) * _GROUP if "WIDE" in scoring.flags else count
-            common |= dict(fixed_of=readings.sums["fixed_of"], fixed=readings.sums["fixed"])
-            common |= dict(guard=self._guard * readings.rounded_reach)
+            common |= self.numbers(scoring)
             return (
                 launch(
-                    "score_field", scoring.flags, (size,), **common, log_p=scoring.log_p,
-                    temperature=self.setting.temperature, ahead=0,
+                    "score_field", scoring.flags, (size,), **common, fixed_of=readings.sums["fixed_of"],
+                    log_p=scoring.log_p, temperature=self.setting.temperature, ahead=0,
                 ),
             )  # fmt: skip
         items = (-(-count // _GROUP) << scoring.tiles.spread) * _GROUP

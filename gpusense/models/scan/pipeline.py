@@ -178,6 +178,10 @@ class ScanPipeline(ABC):
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """Return how many numbers each particle's sum adds, and in blocks of how many; see ``Parts``."""
 
+    def numbers(self, scoring: Scoring) -> dict[str, float]:
+        """Return the arguments of the launches that change from call to call."""
+        return dict(fixed=scoring.readings.sums["fixed"])
+
     @abstractmethod
     def score_launches(self, scoring: Scoring) -> Program:
         """Return the launches of a piece whose poses are placed."""
@@ -305,11 +309,10 @@ class _Scorer:
         placed, table = pipeline.place(request.poses, piece.part, space)
         with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
-            reach = readings.rounded_reach if scoring.tiles is None else None
-            key = (scoring.flags, placed.key, readings.key, reach)
+            key = (scoring.flags, placed.key, readings.key)
             flags = space.run(
-                key, (placed.source, log_p, table), lambda: pipeline.program(scoring), version=pipeline.map.version,
-                lasting=not request.poses.on_device,
+                key, pipeline.numbers(scoring), (placed.source, log_p, table), lambda: pipeline.program(scoring),
+                version=pipeline.map.version, lasting=not request.poses.on_device,
             )  # fmt: skip
         self._last.flags = flags
         if readings.scans > 1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any
@@ -50,12 +49,6 @@ class Readings:
     reach: float = np.inf
     constants_there: bool = False
     placing: Placing | None = None
-
-    @property
-    def rounded_reach(self) -> float:
-        """``reach`` rounded up to four bits: scans of nearly one reach repeat the same program."""
-        mantissa, exponent = math.frexp(self.reach)
-        return math.ldexp(math.ceil(16 * mantissa) / 16, exponent) if math.isfinite(mantissa) else self.reach
 
     @property
     def sum_flags(self) -> frozenset[str]:

@@ -97,7 +97,9 @@ def test_reference_mixture_on_a_dense_grid(weights, precision):
             expected = real.type(share * range_max)
             z = readings_around(float(expected), p, range_max, real)
             with np.errstate(all="ignore"):
-                found = log_density(model._components, z, np.full(len(z), expected), model._terms)
+                found = log_density(
+                    model._pipeline.mixture.flags, z, np.full(len(z), expected), model._pipeline.mixture.terms
+                )
             mixture = Mixture.of(p, range_max)
             errors = [error_in_eps(f, mixture, x, expected, eps) for f, x in zip(found, z, strict=True)]
             worst = int(np.argmax(errors))
@@ -119,7 +121,7 @@ def test_where_the_logarithm_cancels(precision):
         away = p.sigma_hit * np.sqrt(2 * np.maximum(peak + rng.uniform(-1, 1, 8), 0)) * rng.choice([-1, 1], 8)
         z = np.clip(expected + away, 0, np.nextafter(real.type(range_max), real.type(0))).astype(real)
         with np.errstate(all="ignore"):
-            found = log_density(model._components, z, np.full(8, expected), model._terms)
+            found = log_density(model._pipeline.mixture.flags, z, np.full(8, expected), model._pipeline.mixture.terms)
         mixture = Mixture.of(p, range_max)
         for f, x in zip(found, z, strict=True):
             truth = exact_log_density(mixture, float(x), float(expected))
@@ -145,6 +147,8 @@ def test_continuous_part_and_atom_sum_to_one(share, sigma, rate):
     half = np.diff(edges) / 2
     z = ((edges[:-1] + edges[1:]) / 2)[:, None] + half[:, None] * nodes
     with np.errstate(all="ignore"):
-        density = np.exp(log_density(model._components, z, np.full(z.shape, expected), model._terms))
+        density = np.exp(
+            log_density(model._pipeline.mixture.flags, z, np.full(z.shape, expected), model._pipeline.mixture.terms)
+        )
     total = (density * weights * half[:, None]).sum() + p.z_max
     assert total == pytest.approx(1.0 - (p.z_short if expected == 0 else 0.0), abs=1e-9)

@@ -170,7 +170,9 @@ def test_mixture_is_the_mixture_of_the_kernels():
     model = gs.BeamModel(gs.OccupancyGrid([[0]], 1.0), gs.Scanner([0.0], 8.0), p, backend="numpy", precision="float64")
     z, expected = (a.ravel() for a in np.meshgrid(np.linspace(0, 7.99, 50), np.linspace(0, 8, 41)))
     ours = log_mixture(z, expected, range_max=8.0, **p.to_dict())
-    np.testing.assert_allclose(ours, log_density(model._components, z, expected, model._terms), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        ours, log_density(model._pipeline.mixture.flags, z, expected, model._pipeline.mixture.terms), rtol=0, atol=1e-12
+    )
 
 
 def test_names_of_the_textbooks_forms_say_so():

@@ -80,7 +80,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
         assert differing(found, plain) == 0
         return
     # Functions of vectors may round otherwise.
-    if model._peer is None:
+    if model.compat is None:
         assert_near(parts, plain_parts.astype(np.float64), 2 * per_beam(plain_parts, model.precision))
         assert_near(found, plain.astype(np.float64), 2 * per_scan(plain_parts, model.precision))
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)

@@ -226,7 +226,7 @@ def test_edits_that_change_no_obstacle_do_nothing(make, monkeypatch):
     table, says = tables(model, RANGES)
     before = says(poses)
     buffer, preparations, obstacles = table._table, table.preparations, table.obstacles
-    monkeypatch.setattr(table, "_mend", None)
+    monkeypatch.setattr(table, "_refresh", None)
     model.update_map(np.where(grid.cells > 0, 70, 10), (0, 0))
     assert model.grid.cells.max() == 70 and grid.cells.max() == 100
     np.testing.assert_array_equal(says(poses), before)
@@ -262,7 +262,7 @@ def test_a_device_without_room_for_an_update_makes_the_table_anew(make, monkeypa
     def refuse(*_):
         raise MemoryError
 
-    monkeypatch.setattr(table, "_mend", refuse)
+    monkeypatch.setattr(table, "_refresh", refuse)
     model.update_map([[100, 100]], (20, 20))
     other = changed_by_hand(grid, np.array([[100, 100]]), (20, 20))
     np.testing.assert_array_equal(says(poses), tables(make(other), RANGES)[1](poses))

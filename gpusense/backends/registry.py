@@ -105,9 +105,9 @@ class Absent(NamedTuple):
     """A part of a backend that this machine lacks.
 
     Attributes:
-        name: What is absent.
+        name: The name of the absent part.
         kind: The kind of device that it would give, ``"cpu"`` or ``"gpu"``.
-        reason: Why, with the remedy.
+        reason: The reason, with the remedy.
     """
 
     name: str

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer, Recording
+from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.recording import Recording
 from gpusense.interface.launches import Program, flags_of
 
 # Programs of earlier calls that are kept.

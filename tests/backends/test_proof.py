@@ -7,9 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import textwrap
-import time
-from pathlib import Path
 
 import pytest
 from support import fake_driver
@@ -161,18 +158,6 @@ def test_proofs_can_be_switched_off(driver, monkeypatch):
     assert tried == []
 
 
-@pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
-def test_a_program_that_is_no_interpreter_is_not_started(monkeypatch, executable):
-    monkeypatch.setattr(sys, "executable", executable)
-    assert not child.can_start()
-
-
-def test_a_frozen_program_is_not_started(monkeypatch):
-    assert child.can_start()
-    monkeypatch.setattr(sys, "frozen", True, raising=False)
-    assert not child.can_start()
-
-
 def test_a_system_that_starts_no_child_leaves_devices_usable(monkeypatch, caplog):
     """It is no failure of the driver, which is trusted in this process; the next one proves it."""
     monkeypatch.setattr(sys, "executable", "/nowhere/python3")
@@ -216,80 +201,6 @@ def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog
     proof._known.clear()
     monkeypatch.setattr(sys, "frozen", True, raising=False)
     assert verdict_on(INFO, anew=True) == proved and len(tried) == 2
-
-
-@pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "soon"])
-def test_the_time_limit_is_a_number_of_seconds(monkeypatch, text):
-    monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", text)
-    with pytest.raises(ValueError, match=rf"GPUSENSE_PROOF_SECONDS: must be a number of seconds > 0, got '{text}'"):
-        child.time_limit()
-
-
-# ---- children
-
-
-def run_text(text: str, **job):
-    return child.run_text(["-c", textwrap.dedent(text)], job)
-
-
-@pytest.mark.parametrize(
-    ("text", "failure"),
-    [
-        ("print('gpusense-child {\"a\": 1}')", ""),
-        ("import sys; sys.exit(3)", "exit code 3"),
-        ("raise ValueError('so it is')", "ValueError: so it is"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "ends the process with SIGSEGV"),
-        (
-            "import os, sys; sys.stderr.write('2 warnings generated.\\nLLVM ERROR: no\\n#0 0x1\\n'); os.abort()",
-            "ends the process with SIGABRT (LLVM ERROR: no)",
-        ),
-        ("import os; os.write(1, bytes(range(256)) * 100); os.abort()", "ends the process with SIGABRT"),
-    ],
-)
-def test_the_end_of_a_child_is_one_line(text, failure):
-    outcome = run_text(text)
-    assert (outcome.failure, outcome.conclusive) == (failure, True)
-
-
-def test_a_child_reports_until_it_dies():
-    text = """
-    import os, sys
-    print("noise")
-    print('gpusense-child {"begin": 1}')
-    print('a driver\\'s own words gpusense-child {"begin": 2}')
-    print('gpusense-child {"cut": ', end="", flush=True)
-    os.abort()
-    """
-    assert run_text(text).said == [{"begin": 1}, {"begin": 2}]
-
-
-def test_a_hanging_child_and_its_children_are_ended(monkeypatch, tmp_path):
-    monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", "1.5")
-    text = f"""
-    import subprocess, sys, time
-    started = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-    open({str(tmp_path / "pid")!r}, "w").write(str(started.pid))
-    time.sleep(60)
-    """
-    outcome = run_text(text)
-    assert (outcome.failure, outcome.conclusive) == ("hangs: no answer in 1.5 s", True)
-    status = f"/proc/{(tmp_path / 'pid').read_text()}/stat"
-    end = time.monotonic() + 20
-    while os.path.exists(status) and Path(status).read_text().split()[2] not in "ZX":
-        assert time.monotonic() < end, "what the child started still runs"
-        time.sleep(0.05)
-
-
-@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
-def test_signals_from_outside_say_nothing_of_the_driver(name):
-    outcome = run_text(f"import os, signal; signal.signal(2, signal.SIG_DFL); os.kill(os.getpid(), signal.{name})")
-    assert outcome.failure == f"ends the process with {name}" and not outcome.conclusive
-
-
-def test_an_interpreter_that_cannot_be_started_says_nothing_of_the_driver(monkeypatch):
-    monkeypatch.setattr(sys, "executable", "/nowhere/python3")
-    outcome = child.run({"do": "gpusense.evaluation.proof:prove"})
-    assert outcome.failure.startswith("no child process can be started") and not outcome.conclusive
 
 
 @pytest.mark.parametrize("family", ["opencl", "warp"])

@@ -16,13 +16,11 @@ PENDING = {
     "BoundCall",
     "BumperModel",
     "CasterMethod",
-    "Device",
     "HeadingModel",
     "LandmarkModel",
     "LikelihoodFieldModel",
     "PositionModel",
     "RayCaster",
-    "devices",
     "log_likelihoods",
 }
 

@@ -125,7 +125,7 @@ class Bench:
                     self.run_several(f"{name}, ", make, scans)
         graphs = getattr(self.device, "_graphs", None)
         if graphs is not None and self.device.info.graphs:
-            refused = f", and the driver refused one: {graphs.failure}" if graphs.failure else ""
+            refused = f"; {graphs.refusal}" if graphs.refusal else ""
             note(f"{self.device.info.selection}: {len(graphs._graphs)} graphs are kept{refused}")
 
     # ---- one scan a call

@@ -199,7 +199,11 @@ class BeamModel(ScanModel):
 
     def explain(self) -> str:
         """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
-        return str(self._plan(*title_and_omissions(self)))
+        title, omissions = title_and_omissions(
+            self._beam_pipeline, self._last, self._mixtures, self.incidence_parameters,
+            discrete=isinstance(self._parameters, SensorTable), unknown=self.unknown, weights_note=self._weights_note(),
+        )  # fmt: skip
+        return str(self._plan(title, omissions))
 
     def _cast(self, poses: object, out: Any, *, incidence: bool) -> Any:
         pipeline = self._beam_pipeline

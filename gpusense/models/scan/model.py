@@ -18,8 +18,9 @@ from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.classed import Beams, Rules, check_beams
-from gpusense.models.scan.pipeline import LastCall, ScanPipeline, Setting
+from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
+from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world import compat as compat_module
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
@@ -138,7 +139,7 @@ class ScanModel(ABC):
         """
         request = self._request(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            self._pipeline.run(request, self._workspace, self._last)
+            run(self._pipeline, request, self._workspace, self._last)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result(self._setting.backend)
         return (log_p, request.result_parts()) if per_beam else log_p

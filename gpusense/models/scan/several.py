@@ -10,6 +10,7 @@ from gpusense._util import checks
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish_all
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.scoring import run
 
 
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
@@ -57,7 +58,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         # Left first: gathered work is started before an error forgets its memory.
         stack.enter_context(chosen[0]._workspace)
         for model, request in zip(chosen, requests, strict=True):
-            model._pipeline.run(request, model._workspace, model._last)
+            run(model._pipeline, request, model._workspace, model._last)
             model._workspace.start()
         on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])

@@ -30,6 +30,12 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
     return grid
 
 
+def map_words(grid: OccupancyGrid) -> str:
+    """Return the size and the resolution of a map, as ``repr`` of models shows them."""
+    rows, cols = grid.shape
+    return f"{rows} x {cols} cells, resolution={grid.resolution}"
+
+
 def real_dtype(precision: str, backend: Backend) -> np.dtype:
     """NumPy dtype of a precision on a device.
 

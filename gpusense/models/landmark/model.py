@@ -79,6 +79,14 @@ class LandmarkModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> landmarks = gs.LandmarkMap([(2.0, 0.0), (0.0, 3.0)])
+        >>> model = gs.LandmarkModel(landmarks, backend="numpy")
+        >>> poses = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.0)]
+        >>> int(model.log_likelihood(poses, [(1.5, 0.0)]).argmax())
+        1
     """
 
     def __init__(
@@ -168,6 +176,9 @@ class LandmarkModel(PointModel):
         """
         _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts
+
+    def _options(self) -> tuple[str, ...]:
+        return f"landmarks={len(self.landmarks)}", f"association={self.association!r}"
 
     def _describe(self) -> tuple[str, list[Omission]]:
         found = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)

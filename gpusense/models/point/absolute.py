@@ -39,6 +39,12 @@ class PositionModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> model = gs.PositionModel(gs.PositionParameters(sigma=2.0), backend="numpy")
+        >>> int(model.log_likelihood([(0.0, 0.0, 0.0), (9.0, 4.0, 0.0)], (10.0, 5.0)).argmax())
+        1
     """
 
     def __init__(
@@ -150,6 +156,12 @@ class HeadingModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs, math
+        >>> model = gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend="numpy")
+        >>> int(model.log_likelihood([(0.0, 0.0, 1.0), (0.0, 0.0, 0.0)], 2 * math.pi).argmax())
+        1
     """
 
     def __init__(
@@ -203,6 +215,9 @@ class HeadingModel(PointModel):
             return (*wrapping, score)
 
         return cast(np.ndarray, self._score(poses, out, program, []))
+
+    def _options(self) -> tuple[str, ...]:
+        return (f"kind={self.parameters.kind!r}",)
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters

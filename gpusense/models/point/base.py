@@ -60,6 +60,14 @@ class PointModel(ABC):
         self._last_code: frozenset[str] | None = None
         self._last_left_out: list[Omission] = []
 
+    def __repr__(self) -> str:
+        parts = (*self._options(), f"precision={self.precision!r}", f"backend={self.device.selection!r}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _options(self) -> tuple[str, ...]:
+        """Return the map and the options that only this kind of model has, as ``repr`` shows them."""
+        return ()
+
     @property
     def device(self) -> BackendInfo:
         """The device the model is compiled for."""

@@ -38,6 +38,13 @@ class BeaconModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> model = gs.BeaconModel([(0.0, 0.0), (8.0, 0.0)], backend="numpy")
+        >>> poses = [(4.0, 3.0, 0.0), (4.0, 0.0, 0.0)]
+        >>> int(model.log_likelihood(poses, [5.0, 5.0]).argmax())
+        0
     """
 
     def __init__(
@@ -105,6 +112,9 @@ class BeaconModel(PointModel):
             return (*placing, score)
 
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=count))
+
+    def _options(self) -> tuple[str, ...]:
+        return f"beacons={len(self.xy)}", f"kind={self.parameters.kind!r}"
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters

@@ -14,6 +14,7 @@ from gpusense.backends.base import Buffer
 from gpusense.interface.constants import FIELD_RING
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
+from gpusense.models.arguments import map_words
 from gpusense.models.point.base import PointModel
 from gpusense.models.point.pairs import DIGITS, exact, two_parts
 from gpusense.models.poses import Frame, Part, Poses, place
@@ -55,6 +56,14 @@ class BumperModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> model = gs.BumperModel(grid, 0.3, backend="numpy")
+        >>> log_p = model.log_likelihood([(0.5, 0.05, 0.0), (1.7, 0.05, 0.0)], True)
+        >>> int(log_p.argmax())
+        1
     """
 
     def __init__(
@@ -145,6 +154,9 @@ class BumperModel(PointModel):
             return (*placed.launches(), score)
 
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
+
+    def _options(self) -> tuple[str, ...]:
+        return map_words(self.grid), f"segments={self.segments}"
 
     def _describe(self) -> tuple[str, list[Omission]]:
         found = []

@@ -59,6 +59,16 @@ class BeamModel(ScanModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> model = gs.BeamModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> model
+        BeamModel(1 x 21 cells, resolution=0.1, beams=1, caster=Exact(), precision='float32', backend='numpy')
+        >>> log_p = model.log_likelihood([(0.2, 0.05, 0.0), (0.5, 0.05, 0.0)], [1.5])
+        >>> int(log_p.argmax())
+        1
     """
 
     def __init__(
@@ -130,6 +140,9 @@ class BeamModel(ScanModel):
     @property
     def _pipeline(self) -> BeamPipeline:
         return self._beam_pipeline
+
+    def _options(self) -> tuple[str, ...]:
+        return (f"caster={self._caster.method}",)
 
     @property
     def parameters(self) -> BeamParameters | SensorTable:

@@ -33,6 +33,15 @@ class BoundCall(ABC):
     Attributes:
         out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.
         waits: Whether a call has ended when it returns.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> grid, poses = gs.OccupancyGrid([[0] * 20 + [100]]), np.array([(1.0, 0.05, 0.0), (0.5, 0.05, 0.0)])
+        >>> model = gs.BeamModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> call = model.bind(poses, np.array([0.5]))
+        >>> poses[0] = (0.4, 0.05, 0.0)
+        >>> bool((call() == model.log_likelihood(poses, [0.5])).all())
+        True
     """
 
     out: Any

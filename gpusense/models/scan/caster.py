@@ -8,7 +8,7 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense.backends import BackendInfo, Selection, get_backend
-from gpusense.models.arguments import check_scene, real_dtype
+from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
 from gpusense.models.scan.cones import Cones, require_exact
 from gpusense.models.scan.map_caster import MapCaster
@@ -30,7 +30,12 @@ class CasterMethod:
         memory: Bytes on the device.
         precomputation: What is made of the map beforehand.
         backends: Where it runs.
-        knobs: What its error and its time depend on; arguments of the class in ``gpusense.casters``.
+        knobs: Parameters on which its error and its time depend; arguments of the class in ``gpusense.casters``.
+
+    Example:
+        >>> import gpusense as gs
+        >>> [method.name for method in gs.RayCaster.methods()]
+        ['exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup']
     """
 
     name: str
@@ -58,6 +63,15 @@ class RayCaster:
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0, 0, 0, 100]], resolution=0.5)
+        >>> caster = gs.RayCaster(grid, range_max=5.0, precision="float64", backend="numpy")
+        >>> caster
+        RayCaster(1 x 4 cells, resolution=0.5, range_max=5.0, caster=Exact(), precision='float64', backend='numpy')
+        >>> caster.cast([(0.25, 0.25, 0.0)], [0.0]).tolist()
+        [[1.25]]
     """
 
     def __init__(
@@ -84,6 +98,12 @@ class RayCaster:
         real = real_dtype(precision, device)
         self._caster = MapCaster(
             device, real, grid, _NO_MOUNT, self.range_max, self.caster, unknown=unknown, outside=outside, crop=True
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"RayCaster({map_words(self.grid)}, range_max={self.range_max}, caster={self.caster}, "
+            f"precision={self.precision!r}, backend={self.device.selection!r})"
         )
 
     @staticmethod

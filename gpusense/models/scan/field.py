@@ -38,6 +38,14 @@ class LikelihoodFieldModel(ScanModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> log_p = model.log_likelihood([(0.2, 0.05, 0.0), (0.5, 0.05, 0.0)], [1.5])
+        >>> int(log_p.argmax())
+        1
     """
 
     def __init__(

@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Omission, Plan, share
-from gpusense.models.arguments import check_scene, real_dtype
+from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
@@ -73,6 +73,24 @@ class ScanModel(ABC):
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
         self._last = LastCall()
+
+    def __repr__(self) -> str:
+        count, beams = self.scanner.count, self.beams
+        used = (
+            count if beams is None else min(int(beams), count) if isinstance(beams, (int, np.integer)) else len(beams)
+        )
+        parts = [
+            map_words(self.grid),
+            f"beams={count}" if used == count else f"beams={used} of {count}",
+            *self._options(),
+        ]
+        parts += [] if self.compat is None else [f"compat={self.compat!r}"]
+        parts += [f"precision={self.precision!r}", f"backend={self.device.selection!r}"]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _options(self) -> tuple[str, ...]:
+        """Return the options that only this kind of model has, as ``repr`` shows them."""
+        return ()
 
     @property
     @abstractmethod

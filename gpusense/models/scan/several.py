@@ -34,6 +34,14 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         TypeError: models that are not such, or an argument of one of them that breaks its rule.
         ValueError: models of several devices, a list of another length, or an argument that breaks its rule.
         MemoryError: the device cannot hold a map's table, or even a few particles.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]]), gs.Scanner([0.0], range_max=4.0)
+        >>> models = [kind(grid, scanner, backend="numpy") for kind in (gs.BeamModel, gs.LikelihoodFieldModel)]
+        >>> poses, ranges = np.array([(0.5, 0.05, 0.0), (0.4, 0.05, 0.0)]), np.array([0.5])
+        >>> [log_p.shape for log_p in gs.log_likelihoods(models, poses, ranges)]
+        [(2,), (2,)]
     """
     chosen = _checked(models)
     if not chosen:

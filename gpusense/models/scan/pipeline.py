@@ -154,7 +154,7 @@ class ScanPipeline(ABC):
 
     @abstractmethod
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
-        """Return the count of the numbers that each particle's sum adds, and the size of their blocks; see ``Parts``."""
+        """Return the count of numbers that each particle's sum adds, and their block size; see ``Parts``."""
 
     def numbers(self, scoring: Scoring) -> dict[str, float]:
         """Return the arguments of the launches that change from call to call."""

@@ -21,14 +21,14 @@ from gpusense.models.poses import Part, Poses
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 
-# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series: each has few terms in its range.
+# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series: each has few terms.
 _WIDEST_SUM = 1.5
 
 
 class PositionModel(PointModel):
     """log p(z | x) of a position fix, as of a satellite receiver.
 
-    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region; outside it, without the second part.
+    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region, without the second part outside.
 
     Args:
         parameters: Covariance, weights, region and the antenna's mount.

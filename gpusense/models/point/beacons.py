@@ -24,9 +24,9 @@ from gpusense.world.sensor_parameters import BeaconParameters
 class BeaconModel(PointModel):
     """log p(z_1 ... z_F | x) of ranges to known beacons.
 
-    Each range adds ``log(z_hit f(z - d - bias) / m + z_rand / range_max)``. d is the antenna's distance to the beacon, f the
-    density of the parameters' kind and m its mass on [0, range_max], so that each range's density integrates to 1;
-    where d + bias lies outside this interval, m is taken at its nearest end.
+    Each range adds ``log(z_hit f(z - d - bias) / m + z_rand / range_max)``. d is the antenna's distance to the beacon,
+    f the density of the parameters' kind and m its mass on [0, range_max], so that each range's density integrates to
+    1; where d + bias lies outside this interval, m is taken at its nearest end.
 
     Args:
         xy: (M, 2) positions of the beacons in the world [m].
@@ -80,8 +80,8 @@ class BeaconModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and values outside [0, range_max], are
-                missing and add 0.
+            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and values outside [0, range_max],
+                are missing and add 0.
             ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.
             out: The array for the result, in the memory of the poses.
 

@@ -35,9 +35,9 @@ class BumperModel(PointModel):
     """log p(pressed | x, m) of a bumper by the distance of the robot's outline to the nearest obstacle.
 
     ``P(pressed) = p_contact P(touching) + p_false (1 - P(touching))`` with ``P(touching) = Phi(-gap / sigma)``. The gap
-    is the distance from the outline to the nearest occupied cell's centre, less half a cell. A point has the distance of
-    its cell, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle in segments, are
-    looked up at points half a cell apart at most. An obstacle wholly inside a polygon does not touch it. Points are
+    is the distance from the outline to the nearest occupied cell's centre, less half a cell. A point has the distance
+    of its cell, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle in segments,
+    are looked up at points half a cell apart at most. An obstacle wholly inside a polygon does not touch it. Points are
     clamped to a margin around the map: the outline's reach, and 4 deviations (64 cells at most).
 
     Args:
@@ -115,7 +115,7 @@ class BumperModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            pressed: True or False, or 1 or 0; (B,) of them with segments. NaN or None is a missing reading, which adds 0.
+            pressed: True or False, or 1 or 0; (B,) of them with segments. NaN or None is missing, and adds 0.
             out: The array for the result, in the memory of the poses.
 
         Returns:

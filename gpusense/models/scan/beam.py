@@ -51,8 +51,8 @@ class BeamModel(ScanModel):
         temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
             independent. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
-        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults of parameters,
-            caster, unknown and outside; see ``gpusense.compat``.
+        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults of
+            parameters, caster, unknown and outside; see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:

@@ -127,7 +127,7 @@ class ClassedScans:
         )  # fmt: skip
 
     def groups(self) -> Iterator[tuple[int, int]]:
-        """Yield neighbouring scans that one program may score: all with shared rays or all without; single empty scans."""
+        """Yield neighbouring scans that one program may score: all with shared rays, or none; empty ones alone."""
         kinds = np.where(self.counts == 0, 0, np.where(self.counts == self.ray_counts, 1, 2)).tolist()
         begin = 0
         while begin < len(kinds):

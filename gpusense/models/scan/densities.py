@@ -1,7 +1,8 @@
 """The components of the beam mixture, for any expected range, with the source of each formula.
 
 Kernels see expected ranges in [0, range_max], as casters return them. Learning, and other predictions of ranges, may
-need values outside this interval, where the textbook's normaliser underflows to 0. These functions stay finite. They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
+need values outside this interval, where the textbook's normaliser underflows to 0. These functions stay finite.
+They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
 
 The ``naive_`` functions are the textbook's formulas as printed. They serve comparisons only.
 """
@@ -24,7 +25,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
 def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
-    """Return the log density of a normal around z*, truncated to [0, range_max] and renormalised (book equations 6.4 to 6.6).
+    """Return the log density of a normal around z*, truncated to [0, range_max] (book equations 6.4 to 6.6).
 
     For z* in [0, Z] the mass is ``(erf(z* / (sigma sqrt 2)) + erf((Z - z*) / (sigma sqrt 2))) / 2``, a sum of positive
     terms: nothing cancels, however large sigma is. Then ``-u^2 / 2 - log(sigma sqrt(2 pi) mass)``, u = (z - z*) /

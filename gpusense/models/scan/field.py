@@ -18,8 +18,9 @@ from gpusense.world.scanner import Scanner
 class LikelihoodFieldModel(ScanModel):
     """log p(z | x, m) of a scan by the distance of its end points to the nearest obstacle.
 
-    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, which is also its value
-    outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book table 6.3).
+    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, which
+    is also its value outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book
+    table 6.3).
 
     Args:
         grid: The map.
@@ -31,7 +32,8 @@ class LikelihoodFieldModel(ScanModel):
         outside: ``"free"`` (the default), or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
         temperature: In (0, 1]: multiplies the sum over beams. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
-        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default parameters; see ``gpusense.compat``.
+        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default
+            parameters; see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:

@@ -90,7 +90,7 @@ def mixture_on_device(
 def mixture_of(
     kinds: Sequence[BeamParameters], range_max: float, real: np.dtype, *, specialize: bool, max_depends: bool
 ) -> tuple[frozenset[str], np.ndarray]:
-    """Return flags of the components, and the numbers of the kernel file ``mixture`` for each bin of angles of incidence.
+    """Return flags of the components, and the numbers of the kernel file ``mixture`` for each bin of incidence.
 
     Raises:
         ValueError: a number is beyond what the precision can hold.

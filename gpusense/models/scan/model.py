@@ -132,9 +132,9 @@ class ScanModel(ABC):
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Return log p(z | x, m) of a scan for each particle, natural logarithm.
 
-        Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy, in host memory or, for ``warp:cuda``
-        backends, on the model's device; arrays of pyopencl, if the model's backend is their queue. The result is then an
-        array of the same library in the same memory.
+        Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy, in host memory or, for
+        ``warp:cuda`` backends, on the model's device; arrays of pyopencl, if the model's backend is their queue. The
+        result is then an array of the same library in the same memory.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
@@ -142,8 +142,8 @@ class ScanModel(ABC):
             ranges: (K,) readings [m], or (S, K). NaN, -inf and readings below range_min are missing, +inf and readings
                 of range_max or more are max readings.
             per_beam: Also return the term of each reading, before the temperature; NumPy arrays.
-            out: The array for the log-likelihoods, which is returned: of their shape and precision, C-contiguous, in the
-                memory of the poses.
+            out: The array for the log-likelihoods, which is returned: of their shape and precision, C-contiguous, in
+                the memory of the poses.
 
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
@@ -165,11 +165,11 @@ class ScanModel(ABC):
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
         """Bind arrays that stay in place to a call of ``log_likelihood``, for filters that repeat it.
 
-        Each call reads the present contents of the arrays, and writes ``out``. Where poses and ranges are on the model's GPU, a
-        call is one start of a CUDA graph, or three launches of OpenCL whose arguments stay set: it checks nothing,
-        allocates nothing, copies nothing and does not wait; ``check`` waits, and reports poses that were not finite.
-        NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound call is the
-        ordinary one, so that the same program runs on every backend.
+        Each call reads the present contents of the arrays, and writes ``out``. Where poses and ranges are on the
+        model's GPU, a call is one start of a CUDA graph, or three launches of OpenCL whose arguments stay set: it
+        checks nothing, allocates nothing, copies nothing and does not wait; ``check`` waits, and reports poses that
+        were not finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound
+        call is the ordinary one, so that the same program runs on every backend.
 
         Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
         repeat or, with a temperature below 1, no range depends on the pose, and for some of the beams by number with

@@ -11,19 +11,8 @@ import gpusense as gs
 NAMES = [name for name in gs.__all__ if name != "__version__"]
 # Names without an example yet.
 PENDING = {
-    "BeaconModel",
-    "BeamModel",
-    "BoundCall",
-    "BumperModel",
-    "CasterMethod",
     "Device",
-    "HeadingModel",
-    "LandmarkModel",
-    "LikelihoodFieldModel",
-    "PositionModel",
-    "RayCaster",
     "devices",
-    "log_likelihoods",
 }
 
 

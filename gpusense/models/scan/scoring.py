@@ -86,8 +86,8 @@ class _Scorer:
             scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
             key = (scoring.flags, placed.key, readings.key)
             flags = space.run(
-                key, pipeline.numbers(scoring), (placed.source, log_p, table), lambda: pipeline.program(scoring),
-                version=pipeline.map.version, lasting=not request.poses.on_device,
+                key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
+                lambda: pipeline.program(scoring), version=pipeline.map.version,
             )  # fmt: skip
         self._last.flags = flags
         if readings.scans > 1:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording
-from gpusense.interface.launches import Program, flags_of
+from gpusense.interface.launches import Launch, Program, flags_of
 
 # Programs of earlier calls that are kept.
 _MOST_KEPT = 64
@@ -20,30 +21,29 @@ POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
 class _Kept:
-    """A program of an earlier call.
+    """A program of an earlier call, without the arguments that change from call to call.
 
     Attributes:
         flags: Flags of its launches.
         recording: Its recording, which holds no buffers; None where launches are bound anew.
     """
 
-    def __init__(
-        self, program: Program, flags: frozenset[str], recording: Recording | None, numbers: dict[str, float]
-    ) -> None:
-        self.flags, self.recording, self._numbers = flags, recording, numbers
-        self._program = program if recording is None else ()
-        # Launches and arguments that change from call to call.
-        self._places = [(i, j, name) for i, one in enumerate(self._program) for j, name in one.places(numbers)]
+    def __init__(self, program: Program, changing: Iterable[str], recording: Recording | None) -> None:
+        self.flags, self.recording = flags_of(program), recording
+        self._launches: list[tuple[Launch, list[tuple[int, str]]]] = []
+        if recording is None:
+            names = frozenset(changing)
+            self._launches = [(one.without(names), one.places(names)) for one in program]
 
-    def with_numbers(self, numbers: dict[str, float]) -> Program:
-        """Return the program with the numbers of a call."""
-        if numbers == self._numbers:
-            return self._program
-        program = list(self._program)
-        for i, j, name in self._places:
-            arguments = program[i].arguments
-            program[i] = program[i]._replace(arguments=(*arguments[:j], numbers[name], *arguments[j + 1 :]))
-        return tuple(program)
+    def program(self, changing: dict[str, Any]) -> Program:
+        """Return the program with the arguments of a call."""
+        launches = []
+        for one, places in self._launches:
+            arguments = list(one.arguments)
+            for place, name in places:
+                arguments[place] = changing[name]
+            launches.append(one._replace(arguments=tuple(arguments)))
+        return tuple(launches)
 
 
 class Workspace:
@@ -82,24 +82,15 @@ class Workspace:
         self._backend.start()
 
     def run(
-        self,
-        key: Hashable,
-        numbers: dict[str, float],
-        buffers: Iterable[Buffer],
-        make: Callable[[], Program],
-        *,
-        version: int,
-        lasting: bool,
+        self, key: Hashable, changing: dict[str, Any], make: Callable[[], Program], *, version: int
     ) -> frozenset[str]:
         """Run a program on this workspace's buffers; programs of earlier calls are kept, and repeated where they fit.
 
         Args:
             key: All sizes and flags on which the program depends, and all numbers that seldom change.
-            numbers: Arguments that change from call to call.
-            buffers: Its buffers that are not of this workspace; None stands for no buffer.
+            changing: Arguments that change from call to call, by name: numbers, and buffers of other owners.
             make: Returns the program.
             version: The version of the map's table; programs of other versions are dropped.
-            lasting: Whether these buffers stay alive for later calls.
 
         Returns:
             The flags of its launches.
@@ -109,25 +100,25 @@ class Workspace:
         if version != self._version:
             self._version = version
             self._programs.clear()
-        if not (records or lasting):
-            program = make()
-            backend.run(program)
-            return flags_of(program)
-        # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
-        fixed = tuple(numbers.items()) if records else ()
-        key = (records, key, fixed, *[0 if buffer is None else backend.address(buffer) for buffer in buffers])
-        kept = self._programs.get(key)
+        if records:
+            # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
+            key = (key, *map(self._identity, changing.values()))
+        kept = self._programs.get((records, key))
         if kept is None:
             program = make()
-            kept = _Kept(program, flags_of(program), backend.record(program) if records else None, numbers)
+            kept = _Kept(program, changing, backend.record(program) if records else None)
             if len(self._programs) >= _MOST_KEPT:
                 del self._programs[next(iter(self._programs))]
-            self._programs[key] = kept
+            self._programs[records, key] = kept
         if kept.recording is not None:
             backend.replay(kept.recording)
         else:
-            backend.run(kept.with_numbers(numbers))
+            backend.run(kept.program(changing))
         return kept.flags
+
+    def _identity(self, value: Any) -> Hashable:
+        """Return a number as it is, and a buffer by its address."""
+        return value if value is None or isinstance(value, (int, float)) else self._backend.address(value)
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost.

@@ -36,6 +36,11 @@ class Launch(NamedTuple):
         """Return the positions and names of those arguments of a set of names that the kernel has."""
         return [(place, name) for place, name in enumerate(_names(self.kernel)) if name in names]
 
+    def without(self, names: Container[str]) -> Launch:
+        """Return the launch with None in place of the arguments of a set of names."""
+        pairs = zip(_names(self.kernel), self.arguments, strict=True)
+        return self._replace(arguments=tuple([None if name in names else value for name, value in pairs]))
+
     def named(self) -> dict[str, Any]:
         """Return the arguments by name."""
         return dict(zip(_names(self.kernel), self.arguments, strict=True))

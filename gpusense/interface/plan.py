@@ -108,7 +108,7 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
         omissions.append(
             Omission(
                 "guard of each end point",
-                "cells are omissions by rounding, and again where one of 16 end points is near an edge",
+                "cells are found by rounding, and again where one of 16 end points is near an edge",
                 "a branch per particle-beam",
             )
         )

@@ -1,4 +1,4 @@
-"""Arguments of models that are checked against each other: map and range, precision and device, tables and options."""
+"""Checks of arguments against each other: map and range, precision and device, tables and options."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_table import SensorTable
 
-# Up to this many cells float32 knows the place of a crossing to 5/16 of a cell; from half a cell on, neighbouring
-# boundaries could be confused.
+# Up to this number of cells float32 resolves the position of a crossing to 5/16 of a cell. From half a cell on,
+# neighbouring boundaries could be confused.
 _MOST_CELLS_PER_RANGE = 1 << 20
 
 
 def check_scene(grid: object, range_max: float) -> OccupancyGrid:
-    """The map, whose cells must not be absurdly small against the range.
+    """Return the map, after a check of its cells against the range.
 
     Raises:
         TypeError: not an OccupancyGrid.
@@ -30,8 +30,14 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
     return grid
 
 
+def map_words(grid: OccupancyGrid) -> str:
+    """Return the size and the resolution of a map, as ``repr`` of models shows them."""
+    rows, cols = grid.shape
+    return f"{rows} x {cols} cells, resolution={grid.resolution}"
+
+
 def real_dtype(precision: str, backend: Backend) -> np.dtype:
-    """NumPy dtype of a precision on a device.
+    """Return the NumPy dtype of a precision on a device.
 
     Raises:
         TypeError, ValueError: an unknown precision, or float64 on a device without it.
@@ -43,10 +49,10 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
 
 
 def check_discrete(model: SensorTable, scanner: Scanner, compat: object, sensor_table: object) -> None:
-    """See that nothing contradicts a discrete model.
+    """Refuse options that contradict a discrete model.
 
     Raises:
-        ValueError: the scanner has another range_max, or an option is given that is for the mixture.
+        ValueError: the scanner has another range_max, or an option of the mixture is set.
     """
     for name, value in (("compat", compat), ("sensor_table", sensor_table)):
         if value is not None:

@@ -1,4 +1,4 @@
-"""Poses of a request: checked, bounded, and placed in a window of the map.
+"""Poses of a request: checks, bounds, and placement in a window of the map.
 
 NumPy arrays are checked and bounded on the host; the values of device poses are not inspected before the launch that
 places them.
@@ -27,7 +27,7 @@ _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
 _HUGE_SINGLE = _HUGE | {"POSES_FLOAT32"}
 _FRAME = ("origin_x", "origin_y", "resolution", "mount_x", "mount_y", "yaw_cos", "yaw_sin")
-# Poses whose bounds are found at once.
+# Poses in a block whose bounds are computed together.
 _BLOCK = 8192
 
 Part = tuple[int, int]
@@ -42,7 +42,7 @@ class Poses:
         backend: The device.
         name: Their name in messages.
         several: An array on the device is (S, N, 3), the poses of S scans one after the other.
-        in_place: An array on the device must be used where it is, now and later.
+        in_place: An array on the device must be used without a copy, now and later.
 
     Raises:
         TypeError: not numbers, or an array that this device cannot read.
@@ -94,14 +94,14 @@ class Poses:
         return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LARGEST_HEADING else _PLAIN
 
     def buffer(self, backend: Backend, space: Workspace, part: Part) -> Buffer:
-        """Return some poses on the device, uploaded where they are not there; None where the host must place them."""
+        """Return some poses on the device, uploaded from host memory; None where the host must place them."""
         begin, end = part
         if self.host is None:
             return self._device_part(backend, space, 3 * begin, 3 * (end - begin))
         return space.upload("poses", self.host[begin:end]) if backend.info.float64 else None
 
     def _device_part(self, backend: Backend, space: Workspace, first: int, count: int) -> Buffer:
-        """Return some numbers of device poses; a copy where a part cannot begin with them."""
+        """Return some numbers of device poses; a copy where the device cannot address a part that begins with them."""
         size = self._dtype.itemsize
         if first * size % backend.alignment == 0:
             return backend.part(self._buffer, first, count, self._dtype)
@@ -122,7 +122,7 @@ class Frame:
     """The frame in which poses are placed.
 
     Attributes:
-        window: The part of the map that a table is made of.
+        window: The part of the map that the table covers.
         cells: The map's shape, resolution and origin.
         mount: The sensor's pose on the robot; its yaw belongs to the bearings.
     """
@@ -141,10 +141,10 @@ class PlacedPoses:
         corners: Corners of the box of the robot's poses; None where they are not known.
         frame: The frame.
         cell: Cells, int2.
-        pose: Fractions in x and y, cosines and sines of the headings, real4.
+        pose: Fractions of the cell in x and y, cosines and sines of the headings, real4.
         low: Rounding errors (low parts) of ``pose``, real4.
         flags: Flags of the kernels that place them.
-        source: The poses as they are in the request; None where the host has placed them.
+        source: The poses of the request; None where the host has placed them.
         status: The non-finite flag.
     """
 
@@ -160,12 +160,12 @@ class PlacedPoses:
 
     @property
     def headings(self) -> frozenset[str]:
-        """The flag of headings that may be huge: those of device poses are not inspected."""
+        """The flag of huge headings; device poses always have it, since they are not inspected."""
         return self.flags & _HUGE
 
     @property
     def key(self) -> Hashable:
-        """Everything but buffers on which the launches depend."""
+        """All values on which the launches depend, except buffers."""
         return self.flags, self.count, self.frame.window
 
     def arguments(self) -> dict[str, object]:
@@ -178,7 +178,7 @@ class PlacedPoses:
         )  # fmt: skip
 
     def launches(self) -> Program:
-        """Return the launch that places them; none where the host has."""
+        """Return the launch that places them; none where the host has placed them."""
         if self.source is None:
             return ()
         return (launch("place_poses", self.flags, (self.count,), **self.arguments()),)
@@ -187,7 +187,7 @@ class PlacedPoses:
 def place(
     poses: Poses, part: Part, frame: Frame, backend: Backend, space: Workspace, real: np.dtype, *, careful: bool = False
 ) -> PlacedPoses:
-    """Upload some poses, and describe how they are placed in the frame of a window.
+    """Upload some poses, and describe their placement in the frame of a window.
 
     Args:
         poses: The request's poses.
@@ -228,16 +228,16 @@ def _place_on_host(
 
 
 def _bounds(poses: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return the least and the largest of each column of (N, 3) numbers, N > 0; NaN where there is one.
+    """Return the least and the largest of each column of (N, 3) numbers, N > 0; NaN where a column holds one.
 
-    Columns of three are slow to reduce. Turned into rows, a block that fits the nearest cache at a time, they are not.
+    Columns of three are slow to reduce; rows are not. Blocks that fit the nearest cache are transposed one by one.
     """
     lows, highs = [], []
     for begin in range(0, len(poses), _BLOCK):
         rows = np.ascontiguousarray(poses[begin : begin + _BLOCK].T)
         lows.append(np.minimum.reduce(rows, axis=1))
         highs.append(np.maximum.reduce(rows, axis=1))
-    # Several blocks: NaN stays.
+    # minimum.reduce and maximum.reduce keep NaN.
     low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
     high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
     (x, y, turn), (far_x, far_y, far_turn) = low.tolist(), high.tolist()

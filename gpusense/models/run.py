@@ -1,4 +1,4 @@
-"""Pieces of a request that fit a device's memory, and that a processor ends within seconds."""
+"""Pieces of a request that fit a device's memory, and that a processor completes within seconds."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from gpusense.backends import Backend
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.tables.reachable import TableMemoryError
 
-# Particles of one launch: enough to fill a device, few enough for its memory (44 bytes each).
+# Most particles of one launch: they fill a device and fit its memory (44 bytes each).
 CHUNK = 1 << 20
 # Most bytes of a result with a number per particle and beam.
 CHUNK_BYTES = 320 << 20
-# Most particle-beams of one launch on a processor: it can be interrupted between launches, a few seconds apart.
+# Most particle-beams of one launch on a processor: a call can be interrupted between launches, every few seconds.
 CHUNK_WORK = 1 << 24
-# A piece that does not fit is tried with half the particles down to this.
+# Least particles of a piece that is tried again after one that does not fit.
 SMALLEST_CHUNK = 256
-# Pieces are multiples of this number of particles, unless they are smaller: every device can begin at their numbers.
+# Pieces are multiples of this number of particles, unless they are smaller: so every device can address their buffers.
 _ROUND = 256
 
 
@@ -45,7 +45,7 @@ def _rounded(chunk: int) -> int:
 
 @dataclass(frozen=True)
 class Piece:
-    """Particles that are scored by one program, of the S N particles of S scans one after the other.
+    """Particles scored by one program, among the S N particles of S scans in sequence.
 
     Attributes:
         begin: The first of them.
@@ -64,7 +64,7 @@ class Piece:
 
     @property
     def count(self) -> int:
-        """Its particles."""
+        """Number of particles."""
         return self.end - self.begin
 
     @property
@@ -77,14 +77,14 @@ def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece
     """Score particles in pieces; a piece that does not fit into memory is tried again with half the particles.
 
     Args:
-        space: Its memory is freed before a second try.
+        space: Holds the buffers, which are freed before a second try.
         whole: All particles, of whole scans that one program may score.
-        most: Particles of a piece; a piece with several scans has whole ones.
+        most: Most particles of a piece; a piece of several scans holds whole scans.
         score: Runs the program of a piece.
 
     Raises:
-        MemoryError: not even the smallest piece fits, or not the map's table, which is tried only once. The owner of
-            the workspace still works for smaller calls.
+        MemoryError: the smallest piece does not fit, or the map's table does not; the table is tried only once. The
+            owner of the workspace still works for smaller calls.
     """
     begin = whole.begin
     while begin < whole.end:
@@ -97,7 +97,7 @@ def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece
             raise
         except MemoryError:
             most = _halved(piece)
-            # The non-finite flag of earlier pieces stays.
+            # Keep the non-finite flag of earlier pieces.
             space.release(keep=POSE_STATUS[0] if most else "")
             if not most:
                 raise
@@ -121,7 +121,7 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
     """Wait for a call to end.
 
     Raises:
-        ValueError: a device pose that was placed in it was not finite.
+        ValueError: a device pose of the call was not finite.
     """
     if on_device:
         finish_all([(space, True)], name)
@@ -137,7 +137,7 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
         name: Name of the poses in messages.
 
     Raises:
-        ValueError: a device pose that was placed in it was not finite.
+        ValueError: a device pose of the call was not finite.
     """
     flag, dtype = POSE_STATUS
     states = np.zeros((len(spaces), 2), dtype)
@@ -145,7 +145,7 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
         if on_device:
             space.download(space.empty(flag, 2, dtype, zero=True), state)
     for space, _ in spaces:
-        # The device has ended everything after the first.
+        # The first wait already covers all work on the device.
         space.wait()
     for (space, _), state in zip(spaces, states, strict=True):
         if state[0]:

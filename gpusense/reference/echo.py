@@ -75,7 +75,7 @@ def nearest_echo(
 
     Args:
         flags: Flags of the signature table.
-        map_table: What the caster made of the map.
+        map_table: The caster's table of the map.
         normals: Padded normals; see above.
         rows: Rows of the grid.
         cols: Columns of the grid.

@@ -40,7 +40,7 @@ def cast_ray(
         ray: (M, 2) cosine and sine of each bearing.
         limit: Longest distance in cells.
         bins: Not used.
-        slack: What a step is shorter than the distance [cells].
+        slack: Difference between the distance and a step [cells].
         tolerance: The least step [cells].
     """
     real = pose.dtype.type

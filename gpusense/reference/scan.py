@@ -14,7 +14,7 @@ from gpusense.reference.placement import place_poses
 
 
 def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:
-    """Whether an even choice of informative readings has that of a rank: some i * informative // chosen is it."""
+    """Return whether an even choice of informative readings has the rank: some i * informative // chosen equals it."""
     if chosen >= informative:
         return np.ones(rank.shape, bool)
     if chosen == 0:
@@ -24,7 +24,7 @@ def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:
 
 
 def reading_of(flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, beams: int) -> np.ndarray:
-    """(beams,) readings, of some beams, in float64."""
+    """Return (beams,) readings, of some beams, in float64."""
     return ranges[beam[:beams] if "SOME_BEAMS" in flags else slice(beams)].astype(np.float64)
 
 
@@ -51,12 +51,12 @@ def place_reading(
     top: float,
     guard_scale: float,
 ) -> None:
-    """Readings of some beams in their places.
+    """Put readings of some beams in their places.
 
     A place gets its reading, at most ``top``, and as points the ``each`` vectors of its beam; with END_POINTS a point
-    is the reading times its vector, in cells, and what rounding took from it. A max reading is inf. ``guard`` is
-    guard_scale (longest + 2 cells) of a block of places. ``fixed`` is what max readings add that have no place; -inf
-    where a range is there and none is ``possible``.
+    is the reading times its vector, in cells, and its rounding error. A max reading is inf. ``guard`` is guard_scale
+    (longest + 2 cells) of a block of places. ``fixed`` is the sum of the terms of max readings without a place; -inf
+    with a range where none is ``possible``.
     """
     z = reading_of(flags, ranges, beam, beams)
     hit, far = (z >= nearest) & (z < farthest), z >= farthest
@@ -131,7 +131,7 @@ def place_inputs(
     top: float,
     guard_scale: float,
 ) -> None:
-    """Poses and readings in their places; the first ``head`` work-items of a device are for readings."""
+    """Put poses and readings in their places; the first ``head`` work-items of a device are for readings."""
     place_reading(
         flags, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each, places, chosen,
         max_readings, possible, nearest, farthest, log_max, top, guard_scale,

@@ -10,7 +10,7 @@ import numpy as np
 
 
 def range_bin(distance: np.ndarray, per_metre: np.floating, cells: int, range_max: np.floating) -> np.ndarray:
-    """Bins of ranges; the last one, after the cells, is for range_max and more."""
+    """Return bins of ranges; the last one, after the cells, is for range_max and more."""
     inside = np.where(distance < range_max, distance, 0)
     bins = np.minimum((inside * per_metre).astype(np.int64), cells - 1)
     return np.where(distance >= range_max, cells, bins)
@@ -24,6 +24,6 @@ def tabulated_density(
     per_metre: np.floating,
     range_max: np.floating,
 ) -> np.ndarray:
-    """log p of readings by the table."""
+    """Return log p of readings by the table."""
     column = range_bin(expected, per_metre, cells, range_max)
     return sensor[range_bin(z, per_metre, cells, range_max) * (cells + 1) + column]

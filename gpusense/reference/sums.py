@@ -23,11 +23,11 @@ def sum_parts(
     temperature: np.floating,
     per_scan: int,
 ) -> None:
-    """Of each particle count numbers, each along farther than the last, from parts[place * across] on.
+    """Sum ``count`` numbers of each particle, each ``along`` farther than the last, from parts[place * across] on.
 
-    They are sums of blocks or strands, and block is 1, or single terms, whose strands are added plainly first. All go
-    to a compensated total. Of several scans each has a count of its own, with STRANDED of readings, whose strands are
-    added; what lies beyond it counts as 0, which changes no sum.
+    The numbers are sums of blocks or strands, and block is 1, or single terms, whose strands are added plainly first.
+    All are added to a compensated total. Several scans have a count each, with STRANDED of readings, whose strands are
+    added; numbers beyond it count as 0, which changes no sum.
     """
     places, particle = np.arange(particles) * across, order[:particles] if "ORDERED" in flags else np.arange(particles)
     counted, constant_term = np.full(particles, count), np.full(particles, fixed, parts.dtype)

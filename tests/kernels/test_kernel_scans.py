@@ -24,7 +24,8 @@ from support.score_scenes import (
 
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
-from gpusense.interface.constants import BLOCK_TERMS, strands_in
+from gpusense.interface.constants import BLOCK_TERMS
+from gpusense.reference.error_free import strands_in
 
 PER_SCAN, SCANS = 37, 4
 COUNT = PER_SCAN * SCANS

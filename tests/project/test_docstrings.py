@@ -10,19 +10,7 @@ import gpusense as gs
 
 NAMES = [name for name in gs.__all__ if name != "__version__"]
 # Names without an example yet.
-PENDING = {
-    "BeaconModel",
-    "BeamModel",
-    "BoundCall",
-    "BumperModel",
-    "CasterMethod",
-    "HeadingModel",
-    "LandmarkModel",
-    "LikelihoodFieldModel",
-    "PositionModel",
-    "RayCaster",
-    "log_likelihoods",
-}
+PENDING: set[str] = set()
 
 
 def examples_of(name: str) -> Iterator[doctest.DocTest]:

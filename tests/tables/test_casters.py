@@ -79,7 +79,7 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     """Return ranges in cells of rays that are given to the last bit."""
     device, real = get_backend(backend), np.dtype(precision)
     rows, cols = scene.occupied.shape
-    flags = {kind.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
+    flags = {kind.entry.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
     flags |= {"OUTSIDE_OCCUPIED"} if scene.outside_occupied else set()
     flags |= {"ORIGINS_OUTSIDE"} if not ((scene.cell >= 0) & (scene.cell < (cols, rows))).all() else set()
     table = kind.prepare(

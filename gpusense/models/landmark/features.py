@@ -1,4 +1,4 @@
-"""Features on their way to a device: what was measured, their numbers, and how far a landmark can be off and matter."""
+"""Features for a device: checks, numbers of the kernels, and the discs of the landmarks that can matter."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 
 _SPREAD = 4.0
-# Bounds of what can matter are a little wider than they need be, for what rounding takes from distances.
+# Discs are widened by this share, for rounding errors of distances.
 _WIDER = 1e-5
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a model knows of its sensor and map, in float64.
+    """Constants of a sensor and its map, in float64.
 
     Attributes:
-        scales: 1 / (sigma sqrt 2) of range, bearing and signature; 0 for what is left out.
+        scales: 1 / (sigma sqrt 2) of range, bearing and signature; 0 for a part that is left out.
         peaks: Logarithms of the components' largest densities, before the mass is divided out.
-        least_masses: Logarithms of the least mass that each can have, that of a bearing on a full circle included.
+        least_masses: Logarithms of the least mass of each, including a bearing's on a full circle.
         uniforms: Logarithms of the uniform densities of range, bearing and signature.
         span: The smallest and largest signature.
     """
@@ -38,27 +38,27 @@ class Sensor:
 
 
 def span_of(p: LandmarkParameters, landmarks: LandmarkMap) -> tuple[float, float]:
-    """The smallest and largest signature of a feature."""
+    """Return the smallest and largest signature of a feature."""
     if p.signature_span is not None or p.sigma_signature is None:
         return p.signature_span or (0.0, 1.0)
-    own = landmarks.signatures if landmarks.signatures is not None and len(landmarks) else np.zeros(1)
-    return float(own.min()) - _SPREAD * p.sigma_signature, float(own.max()) + _SPREAD * p.sigma_signature
+    signatures = landmarks.signatures if landmarks.signatures is not None and len(landmarks) else np.zeros(1)
+    return float(signatures.min()) - _SPREAD * p.sigma_signature, float(signatures.max()) + _SPREAD * p.sigma_signature
 
 
 def signature_mass(p: LandmarkParameters, landmarks: LandmarkMap) -> np.ndarray:
-    """Mass that each landmark's signature has on the span; that of its nearest end for one beyond."""
+    """Return the mass of each landmark's signature on the span; signatures are clamped to the span."""
     from scipy.special import erf  # loads SciPy
 
     if p.sigma_signature is None or landmarks.signatures is None:
         return np.ones(len(landmarks))
     (low, high), scale = span_of(p, landmarks), math.sqrt(0.5) / p.sigma_signature
-    own = np.clip(landmarks.signatures, low, high)
-    mass: np.ndarray = 0.5 * (erf((own - low) * scale) + erf((high - own) * scale))
+    clamped = np.clip(landmarks.signatures, low, high)
+    mass: np.ndarray = 0.5 * (erf((clamped - low) * scale) + erf((high - clamped) * scale))
     return mass
 
 
 def describe(p: LandmarkParameters, landmarks: LandmarkMap) -> Sensor:
-    """The sensor of these parameters."""
+    """Return the constants of a sensor."""
     span = span_of(p, landmarks)
     lengths = (p.range_max, p.field_of_view, span[1] - span[0])
     deviations = (p.sigma_range, p.sigma_bearing, p.sigma_signature)
@@ -79,18 +79,18 @@ def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
 
 
 def full_circle(p: LandmarkParameters) -> bool:
-    """Whether the sensor sees all around."""
+    """Return whether the field of view is a full circle."""
     return p.field_of_view >= 2 * math.pi
 
 
 def _read(features: object, p: LandmarkParameters) -> np.ndarray:
-    """(F, 3) float64 features; NaN is what was not measured or is left out. Finite bearings are in [-pi, pi]."""
-    given = checks.as_array("features", features)
-    given = np.zeros((0, 2)) if given.shape == (0,) else checks.array("features", given, finite=False)
-    if given.ndim != 2 or given.shape[1] not in (2, 3):
-        raise ValueError(f"features: shape must be (F, 2) or (F, 3), got {checks.shape_text(given.shape)}")
-    full = np.full((len(given), 3), np.nan)
-    full[:, : given.shape[1]] = given
+    """Return (F, 3) float64 features, NaN for parts not measured or left out; finite bearings are in [-pi, pi]."""
+    values = checks.as_array("features", features)
+    values = np.zeros((0, 2)) if values.shape == (0,) else checks.array("features", values, finite=False)
+    if values.ndim != 2 or values.shape[1] not in (2, 3):
+        raise ValueError(f"features: shape must be (F, 2) or (F, 3), got {checks.shape_text(values.shape)}")
+    full = np.full((len(values), 3), np.nan)
+    full[:, : values.shape[1]] = values
     for column, sigma in enumerate((p.sigma_range, p.sigma_bearing, p.sigma_signature)):
         if sigma is None:
             full[:, column] = np.nan
@@ -100,7 +100,7 @@ def _read(features: object, p: LandmarkParameters) -> np.ndarray:
 
 
 def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
-    """(F, 3) which parts are outside what the sensor can measure."""
+    """Return (F, 3) whether a part is outside the sensor's limits."""
     half = math.inf if full_circle(p) else p.field_of_view / 2
     low, high = np.array([0.0, -half, span[0]]), np.array([p.range_max, half, span[1]])
     bad: np.ndarray = (full < low) | (full > high) | np.isinf(full)
@@ -110,7 +110,7 @@ def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, floa
 def possible_features(
     features: object, p: LandmarkParameters, span: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) features, all NaN where the sensor cannot have measured a part of one, and (F,) which are so.
+    """Return (F, 3) features, all NaN where a part is impossible, and (F,) whether a feature is impossible.
 
     Raises:
         TypeError: not numbers.
@@ -123,11 +123,11 @@ def possible_features(
 
 
 def check_features(features: object, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:
-    """(F, 3) float64 features; NaN is what was not measured or is left out. Bearings are in [-pi, pi].
+    """Return (F, 3) float64 features, NaN for parts not measured or left out; bearings are in [-pi, pi].
 
     Raises:
         TypeError: not numbers.
-        ValueError: another shape, or a value outside what the sensor can measure.
+        ValueError: another shape, or a value outside the sensor's limits.
     """
     full = _read(features, p)
     half, rules = p.field_of_view / 2, [f"range must be in [0, {p.range_max:.15g}] (range_max)"]
@@ -145,29 +145,35 @@ def check_features(features: object, p: LandmarkParameters, span: tuple[float, f
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angles in [-pi, pi], those that are there already as they are."""
+    """Wrap angles to [-pi, pi]; angles in that interval keep their bits."""
     turned = np.arctan2(np.sin(angle), np.cos(angle))
     return np.where(np.abs(angle) <= np.pi, angle, turned)
 
 
 def check_correspondence(correspondence: object, count: int, landmarks: int) -> np.ndarray:
-    """(F,) landmark of each feature, -1 for none.
+    """Return the (F,) landmark of each feature, -1 for none.
 
     Raises:
         TypeError: not integers.
-        ValueError: another shape, or an index that is no landmark's.
+        ValueError: another shape, or an index outside the map.
     """
-    found = checks.array("correspondence", correspondence, (count,), dtype=np.int64)
-    bad = np.flatnonzero((found < -1) | (found >= landmarks))
+    indices = checks.array("correspondence", correspondence, (count,), dtype=np.int64)
+    bad = np.flatnonzero((indices < -1) | (indices >= landmarks))
     if len(bad):
         rule = f"indices must be in [-1, {landmarks})"
-        raise ValueError(f"correspondence: {rule}, got {found[bad[0]]} at index {bad[0]}")
-    return found
+        raise ValueError(f"correspondence: {rule}, got {indices[bad[0]]} at index {bad[0]}")
+    return indices
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Landmarks that can matter to a feature lie within ``radius`` of the point ``reach`` ahead, beyond ``hole``."""
+    """Bounds of the landmarks that can matter to a feature.
+
+    Attributes:
+        reach: Distance of the disc's centre along the bearing [m].
+        radius: Radius of the disc [m]; negative where no landmark matters.
+        hole: Least distance from the sensor [m].
+    """
 
     reach: float
     radius: float
@@ -175,14 +181,14 @@ class Reach:
 
 
 def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
-    """The disc outside which exponents are larger than ``bound``.
+    """Return the disc outside which exponents are larger than ``bound``.
 
     Args:
         p: Deviations and limits.
-        sensor: What is made of them.
-        z: The range, of no meaning where there is none.
-        measured: Whether range, bearing and signature are there.
-        bound: Exponents above this do not matter; infinite where all do.
+        sensor: Constants of the sensor.
+        z: The range; not read where it was not measured.
+        measured: Whether range, bearing and signature were measured.
+        bound: Largest exponent that matters; infinite where all do.
     """
     if bound < 0:
         return Reach(0.0, -1.0, 0.0)
@@ -197,7 +203,7 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
     if not measured[1]:
         return around
     if math.isinf(far):
-        # Everything may matter until a landmark is found that is likelier than all beyond some distance.
+        # All landmarks may matter until one is likelier than all beyond some distance.
         return Reach(z, far, 0.0)
     # Of the points of a ring's sector, a corner is farthest from its middle.
     if measured[0]:
@@ -218,7 +224,7 @@ class PreparedFeatures:
     Attributes:
         columns: (K,) positions of the features that are evaluated.
         numbers: (K, FEATURE) in the model's precision; see ``gpusense.reference.landmarks``.
-        measured: (K, 3) whether range, bearing and signature are there.
+        measured: (K, 3) whether range, bearing and signature were measured.
         false: (F,) float64 log densities of each feature as a false positive; 0 where nothing was measured.
     """
 
@@ -229,7 +235,7 @@ class PreparedFeatures:
 
     @property
     def radius(self) -> np.ndarray:
-        """(K,) radius of each feature's disc [m]; negative where no landmark matters."""
+        """The (K,) radius of each feature's disc [m]; negative where no landmark matters."""
         return self.numbers[:, at.RADIUS]
 
 
@@ -244,24 +250,24 @@ def prepare_features(
     norm: float,
     gated: bool,
 ) -> PreparedFeatures:
-    """The numbers of (F, 3) checked features.
+    """Return the numbers of (F, 3) checked features.
 
     Args:
         features: Range, bearing and signature, NaN where not measured.
         p: The parameters.
-        sensor: What is made of them.
+        sensor: Constants of the sensor.
         mount: The sensor's pose on the robot.
         real: Precision of the numbers.
         extent: Largest coordinate of the landmarks in their buckets' frame [m].
         norm: Largest -log of the mass of a landmark's signature.
-        gated: Whether to bound what can matter.
+        gated: Whether to bound the landmarks that can matter.
     """
-    there = ~np.isnan(features)
-    says = there.any(axis=1)
-    false = np.where(says, _log(p.z_false) + (there * sensor.uniforms).sum(axis=1), 0.0)
-    columns = np.flatnonzero(says)
+    is_measured = ~np.isnan(features)
+    informative = is_measured.any(axis=1)
+    false = np.where(informative, _log(p.z_false) + (is_measured * sensor.uniforms).sum(axis=1), 0.0)
+    columns = np.flatnonzero(informative)
     numbers = np.zeros((len(columns), at.FEATURE))
-    measured, kept = there[columns], features[columns]
+    measured, kept = is_measured[columns], features[columns]
     values = np.where(measured, kept, 0.0)
     bearing = values[:, 1] + mount[2]
     scales = measured * np.array(sensor.scales)
@@ -281,7 +287,7 @@ def prepare_features(
     with np.errstate(divide="ignore"):
         numbers[:, at.RANGE_SPREAD], numbers[:, at.BEARING_SPREAD] = 1 / scales[:, 0], 1 / scales[:, 1]
     numbers[:, at.MOST] = highest
-    # A landmark below this adds less than eps to what a false positive alone has.
+    # A landmark below this adds less than eps to the density of a false positive.
     smallest = false[columns] + math.log(np.finfo(real).eps) - 1
     slack = 16 * np.finfo(real).eps * (extent + 2 * p.range_max)
     # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.

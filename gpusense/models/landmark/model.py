@@ -42,7 +42,7 @@ _PER_READING = 8
 
 @dataclass(frozen=True)
 class _Call:
-    """What all particles of a call share: features that are evaluated, and for known ones the landmarks' places."""
+    """Values that all particles of a call share: the evaluated features, and the landmarks' places of known ones."""
 
     prepared: PreparedFeatures
     places: np.ndarray
@@ -52,26 +52,26 @@ class _Call:
 
     @property
     def count(self) -> int:
-        """Features that are evaluated."""
+        """Number of evaluated features."""
         return len(self.prepared.columns)
 
 
 class LandmarkModel(PointModel):
-    """log p(f | x, m) of the features that a sensor finds, by the landmarks that they may be.
+    """log p(f | x, m) of the features that a sensor detects, by the landmarks that they may belong to.
 
-    Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; what p(f | j) and p_uniform are stands in
-    docs/landmarks.md. Which landmark j a feature is, is given, or chosen by ``association`` (tables 6.4 and 6.5).
+    Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; docs/landmarks.md defines both
+    densities. The landmark j is known from ``correspondence``, or chosen by ``association`` (tables 6.4 and 6.5).
 
     Args:
         landmarks: The map.
         parameters: Deviations, weights and limits of the sensor.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        association: What a feature without a known landmark is: ``"nearest"`` is the likeliest landmark of each
-            by itself (the book's maximum likelihood); ``"sum"`` sums over all landmarks, each with the prior 1 / M;
-            ``"joint"`` is the likeliest assignment in which no two features are the same landmark, for at most 8
+        association: The rule for features without a known landmark. ``"nearest"`` takes the likeliest landmark of each
+            feature (the book's maximum likelihood); ``"sum"`` sums over all landmarks, each with the prior 1 / M;
+            ``"joint"`` takes the likeliest assignment in which no two features have the same landmark, for at most 8
             features and 1024 landmarks.
-        negative: Whether landmarks in view that no feature is add ``log(1 - p_detect)`` each; not with ``"sum"``.
+        negative: Whether landmarks in view without a feature add ``log(1 - p_detect)`` each; not with ``"sum"``.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
         temperature: In (0, 1]: multiplies the sum over features. 1 is the book's plain product.
         specialize: False leaves nothing out: same numbers, slower.
@@ -79,6 +79,14 @@ class LandmarkModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> landmarks = gs.LandmarkMap([(2.0, 0.0), (0.0, 3.0)])
+        >>> model = gs.LandmarkModel(landmarks, backend="numpy")
+        >>> poses = [(0.0, 0.0, 0.0), (0.5, 0.0, 0.0)]
+        >>> int(model.log_likelihood(poses, [(1.5, 0.0)]).argmax())
+        1
     """
 
     def __init__(
@@ -128,32 +136,31 @@ class LandmarkModel(PointModel):
     def log_likelihood(
         self, poses: object, features: object, correspondence: object = None, *, out: Any = None
     ) -> np.ndarray:
-        """log p(f_1 ... f_F | x, m) for each particle, natural logarithm.
+        """Return log p(f_1 ... f_F | x, m) for each particle, natural logarithm.
 
-        A feature of which nothing was measured, or of which a part is outside what the sensor can measure, says
-        nothing: it is left out as if it had not been given.
+        A feature is left out if none of its parts was measured, or if a part is outside the sensor's limits.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN is what was not measured.
-            correspondence: None, or (F,) indices of the landmarks that the features are, -1 for a false positive.
-            out: Where to write the result, in the memory where the poses are.
+            features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN for parts not measured.
+            correspondence: None, or (F,) indices of the landmarks of the features, -1 for a false positive.
+            out: The array for the result, in the memory of the poses.
 
         Returns:
-            (N,) log-likelihoods in the model's precision: densities in 1/m, 1/rad and 1/unit of the signature for what
-            was measured.
+            (N,) log-likelihoods in the model's precision: densities in 1/m, 1/rad and 1/unit of the signature for
+            the measured parts.
 
         Raises:
             TypeError: an argument does not hold numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, an index that is no landmark's, or more than 8
+            ValueError: a wrong shape, a pose that is not finite, an index outside the map, or more than 8
                 features for a joint association.
         """
         return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
 
     def associate(self, poses: object, features: object) -> tuple[np.ndarray, np.ndarray]:
-        """The landmark that each feature is, for each particle.
+        """Return the landmark of each feature, for each particle.
 
-        With ``association="sum"`` it is the landmark with the largest part of the sum.
+        With ``association="sum"`` this is the landmark with the largest part of the sum.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``.
@@ -161,7 +168,7 @@ class LandmarkModel(PointModel):
 
         Returns:
             (N, F) int32 indices in the map, -1 where a false positive is likelier or a feature is left out, and (N, F)
-            what each feature adds to the log-likelihood before the temperature. NumPy arrays, wherever the poses are.
+            terms of the features in the log-likelihood, before the temperature; always NumPy arrays.
 
         Raises:
             TypeError, ValueError: as ``log_likelihood``.
@@ -169,21 +176,24 @@ class LandmarkModel(PointModel):
         _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts
 
+    def _options(self) -> tuple[str, ...]:
+        return f"landmarks={len(self.landmarks)}", f"association={self.association!r}"
+
     def _describe(self) -> tuple[str, list[Omission]]:
-        found = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)
-        return f"landmark model, {self.association}", found
+        omissions = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)
+        return f"landmark model, {self.association}", omissions
 
     def _code(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
-        """The flags of the kernels."""
+        """Return the flags of the kernels."""
         names = ("RANGE", "BEARING", "SIGNATURE")
-        there = np.asarray(prepared.measured.any(axis=0))
-        flags = {name for name, used in zip(names, there.tolist(), strict=True) if used or not self._specialize}
+        measured = np.asarray(prepared.measured.any(axis=0))
+        flags = {name for name, used in zip(names, measured.tolist(), strict=True) if used or not self._specialize}
         flags |= {"FIELD"} if not full_circle(self.parameters) else set()
         flags |= {"KNOWN"} if known else {"MARGINAL"} if self.association == "sum" else set()
         return self._flags | flags | ({"PER_BEAM"} if each else set())
 
     def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> _Call:
-        """What kernels need of (F, 3) features that are possible."""
+        """Return the values of (F, 3) possible features that all particles share."""
         known = correspondence is not None
         prepared = prepare_features(
             full, self.parameters, self._sensor, self.mount, self._real,
@@ -209,17 +219,17 @@ class LandmarkModel(PointModel):
     def _evaluate(
         self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
     ) -> tuple[Any, np.ndarray, np.ndarray]:
-        """log p of each particle, and with ``each`` the (N, F) landmarks and what features add."""
+        """Return log p of each particle, and with ``each`` the (N, F) landmarks and terms of the features."""
         host = arrays.copied_to_host(features, self._backend, "features")
         full, impossible = possible_features(host, self.parameters, self._sensor.span)
         call = self._prepare(full, correspondence, each)
         known = correspondence is not None
         left_out = feature_omissions(
-            call.prepared, self._buckets, given=len(full), impossible=int(impossible.sum()), known=known
+            call.prepared, self._buckets, total=len(full), impossible=int(impossible.sum()), known=known
         )
-        # By the first particle of each piece, since a piece that does not fit into memory is tried again in halves.
-        nobody = np.empty((0, len(full)))
-        pieces = {-1: (nobody.astype(_INT), nobody.astype(self._real))}
+        # Keyed by the first particle of a piece, since a piece that does not fit into memory is tried again in halves.
+        empty = np.empty((0, len(full)))
+        pieces = {-1: (empty.astype(_INT), empty.astype(self._real))}
 
         def after(part: Part) -> None:
             if each:
@@ -233,7 +243,7 @@ class LandmarkModel(PointModel):
         return log_p, np.concatenate(which), np.concatenate(added)
 
     def _cost(self, call: _Call, known: bool) -> tuple[int, float]:
-        """What a particle costs, in readings of a scan, and the bytes that it keeps for each."""
+        """Return the cost of a particle, in readings of a scan, and the bytes that it keeps for each."""
         looked = 1.0 if known else len(self.landmarks) if call.joint else looked_at(call.prepared, self._buckets)
         work, kept = max(call.count, 1) * (1 + looked / _PER_READING), 0.0
         if call.joint:
@@ -280,7 +290,7 @@ class LandmarkModel(PointModel):
         return which, added
 
     def _each_launch(self, call: _Call, common: dict[str, Any]) -> Launch:
-        """Return the launch in which every feature chooses its landmark, or sums over them, by itself."""
+        """Return the launch in which each feature chooses its landmark, or sums over them, independently."""
         landmarks, (rows, cols) = len(self.landmarks), self._buckets.shape
         prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
         partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
@@ -300,7 +310,7 @@ class LandmarkModel(PointModel):
         )  # fmt: skip
 
     def _unseen_launch(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Launch:
-        """Return the launch that adds the landmarks in view that no feature is."""
+        """Return the launch that adds the landmarks in view without a feature."""
         p, (rows, cols) = self.parameters, self._buckets.shape
         return launch(
             "count_unseen", self._flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,

@@ -1,4 +1,4 @@
-"""What a landmark model leaves out: by its parameters, and by the features of a call."""
+"""Omissions of a landmark model: by its parameters, and by the features of a call."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpusense.world.parameters import LandmarkParameters
 
 
 def looked_at(prepared: PreparedFeatures, buckets: Buckets) -> float:
-    """Landmarks that a feature looks at, on average over a map that is evenly filled."""
+    """Return the landmarks that a feature inspects, on average over an evenly filled map."""
     side, (rows, cols) = buckets.resolution, buckets.shape
     across = np.maximum(2 * prepared.radius, 0) + side
     looked = np.minimum(across, rows * side) * np.minimum(across, cols * side) / (rows * cols * side**2)
@@ -20,8 +20,8 @@ def looked_at(prepared: PreparedFeatures, buckets: Buckets) -> float:
 
 
 def parameter_omissions(p: LandmarkParameters, negative: bool, mount: Mount, precision: str) -> list[Omission]:
-    """What no call needs."""
-    found = [
+    """Return the omissions of every call, by the parameters."""
+    omissions = [
         Omission(name[6:], f"{name} = None", cost)
         for name, cost in (
             ("sigma_range", "1 exponent per particle, feature and landmark"),
@@ -31,42 +31,42 @@ def parameter_omissions(p: LandmarkParameters, negative: bool, mount: Mount, pre
         if getattr(p, name) is None
     ]
     if full_circle(p):
-        found.append(Omission("mass in the field of view", "it is a full circle", "2 erf or more per landmark"))
+        omissions.append(Omission("mass in the field of view", "it is a full circle", "2 erf or more per landmark"))
     if not negative:
-        found.append(Omission("negative information", "negative=False", "a look at all landmarks in view"))
+        omissions.append(Omission("negative information", "negative=False", "a look at all landmarks in view"))
     if mount[:2] == (0.0, 0.0):
-        found.append(Omission("mount", "the sensor sits at the robot's origin", "a rotation per particle"))
+        omissions.append(Omission("mount", "the sensor sits at the robot's origin", "a rotation per particle"))
     if precision == "float32":
         why = "positions, angles and exponents are kept in two numbers"
-        found.append(Omission("float64", why, "wide units, which many devices lack"))
-    return found
+        omissions.append(Omission("float64", why, "wide units, which many devices lack"))
+    return omissions
 
 
 def feature_omissions(
-    prepared: PreparedFeatures, buckets: Buckets, *, given: int, impossible: int, known: bool
+    prepared: PreparedFeatures, buckets: Buckets, *, total: int, impossible: int, known: bool
 ) -> list[Omission]:
-    """What a call's features do not need.
+    """Return the omissions by the features of a call.
 
     Args:
         prepared: Features that are evaluated.
         buckets: The map.
-        given: Features of the call.
-        impossible: How many of them the sensor cannot have measured.
-        known: Whether it is given which landmarks they are.
+        total: Number of features of the call.
+        impossible: Number of features that the sensor cannot have measured.
+        known: Whether the correspondences are known.
     """
-    found, count = [], len(buckets.index)
-    silent = given - len(prepared.columns) - impossible
+    omissions, count = [], len(buckets.index)
+    silent = total - len(prepared.columns) - impossible
     for number, what, why in (
         (impossible, "impossible features", "have a part that the sensor cannot measure"),
         (silent, "features", "do not depend on the pose"),
     ):
         if number:
-            found.append(Omission(what, f"{number} of {given} features {why}", f"{share(number, given)} of them"))
+            omissions.append(Omission(what, f"{number} of {total} features {why}", f"{share(number, total)} of them"))
     if known:
-        found.append(Omission("search", "correspondences are known", f"{count - 1} of {count} landmarks"))
+        omissions.append(Omission("search", "correspondences are known", f"{count - 1} of {count} landmarks"))
     elif len(prepared.columns) and np.isfinite(prepared.radius).any():
         spared = count - looked_at(prepared, buckets)
         if spared >= 0.5:
             why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
-            found.append(Omission("far landmarks", why, f"about {share(spared, count)} of {count} landmarks"))
-    return found
+            omissions.append(Omission("far landmarks", why, f"about {share(spared, count)} of {count} landmarks"))
+    return omissions

@@ -21,8 +21,8 @@ class LandmarkTables:
     """Buffers by the names of the kernels' arguments.
 
     Attributes:
-        landmark: (M,) real4 positions in the buckets' frame, by place, and what rounding took from them.
-        signature: (M,) real4 signatures, what rounding took from them, and -log of their mass on the span.
+        landmark: (M,) real4 positions in the buckets' frame, by place, and their rounding errors (low parts).
+        signature: (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span.
         start: (rows * columns + 1,) place of the first landmark of each bucket.
         terms: The sensor's numbers.
         arcs: Arcs of the slopes i / 8.
@@ -40,7 +40,7 @@ class LandmarkTables:
 def upload_tables(
     backend: Backend, real: np.dtype, landmarks: LandmarkMap, buckets: Buckets, p: LandmarkParameters, sensor: Sensor
 ) -> LandmarkTables:
-    """Make the tables in a precision."""
+    """Upload the tables in a precision."""
     signature = np.zeros((len(landmarks), 4))
     if landmarks.signatures is not None:
         high, low = split(landmarks.signatures[buckets.index], real)
@@ -48,20 +48,20 @@ def upload_tables(
             norm = -np.log(signature_mass(p, landmarks)[buckets.index])
         signature[:, 0], signature[:, 1], signature[:, 2] = high, low, norm
     high, low = split(np.array([p.range_max, p.field_of_view]), real)
-    # The density of a bearing at zero range, over the largest one there is elsewhere, but for the scale.
+    # The density of a bearing at zero range over the largest one at other ranges, without the scale.
     scale = sensor.scales[1]
     flat = p.field_of_view / math.sqrt(math.pi)
     flat /= math.erf(math.pi * scale) if full_circle(p) and scale else 1.0
     terms = np.array([high[0], low[0], high[1], flat], real)
     arcs = np.empty((len(ARCS), 2), real)
-    given = np.array(ARCS)
-    arcs[:, 0] = given[:, 0]
-    arcs[:, 1] = (given[:, 0] - arcs[:, 0]) + given[:, 1]
+    exact = np.array(ARCS)
+    arcs[:, 0] = exact[:, 0]
+    arcs[:, 1] = (exact[:, 0] - arcs[:, 0]) + exact[:, 1]
 
-    def there(table: np.ndarray) -> Buffer:
+    def upload(table: np.ndarray) -> Buffer:
         return backend.upload(np.ascontiguousarray(table))
 
     return LandmarkTables(
-        there(buckets.table(real)), there(signature.astype(real)), there(buckets.start), there(terms), there(arcs),
+        upload(buckets.table(real)), upload(signature.astype(real)), upload(buckets.start), upload(terms), upload(arcs),
         float(signature[:, 2].max(initial=0.0)),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Sensors that know where they are: position fixes and headings."""
+"""Models of absolute sensors: position fixes and headings."""
 
 from __future__ import annotations
 
@@ -21,24 +21,30 @@ from gpusense.models.poses import Part, Poses
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 
-# Up to this deviation a wrapped normal is a sum of normals, beyond a Fourier series: both have few terms there.
+# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series: each has few terms.
 _WIDEST_SUM = 1.5
 
 
 class PositionModel(PointModel):
     """log p(z | x) of a position fix, as of a satellite receiver.
 
-    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region; outside it lacks the second part.
+    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region, without the second part outside.
 
     Args:
-        parameters: Covariance, weights, region and where the antenna is.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        parameters: Covariance, weights, region and the antenna's mount.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
         temperature: In (0, 1]: multiplies log p, for errors that are not independent from fix to fix.
 
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> model = gs.PositionModel(gs.PositionParameters(sigma=2.0), backend="numpy")
+        >>> int(model.log_likelihood([(0.0, 0.0, 0.0), (9.0, 4.0, 0.0)], (10.0, 5.0)).argmax())
+        1
     """
 
     def __init__(
@@ -54,33 +60,33 @@ class PositionModel(PointModel):
         super().__init__(backend, precision, temperature)
         self.parameters = parameters
         p = parameters
-        own = p.covariance
+        matrix = p.covariance
         self._hit: list[np.floating] | None = None
         if p.sigma is not None:
             self._check_scale("sigma", p.sigma)
             square = exact(p.sigma) * exact(p.sigma)
             self._hit = self._gaussian("sigma", (square, Decimal(0), square))
-        elif own is not None:
-            self._hit = self._gaussian("covariance", (exact(own[0][0]), exact(own[0][1]), exact(own[1][1])))
+        elif matrix is not None:
+            self._hit = self._gaussian("covariance", (exact(matrix[0][0]), exact(matrix[0][1]), exact(matrix[1][1])))
 
     def log_likelihood(self, poses: object, fix: object, *, covariance: object = None, out: Any = None) -> np.ndarray:
-        """log p(z | x) of a fix for each particle, natural logarithm.
+        """Return log p(z | x) of a fix for each particle, natural logarithm.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            fix: (2,) measured x and y of the antenna [m]. One that is not finite is missing and says nothing: 0.
+            fix: (2,) measured x and y of the antenna [m]. One that is not finite is missing and has log p = 0.
             covariance: None, or the (2, 2) covariance matrix of this fix in the world [m^2].
-            out: Where to write the result, in the memory where the poses are.
+            out: The array for the result, in the memory of the poses.
 
         Returns:
             (N,) log-likelihoods in the model's precision, densities in 1/m^2.
 
         Raises:
             TypeError: an argument does not hold real numbers.
-            ValueError: a wrong shape, a pose that is not finite, or no covariance at all.
+            ValueError: a wrong shape, a pose that is not finite, or no covariance.
         """
-        given = arrays.copied_to_host(fix, self._backend, "fix")
-        x, y = (float(value) for value in checks.array("fix", given, (2,), finite=False))
+        on_host = arrays.copied_to_host(fix, self._backend, "fix")
+        x, y = (float(value) for value in checks.array("fix", on_host, (2,), finite=False))
         hit = self._hit
         if covariance is not None:
             c = check_covariance("covariance", covariance)
@@ -110,8 +116,8 @@ class PositionModel(PointModel):
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
-        found = [] if p.z_rand else [rand_omission("z_rand = 0")]
-        return "position fix", found + relative_omissions(p.mount, self.precision)
+        omissions = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        return "position fix", omissions + relative_omissions(p.mount, self.precision)
 
     def _terms(self, hit: list[np.floating], x: float, y: float) -> np.ndarray:
         region, random = self.parameters.region, -math.inf
@@ -121,7 +127,7 @@ class PositionModel(PointModel):
         return np.array([*hit, random], self._real)
 
     def _gaussian(self, name: str, covariance: tuple[Decimal, Decimal, Decimal]) -> list[np.floating]:
-        """Whitening by the Cholesky factor, and the log of weight and peak, each as two numbers."""
+        """Return the whitening by the Cholesky factor, and the log of weight and peak, each as two numbers."""
         with localcontext(prec=DIGITS):
             xx, xy, yy = covariance
             first = xx.sqrt()
@@ -143,13 +149,19 @@ class HeadingModel(PointModel):
 
     Args:
         parameters: Kind, deviation or concentration, weights and offset.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of headings of many turns.
         temperature: In (0, 1]: multiplies log p, for errors that are not independent from reading to reading.
 
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs, math
+        >>> model = gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend="numpy")
+        >>> int(model.log_likelihood([(0.0, 0.0, 1.0), (0.0, 0.0, 0.0)], 2 * math.pi).argmax())
+        1
     """
 
     def __init__(
@@ -166,16 +178,15 @@ class HeadingModel(PointModel):
         super().__init__(backend, precision, temperature)
         self._kind, terms = self._mixture()
         self._flags |= {"RAND"} if self.parameters.z_rand else set()
-        self._terms_there = self._backend.upload(terms)
+        self._terms_buffer = self._backend.upload(terms)
 
     def log_likelihood(self, poses: object, heading: object, *, out: Any = None) -> np.ndarray:
-        """log p(z | x) of a heading for each particle, natural logarithm.
+        """Return log p(z | x) of a heading for each particle, natural logarithm.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            heading: What the sensor reads [rad], any number of turns. One that is not finite is missing and says
-                nothing: 0.
-            out: Where to write the result, in the memory where the poses are.
+            heading: The reading [rad], any number of turns. One that is not finite is missing and has log p = 0.
+            out: The array for the result, in the memory of the poses.
 
         Returns:
             (N,) log-likelihoods in the model's precision, densities in 1/rad.
@@ -184,8 +195,8 @@ class HeadingModel(PointModel):
             TypeError: an argument does not hold real numbers.
             ValueError: a wrong shape, or a pose that is not finite.
         """
-        given = arrays.copied_to_host(heading, self._backend, "heading")
-        reading = float(checks.array("heading", given, (), finite=False))
+        on_host = arrays.copied_to_host(heading, self._backend, "heading")
+        reading = float(checks.array("heading", on_host, (), finite=False))
         if not math.isfinite(reading):
             return cast(np.ndarray, self._score(poses, out, None, [MISSING]))
         zero = np.zeros(1)
@@ -197,25 +208,28 @@ class HeadingModel(PointModel):
             residual, wrapping = self._relative(some, part, "wrap_headings", target)
             count = part[1] - part[0]
             score = launch(
-                "score_heading", self._flags, (count,), residual=residual, terms=self._terms_there, log_p=log_p,
+                "score_heading", self._flags, (count,), residual=residual, terms=self._terms_buffer, log_p=log_p,
                 particles=count, kind=self._kind, temperature=self.temperature,
             )  # fmt: skip
             return (*wrapping, score)
 
         return cast(np.ndarray, self._score(poses, out, program, []))
 
+    def _options(self) -> tuple[str, ...]:
+        return (f"kind={self.parameters.kind!r}",)
+
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
-        found = [] if p.z_rand else [rand_omission("z_rand = 0")]
-        # How far from half a turn all other turns are below exp(-40) of the nearest one.
+        omissions = [] if p.z_rand else [rand_omission("z_rand = 0")]
+        # Distance from half a turn beyond which all other turns are below exp(-40) of the nearest one.
         near = NEGLIGIBLE * p.sigma**2 / (2 * math.pi)
         if self._kind == NEARBY and near < math.pi:
             why = f"residuals of less than pi - {near:.2g} rad need the nearest turn only"
-            found.append(Omission("other turns", why, f"{2 * WRAPS} exp and 1 log for each such particle"))
-        return f"heading, {p.kind}", found
+            omissions.append(Omission("other turns", why, f"{2 * WRAPS} exp and 1 log for each such particle"))
+        return f"heading, {p.kind}", omissions
 
     def _mixture(self) -> tuple[int, np.ndarray]:
-        """The kind of density, and the numbers of the kernel file ``absolute``."""
+        """Return the kind of density, and the numbers of the kernel file ``absolute``."""
         p, real = self.parameters, self._real
         waves, decay = [0.0] * WAVES, 0.0
         log_hit, random = log_of(p.z_hit), log_weight(p.z_rand) - math.log(2 * math.pi)
@@ -223,7 +237,7 @@ class HeadingModel(PointModel):
             if p.kind == "von_mises":
                 from scipy.special import i0e
 
-                # Small ones may vanish: they are as 0.
+                # A small kappa may underflow: its density is that of 0.
                 self._check_scale("kappa", 1 / math.sqrt(max(p.kappa, 1.0)), "1 / sqrt(kappa) ")
                 kind, scale = VON_MISES, (2 * exact(p.kappa)).sqrt()
                 peak = total(log_hit, -(2 * PI * exact(float(i0e(p.kappa)))).ln())
@@ -231,7 +245,7 @@ class HeadingModel(PointModel):
                 self._check_scale("sigma", p.sigma)
                 kind, scale = NEARBY, 1 / (Decimal(2).sqrt() * exact(p.sigma))
                 peak = total(log_hit, -((2 * PI).sqrt() * exact(p.sigma)).ln())
-                # Held finite in float32; other turns have vanished long before.
+                # Clamped to stay finite in float32; other turns vanish long before.
                 decay = min(2 * math.pi / p.sigma / p.sigma, 1e30)
             else:
                 kind, scale, peak = SERIES, Decimal(0), total(log_hit, -(2 * PI).ln())

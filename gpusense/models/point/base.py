@@ -1,4 +1,4 @@
-"""What the models without a scan share: the device, batching, the temperature, the report of what is left out."""
+"""Base of the models without a scan: the device, batching, the temperature, the report of omissions."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.reference import relative
 
 Programmer = Callable[[Poses, Part, Buffer], Program]
-"""Makes the program that writes log p of some poses into a buffer."""
+"""Function that makes the program that writes log p of some poses into a buffer."""
 ORIGIN = dict(origin_x=0.0, origin_y=0.0, mount_x=0.0, mount_y=0.0)
 MISSING = Omission("reading", "it is not finite, so it is missing", "everything but a look at the poses")
 
 
 def rand_omission(why: str, each: str = "") -> Omission:
-    """What it saves that a reading cannot be just anything."""
+    """Return the saving of a mixture without its uniform component."""
     return Omission("rand component", why, f"1 exp and 1 log per particle{each}")
 
 
 def relative_omissions(mount: tuple[float, float], precision: str) -> list[Omission]:
-    """What is left out of places relative to a fix or to beacons."""
-    found = []
+    """Return the omissions of places relative to a fix or to beacons."""
+    omissions = []
     if mount == (0.0, 0.0):
         why = "the antenna sits at the robot's origin"
-        found.append(Omission("mount", why, "cosine and sine of a heading, and a rotation, per particle"))
+        omissions.append(Omission("mount", why, "cosine and sine of a heading, and a rotation, per particle"))
     if precision == "float32":
         why = "places are taken relative to what is measured in float64, and kept in two numbers"
-        found.append(Omission("float64", why, "half the bytes and wide units"))
-    return found
+        omissions.append(Omission("float64", why, "half the bytes and wide units"))
+    return omissions
 
 
 class PointModel(ABC):
-    """A measurement model of one reading, or a few, for each of many poses."""
+    """Base of the measurement models of one reading, or a few, for each of many poses."""
 
     _specialize = True
 
@@ -56,9 +56,17 @@ class PointModel(ABC):
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
         self._flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
-        # Flags of the last call's kernels, if there was one, and what its readings left out.
+        # Flags of the last call's kernels, None before a call, and omissions by its readings.
         self._last_code: frozenset[str] | None = None
         self._last_left_out: list[Omission] = []
+
+    def __repr__(self) -> str:
+        parts = (*self._options(), f"precision={self.precision!r}", f"backend={self.device.selection!r}")
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _options(self) -> tuple[str, ...]:
+        """Return the map and the options that only this kind of model has, as ``repr`` shows them."""
+        return ()
 
     @property
     def device(self) -> BackendInfo:
@@ -71,7 +79,7 @@ class PointModel(ABC):
         return self._real.name
 
     def explain(self) -> str:
-        """What this scene does not need, why, and what leaving it out saves; readings and poses as of the last call."""
+        """Report what this scene leaves out, why, and the saving; readings and poses as of the last call."""
         name, omissions = self._describe()
         title = f"{name}, {self.precision}, {self.device.selection} ({self.device.name})"
         code = self._last_code or frozenset()
@@ -84,10 +92,10 @@ class PointModel(ABC):
 
     @abstractmethod
     def _describe(self) -> tuple[str, list[Omission]]:
-        """The model's name in a report, and what its parameters leave out."""
+        """Return the model's name in a report, and the omissions by its parameters."""
 
     def _check_scale(self, name: str, value: float, what: str = "") -> None:
-        """Hold a deviation to what the model's precision can square.
+        """Refuse a deviation whose square is beyond the model's precision.
 
         Raises:
             ValueError: it is outside.
@@ -112,15 +120,15 @@ class PointModel(ABC):
 
         Args:
             poses: (N, 3) poses.
-            out: Where the result is to be, or None.
+            out: The array for the result, or None.
             program: Makes the program that writes log p of some poses into a buffer.
-            left_out: What these readings do not need.
+            left_out: The omissions by these readings.
             items: Cost of each pose, in readings of a scan.
             itemsize: Bytes that are kept for each pose and item.
             after: Called with each part once its program is started.
 
         Raises:
-            TypeError, ValueError: poses that are not (N, 3) finite numbers, or an unfit place for the result.
+            TypeError, ValueError: poses that are not (N, 3) finite numbers, or an unfit array for the result.
         """
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend)
@@ -132,14 +140,14 @@ class PointModel(ABC):
         def score(piece: Piece) -> None:
             with space.result("log_p", flat, piece.begin, piece.count, real) as result:
                 if program is None:
-                    # Nothing is measured, but poses that are not finite are refused as ever.
+                    # Poses that are not finite are refused even without a measurement.
                     _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)
                     backend.run(launches)
                     backend.upload(np.zeros(piece.count, real), result)
                 else:
-                    made = program(checked, piece.part, result)
-                    self._last_code = flags_of(made)
-                    backend.run(made)
+                    launches = program(checked, piece.part, result)
+                    self._last_code = flags_of(launches)
+                    backend.run(launches)
             after(piece.part)
 
         with self._lock, space:
@@ -154,7 +162,7 @@ class PointModel(ABC):
         return arrays.lent(poses, backend, flat, (count,), real) if on_device else arrays.like(poses, flat)
 
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
-        """Return the places or residuals of some poses, and the launch of the file ``relative`` that finds them.
+        """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.
 
         Args:
             poses: The poses.

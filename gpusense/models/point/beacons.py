@@ -24,20 +24,27 @@ from gpusense.world.sensor_parameters import BeaconParameters
 class BeaconModel(PointModel):
     """log p(z_1 ... z_F | x) of ranges to known beacons.
 
-    Each adds ``log(z_hit f(z - d - bias) / m + z_rand / range_max)``. d is the antenna's distance to the beacon, f the
-    density of the parameters' kind and m its mass on [0, range_max], so that each range's density integrates to 1;
-    where d + bias lies outside this interval m is that at its end.
+    Each range adds ``log(z_hit f(z - d - bias) / m + z_rand / range_max)``. d is the antenna's distance to the beacon,
+    f the density of the parameters' kind and m its mass on [0, range_max], so that each range's density integrates to
+    1; where d + bias lies outside this interval, m is taken at its nearest end.
 
     Args:
-        xy: (M, 2) places of the beacons in the world [m].
-        parameters: Density, bias, weights and where the antenna is.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        xy: (M, 2) positions of the beacons in the world [m].
+        parameters: Density, bias, weights and the antenna's mount.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``; either keeps the digits of large coordinates.
         temperature: In (0, 1]: multiplies the sum over ranges. 1 is the plain product of densities.
 
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> model = gs.BeaconModel([(0.0, 0.0), (8.0, 0.0)], backend="numpy")
+        >>> poses = [(4.0, 3.0, 0.0), (4.0, 0.0, 0.0)]
+        >>> int(model.log_likelihood(poses, [5.0, 5.0]).argmax())
+        0
     """
 
     def __init__(
@@ -52,9 +59,9 @@ class BeaconModel(PointModel):
         self.parameters = BeaconParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BeaconParameters):
             raise TypeError(f"parameters: must be BeaconParameters, got {checks.show(parameters)}")
-        given = checks.as_array("xy", xy)
+        points = checks.as_array("xy", xy)
         # An empty list has no columns.
-        self.xy = checks.array("xy", given.reshape(0, 2) if given.shape == (0,) else given, ("M", 2)).copy()
+        self.xy = checks.array("xy", points.reshape(0, 2) if points.shape == (0,) else points, ("M", 2)).copy()
         self.xy.flags.writeable = False
         super().__init__(backend, precision, temperature)
         self._flags |= {"RAND"} if self.parameters.z_rand else set()
@@ -66,17 +73,17 @@ class BeaconModel(PointModel):
             raise ValueError(f"xy: must be within {FARTHEST:.2g} m of the middle, got {far:.2g} m")
         self._kind, terms, series = self._mixture()
         self._count = len(series)
-        self._terms_there, self._series_there = self._backend.upload(terms), self._backend.upload(series)
+        self._terms_buffer, self._series_buffer = self._backend.upload(terms), self._backend.upload(series)
 
     def log_likelihood(self, poses: object, ranges: object, ids: object = None, *, out: Any = None) -> np.ndarray:
-        """log p(z_1 ... z_F | x) for each particle, natural logarithm.
+        """Return log p(z_1 ... z_F | x) for each particle, natural logarithm.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and what is not between 0 and
-                range_max, is missing: it says nothing.
+            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and values outside [0, range_max],
+                are missing and add 0.
             ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.
-            out: Where to write the result, in the memory where the poses are.
+            out: The array for the result, in the memory of the poses.
 
         Returns:
             (N,) log-likelihoods in the model's precision, densities in 1/m for each range; 0 without ranges.
@@ -98,7 +105,7 @@ class BeaconModel(PointModel):
             particles = part[1] - part[0]
             score = launch(
                 "score_beacons", self._flags, (particles,), place=place,
-                beacon=self._workspace.upload("beacon", beacon), terms=self._terms_there, series=self._series_there,
+                beacon=self._workspace.upload("beacon", beacon), terms=self._terms_buffer, series=self._series_buffer,
                 log_p=log_p, particles=particles, beacons=count, count=self._count, kind=self._kind,
                 temperature=self.temperature,
             )  # fmt: skip
@@ -106,30 +113,33 @@ class BeaconModel(PointModel):
 
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=count))
 
+    def _options(self) -> tuple[str, ...]:
+        return f"beacons={len(self.xy)}", f"kind={self.parameters.kind!r}"
+
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
-        found = [] if p.z_rand else [rand_omission("z_rand = 0", " and range")]
-        return f"ranges to beacons, {p.kind}", found + relative_omissions(p.mount, self.precision)
+        omissions = [] if p.z_rand else [rand_omission("z_rand = 0", " and range")]
+        return f"ranges to beacons, {p.kind}", omissions + relative_omissions(p.mount, self.precision)
 
     def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
-        """(F, BEACON) numbers of the ranges that count, and which do not."""
+        """Return the (F, BEACON) numbers of the valid ranges, and the omissions of the others."""
         p, known = self.parameters, len(self.xy)
-        given = arrays.copied_to_host(ranges, self._backend, "ranges")
+        on_host = arrays.copied_to_host(ranges, self._backend, "ranges")
         if ids is None:
-            z, index = checks.array("ranges", given, (known,), finite=False), np.arange(known)
+            z, index = checks.array("ranges", on_host, (known,), finite=False), np.arange(known)
         else:
             chosen = checks.as_array("ids", ids)
             index = checks.array("ids", chosen.astype(np.int64) if chosen.size == 0 else chosen, ("F",), dtype=np.int64)
-            z = checks.array("ranges", given, (len(index),), finite=False)
+            z = checks.array("ranges", on_host, (len(index),), finite=False)
             outside = (index < 0) | (index >= known)
             if outside.any():
                 at = int(np.argmax(outside))
                 raise ValueError(f"ids: indices must be in [0, {known}), got {index[at]} at index {at}")
-        missing, there = np.isnan(z), (z >= 0) & (z <= p.range_max)
+        missing, valid = np.isnan(z), (z >= 0) & (z <= p.range_max)
         left_out = []
         reasons = (
             ("missing ranges", missing, "are nan"),
-            ("impossible ranges", ~(missing | there), f"are not in [0, {p.range_max:g}] m"),
+            ("impossible ranges", ~(missing | valid), f"are not in [0, {p.range_max:g}] m"),
         )
         for what, which, why in reasons:
             if number := int(np.count_nonzero(which)):
@@ -137,14 +147,14 @@ class BeaconModel(PointModel):
                 left_out.append(Omission(what, why, f"{share(number, len(z))} of the ranges"))
         rows = []
         with localcontext(prec=DIGITS):
-            for (x, y), reading in zip(self.xy[index[there]], z[there], strict=True):
+            for (x, y), reading in zip(self.xy[index[valid]], z[valid], strict=True):
                 numbers = (exact(float(x)) - exact(self._origin[0]), exact(float(y)) - exact(self._origin[1]),
                            exact(float(reading)) - exact(p.bias))  # fmt: skip
                 rows.append(two_parts(numbers, self._real))
         return np.array(rows, self._real).reshape(-1, BEACON), left_out
 
     def _mixture(self) -> tuple[int, np.ndarray, np.ndarray]:
-        """The kind of density, and the numbers and the series of the kernel file ``beacons``."""
+        """Return the kind of density, and the numbers and the series of the kernel file ``beacons``."""
         p, real = self.parameters, self._real
         self._check_scale("sigma_range", p.sigma_range)
         self._check_scale("range_max", p.range_max)
@@ -175,13 +185,13 @@ class BeaconModel(PointModel):
 
 
 def _normal(sigma: float, log_share: Decimal | float) -> tuple[Decimal, Decimal | float]:
-    """``1 / (sigma sqrt 2)`` and the log of a share of a normal's peak."""
+    """Return ``1 / (sigma sqrt 2)`` and the log of a share of a normal's peak."""
     scale = 1 / (Decimal(2).sqrt() * exact(sigma))
     return scale, total(log_share, -((2 * PI).sqrt() * exact(sigma)).ln())
 
 
 def _log_t_peak(nu: int) -> Decimal:
-    """Log of the peak of a Student t of scale 1, by the recurrence of its ratio of gamma functions."""
+    """Return the log of the peak of a Student t of scale 1, by the recurrence of its ratio of gamma functions."""
     ratio = 1 / PI.sqrt() if nu % 2 else PI.sqrt() / 2
     for n in range(2 - nu % 2, nu, 2):
         ratio = ratio * (n + 1) / n
@@ -189,7 +199,7 @@ def _log_t_peak(nu: int) -> Decimal:
 
 
 def t_series(nu: int) -> tuple[float, np.ndarray]:
-    """Of a Student t's mass between -t and t: the factor of the arc, and the series in the square of its cosine.
+    """Return the factor of the arc, and the series in its cosine's square, of a Student t's mass between -t and t.
 
     Source: Abramowitz and Stegun, 26.7.3 (odd nu) and 26.7.4 (even nu).
     """

@@ -1,4 +1,4 @@
-"""A bumper: contact of a robot's outline with the map."""
+"""The bumper model: contact of a robot's outline with the map."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from gpusense.backends.base import Buffer
 from gpusense.interface.constants import FIELD_RING
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
+from gpusense.models.arguments import map_words
 from gpusense.models.point.base import PointModel
 from gpusense.models.point.pairs import DIGITS, exact, two_parts
 from gpusense.models.poses import Frame, Part, Poses, place
@@ -23,9 +24,9 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters
 from gpusense.world.windows import LONGEST_SIDE, Window
 
-# Cells around the map and the outline: so many deviations, but no more than that many cells.
+# Margin around the map and the outline: this number of deviations, at most this number of cells.
 _DEVIATIONS, _MOST_MARGIN = 4, 64
-# Points of an outline, and in eps and cells of a reading and 2 more what an end point's rounding errors can be.
+# Most points of an outline, and the bound of an end point's rounding errors, in eps times its length in cells + 2.
 _MOST_POINTS = 1 << 16
 _GUARD = 3.25
 
@@ -34,10 +35,10 @@ class BumperModel(PointModel):
     """log p(pressed | x, m) of a bumper by the distance of the robot's outline to the nearest obstacle.
 
     ``P(pressed) = p_contact P(touching) + p_false (1 - P(touching))`` with ``P(touching) = Phi(-gap / sigma)``. The gap
-    is the distance from the outline to the nearest occupied cell's centre, less half a cell; distances are those of the
-    cells that points lie in, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle
-    in segments, are looked up at points half a cell apart at most. What stands wholly inside a polygon touches nothing.
-    A point farther off the map than the outline reaches, and 4 deviations (64 cells at most), counts as there.
+    is the distance from the outline to the nearest occupied cell's centre, less half a cell. A point has the distance
+    of its cell, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle in segments,
+    are looked up at points half a cell apart at most. An obstacle wholly inside a polygon does not touch it. Points are
+    clamped to a margin around the map: the outline's reach, and 4 deviations (64 cells at most).
 
     Args:
         grid: The map.
@@ -46,7 +47,7 @@ class BumperModel(PointModel):
         segments: None where the outline is one bumper. Of a circle: (B, 2) bearings from and to which bumpers reach
             counter-clockwise [rad]. Of a polygon: (P,) integers, the bumper 0 to B - 1 that the edge from each corner
             to the next is part of, or -1 for none.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
@@ -55,6 +56,14 @@ class BumperModel(PointModel):
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> model = gs.BumperModel(grid, 0.3, backend="numpy")
+        >>> log_p = model.log_likelihood([(0.5, 0.05, 0.0), (1.7, 0.05, 0.0)], True)
+        >>> int(log_p.argmax())
+        1
     """
 
     def __init__(
@@ -98,17 +107,16 @@ class BumperModel(PointModel):
         self._window = Window(-margin, -margin, rows, cols)
         self._guard = _GUARD * float(np.finfo(self._real).eps) * (2 * extent / side + 2)
         high, low = split(self._points / side, self._real)
-        self._given = [self._backend.upload(each) for each in (high, low)]
-        self._terms_there = self._backend.upload(self._terms(self._radius))
+        self._all_points = [self._backend.upload(each) for each in (high, low)]
+        self._terms_buffer = self._backend.upload(self._terms(self._radius))
 
     def log_likelihood(self, poses: object, pressed: object, *, out: Any = None) -> np.ndarray:
-        """log p(pressed | x, m) for each particle, natural logarithm.
+        """Return log p(pressed | x, m) for each particle, natural logarithm.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            pressed: True or False (1 or 0 do as well), or (B,) of them where there are segments; NaN or None is a
-                missing reading, which says nothing: 0.
-            out: Where to write the result, in the memory where the poses are.
+            pressed: True or False, or 1 or 0; (B,) of them with segments. NaN or None is missing, and adds 0.
+            out: The array for the result, in the memory of the poses.
 
         Returns:
             (N,) logarithms of probabilities in the model's precision.
@@ -118,17 +126,17 @@ class BumperModel(PointModel):
             ValueError: a wrong shape, or a pose that is not finite.
         """
         states = self._states(pressed)
-        there, left_out = states >= 0, []
-        if missing := int(np.count_nonzero(~there)):
+        valid, left_out = states >= 0, []
+        if missing := int(np.count_nonzero(~valid)):
             why = f"{missing} of {self.segments} are nan or None"
             left_out = [Omission("missing readings", why, f"{share(missing, self.segments)} of the segments")]
-        if not there.any():
+        if not valid.any():
             return cast(np.ndarray, self._score(poses, out, None, left_out))
         sizes = np.diff(self._start)
-        kept = np.repeat(there, sizes)
-        points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._given
-        start = np.concatenate([[0], np.cumsum(sizes[there])]).astype(np.int32)
-        own = states[there].astype(np.int32)
+        kept = np.repeat(valid, sizes)
+        points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._all_points
+        start = np.concatenate([[0], np.cumsum(sizes[valid])]).astype(np.int32)
+        known = states[valid].astype(np.int32)
         flags = self._flags | (frozenset({"CAREFUL"}) if self._real == np.float32 else frozenset())
         window, space = self._window, self._workspace
 
@@ -138,41 +146,44 @@ class BumperModel(PointModel):
             score = launch(
                 "score_contact", flags, (placed.count,), table=self._table, pose_cell=placed.cell, pose=placed.pose,
                 pose_low=placed.low, point=points[0], point_low=points[1], start=space.upload("start", start),
-                pressed=space.upload("pressed", own), terms=self._terms_there, log_p=log_p, rows=window.rows,
-                cols=window.cols, particles=placed.count, segments=len(own), guard=self._guard,
+                pressed=space.upload("pressed", known), terms=self._terms_buffer, log_p=log_p, rows=window.rows,
+                cols=window.cols, particles=placed.count, segments=len(known), guard=self._guard,
                 temperature=self.temperature,
             )  # fmt: skip
             return (*placed.launches(), score)
 
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
 
+    def _options(self) -> tuple[str, ...]:
+        return map_words(self.grid), f"segments={self.segments}"
+
     def _describe(self) -> tuple[str, list[Omission]]:
-        found = []
+        omissions = []
         if len(self._points) == 1:
             spared = max(round(4 * math.pi * self._radius / self.grid.resolution) - 1, 0)
             why = "one look-up at a circle's centre gives the distance of all of it"
-            found.append(Omission("points of the outline", why, f"about {spared} look-ups per particle"))
+            omissions.append(Omission("points of the outline", why, f"about {spared} look-ups per particle"))
         why = f"unknown cells are {self.unknown} by one rule, applied once to the map"
-        found.append(Omission("unknown branch", why, "a test per look-up"))
+        omissions.append(Omission("unknown branch", why, "a test per look-up"))
         if self.precision == "float32":
             why = "positions are split into cell and fraction in float64"
-            found.append(Omission("float64", why, "half the bytes and wide units"))
-        return "bumper", found
+            omissions.append(Omission("float64", why, "half the bytes and wide units"))
+        return "bumper", omissions
 
     def _select(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         high, low = split(self._points[kept] / self.grid.resolution, self._real)
         return high, low
 
     def _states(self, pressed: object) -> np.ndarray:
-        """(B,) 1 where pressed, 0 where not, -1 where missing."""
-        given = arrays.copied_to_host(pressed, self._backend, "pressed")
-        one = given is None or isinstance(given, (bool, int, float, np.bool, np.number))
-        if not one and not isinstance(given, (list, tuple, np.ndarray)):
+        """Return (B,) states: 1 pressed, 0 released, -1 missing."""
+        on_host = arrays.copied_to_host(pressed, self._backend, "pressed")
+        one = on_host is None or isinstance(on_host, (bool, int, float, np.bool, np.number))
+        if not one and not isinstance(on_host, (list, tuple, np.ndarray)):
             rule = "must be True, False or nan, or a sequence of these"
             raise TypeError(f"pressed: {rule}, got {checks.show(pressed)}")
-        if isinstance(given, np.ndarray) and given.ndim > 1:
-            raise ValueError(f"pressed: shape must be ({self.segments},), got {checks.shape_text(given.shape)}")
-        many = [given] if one else list(np.atleast_1d(np.asarray(given, object)))
+        if isinstance(on_host, np.ndarray) and on_host.ndim > 1:
+            raise ValueError(f"pressed: shape must be ({self.segments},), got {checks.shape_text(on_host.shape)}")
+        many = [on_host] if one else list(np.atleast_1d(np.asarray(on_host, object)))
         states = []
         for value in many:
             if value is None or (isinstance(value, (float, np.floating)) and math.isnan(value)):
@@ -186,7 +197,7 @@ class BumperModel(PointModel):
         return np.array(states)
 
     def _terms(self, radius: float) -> np.ndarray:
-        """The numbers of the kernel file ``contact``."""
+        """Return the numbers of the kernel file ``contact``."""
         p, side = self.parameters, self.grid.resolution
         with localcontext(prec=DIGITS):
             scale = 1 / (exact(2).sqrt() * exact(p.sigma))
@@ -198,11 +209,11 @@ class BumperModel(PointModel):
 
 
 def sample_outline(outline: object, segments: object, spacing: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """What is left of an outline beside its points, the (Q, 2) points, and where each segment's begin, (B + 1,).
+    """Return the radius around the points of an outline, the (Q, 2) points, and the (B + 1,) starts of its segments.
 
     Raises:
         TypeError: not numbers, or segments of a polygon that are no integers.
-        ValueError: a radius that is not positive, fewer than 3 corners, segments that fit neither, or too many points.
+        ValueError: a radius that is not positive, fewer than 3 corners, segments of a wrong shape, or too many points.
     """
     if isinstance(outline, (int, float, np.integer, np.floating)) and not isinstance(outline, bool):
         radius = checks.real("outline", float(outline), above=0)
@@ -238,7 +249,7 @@ def sample_outline(outline: object, segments: object, spacing: float) -> tuple[f
 
 
 def _count(length: float, spacing: float) -> int:
-    """Pieces of a stretch of the outline.
+    """Return the number of pieces of a stretch of the outline.
 
     Raises:
         ValueError: more than 65 536.

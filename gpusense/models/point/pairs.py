@@ -1,6 +1,6 @@
-"""Numbers of a kernel to twice a model's precision: found with 50 digits, given as a rounded number and what it lacks.
+"""Arguments of kernels to twice a model's precision: computed with 50 digits, split into high and low parts.
 
-Where a peak is high its logarithm and the exponent nearly cancel, and every digit of either counts.
+Where a peak is high, its logarithm and the exponent nearly cancel, so every digit of either counts.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ DIGITS = 50
 
 
 def exact(value: float) -> Decimal:
-    """A float as it is."""
+    """Return a float without rounding."""
     return Decimal(value)
 
 
 def log_of(value: Decimal | float) -> Decimal | float:
-    """Natural logarithm with 50 digits; -inf of 0."""
+    """Return the natural logarithm with 50 digits; -inf of 0."""
     with localcontext(prec=DIGITS):
         return Decimal(value).ln() if value > 0 else -math.inf
 
 
 def total(*values: Decimal | float) -> Decimal | float:
-    """A sum of logarithms; -inf if one of them is."""
+    """Return a sum of logarithms; -inf if one of them is."""
     with localcontext(prec=DIGITS):
         return sum((Decimal(v) for v in values), Decimal(0)) if all(map(math.isfinite, values)) else -math.inf
 
 
 def two_parts(values: Iterable[Decimal | float], real: np.dtype) -> list[np.floating]:
-    """Each number rounded, and what rounding took from it; infinite ones lack nothing."""
+    """Return each number rounded, and its rounding error (low part), 0 for infinite ones."""
     parts = []
     with localcontext(prec=DIGITS):
         for value in values:

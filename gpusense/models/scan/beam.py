@@ -35,30 +35,39 @@ class BeamModel(ScanModel):
     Args:
         grid: The map.
         scanner: The scanner's geometry.
-        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, the table of a sensor of the
-            scanner's range_max, of which every beam is one look-up, max readings too.
-        incidence: Instead of ``parameters``, those for each range of angles of incidence: between a beam and the normal
-            of the wall that it hits, see ``RayCaster.incidence``. A beam that hits nothing has its ``no_surface``, or
-            those of the first range. Where ``z_max`` differs between them, max readings depend on the pose, and are
-            impossible where it is 0. Needs an exact caster.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, a table over
+            the scanner's range_max; each beam is one look-up, max readings too.
+        incidence: Parameters by angle of incidence, in place of ``parameters``; see ``RayCaster.incidence`` for the
+            angle. A beam without a hit has ``no_surface``, or the parameters of the first bin. If ``z_max`` differs
+            between bins, max readings depend on the pose, and are impossible where it is 0. Needs an exact caster.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        caster: How expected ranges are found: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
-            one of ``gpusense.casters`` with knobs of its own.
-        sensor_table: None evaluates the mixture; a number tabulates log p over readings and expected ranges in bins of
-            that width [m], at least range_max / 8192, as racing particle filters do.
+        caster: The method for expected ranges: ``"exact"`` (the default), another name of ``RayCaster.methods()``, or
+            a caster of ``gpusense.casters`` with its knobs.
+        sensor_table: None to evaluate the mixture, or the width [m] of bins of readings and expected ranges in which
+            log p is tabulated, at least range_max / 8192, as racing particle filters do.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
         temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
             independent. 1 is the book's plain product.
-        beams: Use only so many informative beams, evenly chosen, or the beams of these indices.
-        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights that these programs compute, with their defaults of
+        beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
+        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults of
             parameters, caster, unknown and outside; see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> model = gs.BeamModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> model
+        BeamModel(1 x 21 cells, resolution=0.1, beams=1, caster=Exact(), precision='float32', backend='numpy')
+        >>> log_p = model.log_likelihood([(0.2, 0.05, 0.0), (0.5, 0.05, 0.0)], [1.5])
+        >>> int(log_p.argmax())
+        1
     """
 
     def __init__(
@@ -131,6 +140,9 @@ class BeamModel(ScanModel):
     def _pipeline(self) -> BeamPipeline:
         return self._beam_pipeline
 
+    def _options(self) -> tuple[str, ...]:
+        return (f"caster={self._caster.method}",)
+
     @property
     def parameters(self) -> BeamParameters | SensorTable:
         """Weights and shapes of the mixture, or the table of a sensor.
@@ -150,7 +162,7 @@ class BeamModel(ScanModel):
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.
 
-        With the exact caster only what can have changed is made anew; see ``RayCaster.update_map``.
+        The exact caster updates only the affected part of its table; see ``RayCaster.update_map``.
 
         Args:
             cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
@@ -164,14 +176,14 @@ class BeamModel(ScanModel):
             self._beam_pipeline.grid = self._caster.update(cells, region)
 
     def expected_ranges(self, poses: object, *, out: Any = None) -> Any:
-        """z* of every beam of the scanner at each pose; of a cone, the range of the nearest return.
+        """Return z* of every beam of the scanner at each pose; for a cone, the range of the nearest return.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad]; arrays of other libraries as in ``log_likelihood``.
-            out: Where to write them, as in ``log_likelihood``.
+            out: The array for the ranges, as in ``log_likelihood``.
 
         Returns:
-            (N, K) metres in the model's precision; exactly range_max where nothing is nearer, or returns.
+            (N, K) metres in the model's precision; exactly range_max without a nearer obstacle or return.
 
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers.
@@ -180,15 +192,15 @@ class BeamModel(ScanModel):
             return self._cast(poses, out, incidence=False)
 
     def incidence(self, poses: object, *, out: Any = None) -> Any:
-        """The angle of incidence of every beam of the scanner at each pose; see ``RayCaster.incidence``.
+        """Return the angle of incidence of every beam of the scanner at each pose; see ``RayCaster.incidence``.
 
         Args:
             poses: As for ``expected_ranges``.
-            out: Where to write them, as in ``log_likelihood``.
+            out: The array for the angles, as in ``log_likelihood``.
 
         Returns:
-            (N, K) radians in [0, pi / 2] in the model's precision, 0 head-on; of a cone, that of the ray with the
-            nearest return. NaN where a beam has none.
+            (N, K) radians in [0, pi / 2] in the model's precision, 0 head-on; for a cone, the angle of the nearest
+            return. NaN for a beam without a return.
 
         Raises:
             TypeError, ValueError: poses that are not (N, 3) finite numbers, or a caster that is not exact.
@@ -198,8 +210,12 @@ class BeamModel(ScanModel):
             return self._cast(poses, out, incidence=True)
 
     def explain(self) -> str:
-        """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
-        return str(self._plan(*title_and_omissions(self)))
+        """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
+        title, omissions = title_and_omissions(
+            self._beam_pipeline, self._last, self._mixtures, self.incidence_parameters,
+            discrete=isinstance(self._parameters, SensorTable), unknown=self.unknown, weights_note=self._weights_note(),
+        )  # fmt: skip
+        return str(self._plan(title, omissions))
 
     def _cast(self, poses: object, out: Any, *, incidence: bool) -> Any:
         pipeline = self._beam_pipeline
@@ -208,11 +224,11 @@ class BeamModel(ScanModel):
 
 
 def _check_incidence(incidence: object, **others: object) -> None:
-    """Refuse parameters by angle of incidence that are none, or that come with other options.
+    """Refuse parameters by angle of incidence of a wrong type, or with conflicting options.
 
     Raises:
         TypeError: not IncidenceParameters.
-        ValueError: another option is given.
+        ValueError: a conflicting option is set.
     """
     if not isinstance(incidence, IncidenceParameters):
         raise TypeError(f"incidence: must be IncidenceParameters, got {checks.show(incidence)}")

@@ -2,35 +2,51 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from gpusense.interface.plan import Omission, launch_omissions, scene_omissions, share
 from gpusense.interface.terms import HIGH_PEAK
+from gpusense.models.scan.beam_pipeline import BeamPipeline
+from gpusense.models.scan.scoring import LastCall
 from gpusense.models.scan.tiles import LEAST_ORDERED
-from gpusense.world.sensor_table import SensorTable
+from gpusense.world.parameters import BeamParameters, IncidenceParameters
 
-if TYPE_CHECKING:
-    from gpusense.models.scan.beam import BeamModel
+_COSTS = (
+    ("z_hit", "1 exp, 2 erf and 1 division per particle-beam"),
+    ("z_short", "1 exp, 1 tanh and 2 divisions per particle-beam"),
+    ("z_rand", "1 addition per particle-beam"),
+    ("z_max", "max readings altogether"),
+)
 
 
-def title_and_omissions(model: BeamModel) -> tuple[str, list[Omission]]:
-    """Return the title of the report, and the omissions; readings and map as of the last call."""
-    costs = (
-        ("z_hit", "1 exp, 2 erf and 1 division per particle-beam"),
-        ("z_short", "1 exp, 1 tanh and 2 divisions per particle-beam"),
-        ("z_rand", "1 addition per particle-beam"),
-        ("z_max", "max readings altogether"),
-    )
-    discrete = isinstance(model._parameters, SensorTable)
-    pipeline, flags = model._pipeline, model._last.flags
-    cells = pipeline.mixture.cells
-    components = [(name, max(getattr(p, name) for p in model._mixtures), cost) for name, cost in costs]
-    components = [] if discrete else components
+def title_and_omissions(
+    pipeline: BeamPipeline,
+    last: LastCall,
+    mixtures: Sequence[BeamParameters],
+    incidence: IncidenceParameters | None,
+    *,
+    discrete: bool,
+    unknown: str,
+    weights_note: str,
+) -> tuple[str, list[Omission]]:
+    """Return the title of the report, and the omissions; readings and map as of the last call.
+
+    Args:
+        pipeline: The stages of the model.
+        last: The last call.
+        mixtures: Parameters of each bin of angles of incidence.
+        incidence: The parameters by angle of incidence, or None.
+        discrete: Whether the model is the table of a sensor.
+        unknown: The rule for unknown cells.
+        weights_note: Words of the title about weights of other programs.
+    """
+    caster, flags, scan = pipeline.caster, last.flags, last.scan
+    scanner, real, peer = pipeline.scanner, pipeline.real.name, pipeline.setting.peer
+    components = [(name, max(getattr(p, name) for p in mixtures), cost) for name, cost in _COSTS]
     omissions = scene_omissions(
-        components=components, mount=model.scanner.mount, unknown=model.unknown, outside=model.outside,
-        precision=model.precision, ring=model._caster.method.ring,
+        components=[] if discrete else components, mount=scanner.mount, unknown=unknown, outside=caster.outside,
+        precision=real, ring=caster.method.ring,
     )  # fmt: skip
-    scan = model._last.scan
     if scan is not None and scan.shared:
         spared = len(scan.readings) - len(scan.rays)
         omissions.append(
@@ -46,28 +62,33 @@ def title_and_omissions(model: BeamModel) -> tuple[str, list[Omission]]:
         omissions.append(
             Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
         )
-    if model.compat is not None:
-        omissions.append(Omission("normalised density", f"compat='{model.compat}' sums cubes", "the likelihood"))
-    elif discrete:
-        steps = f"{cells + 1} x {cells + 1} steps of readings and expected ranges, no return included"
-        omissions.append(Omission("mixture", f"the model is a table of {steps}", "all but 1 look-up a beam"))
-    elif model.sensor_table is not None:
-        why = f"log p is tabulated over {cells} x {cells + 1} bins of readings and expected ranges"
-        omissions.append(Omission("mixture", why, "all functions of the components, at the error of the bins"))
-    elif "SHARP" not in pipeline.mixture.flags:
-        omissions.append(
-            Omission("exponents in two parts", f"the hit density's peak is at most {HIGH_PEAK:g} / m", "37 operations")
-        )
-    omissions += launch_omissions(flags, LEAST_ORDERED if model.device.kind == "gpu" else None)
-    if (far := model._caster.omission()) is not None:
+    if peer is not None:
+        omissions.append(Omission("normalised density", f"compat='{peer.name}' sums cubes", "the likelihood"))
+    else:
+        omissions += _mixture_omissions(pipeline, discrete=discrete)
+    omissions += launch_omissions(flags, LEAST_ORDERED if pipeline.backend.info.kind == "gpu" else None)
+    if (far := caster.omission()) is not None:
         omissions.append(far)
-    caster = model._caster.method
-    how = "" if caster.name == "exact" else f", ranges by {caster}"
-    how += pipeline.cones.words(model.scanner.critical_incidence)
-    if model.incidence_parameters is not None:
-        how += f", parameters for {len(model.incidence_parameters.parameters)} ranges of the angle of incidence"
-        how += " and for none" if model.incidence_parameters.no_surface is not None else ""
-        how += " (max readings depend on it)" if pipeline.rules.max_depends else ""
+    method = "" if caster.method.name == "exact" else f", ranges by {caster.method}"
+    method += pipeline.cones.words(scanner.critical_incidence)
+    if incidence is not None:
+        method += f", parameters for {len(incidence.parameters)} ranges of the angle of incidence"
+        method += " and for none" if incidence.no_surface is not None else ""
+        method += " (max readings depend on it)" if pipeline.rules.max_depends else ""
     name = "beam model" if not discrete else "discrete beam model"
-    title = f"{name}{model._weights_note()}{how}, {model.precision}"
-    return title, omissions
+    return f"{name}{weights_note}{method}, {real}", omissions
+
+
+def _mixture_omissions(pipeline: BeamPipeline, *, discrete: bool) -> list[Omission]:
+    """Return the part of the mixture that a table, or a low peak, makes unnecessary."""
+    mixture, cells = pipeline.mixture, pipeline.mixture.cells
+    if discrete:
+        steps = f"{cells + 1} x {cells + 1} steps of readings and expected ranges, no return included"
+        return [Omission("mixture", f"the model is a table of {steps}", "all but 1 look-up a beam")]
+    if mixture.table is not None:
+        why = f"log p is tabulated over {cells} x {cells + 1} bins of readings and expected ranges"
+        return [Omission("mixture", why, "all functions of the components, at the error of the bins")]
+    if "SHARP" not in mixture.flags:
+        why = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
+        return [Omission("exponents in two parts", why, "37 operations")]
+    return []

@@ -30,8 +30,8 @@ class BeamPipeline(ScanPipeline):
 
     Args:
         setting: The device and the rules.
-        caster: Finds expected ranges.
-        cones: How the sensor hears.
+        caster: Casts expected ranges.
+        cones: Cones of the sensor.
         mixture: The mixture.
         max_evaluated: Whether max readings are evaluated by the mixture.
     """
@@ -44,10 +44,10 @@ class BeamPipeline(ScanPipeline):
         super().__init__(setting, caster.grid)
         self.caster, self.cones, self.mixture = caster, cones, mixture
         self.rays_each = cones.rays
-        # The rays of each beam: one, or those of a cone.
+        # The rays of each beam, several for a cone.
         self.cone_vectors = ray_vectors(self.scanner.ray_bearings, self.scanner.mount)
         self._fixed_flags = mixture.flags | ({"FLOAT64"} if self.real == np.float64 else _NO_FLAGS)
-        # Where no range is possible there are no components, but the code must evaluate some.
+        # Without possible ranges there are no components, but the kernel's code needs one.
         self._fixed_flags |= _NO_FLAGS if mixture.flags else {"RAND", "SINGLE"}
         self._fixed_flags |= {"ALL_READINGS"} if max_evaluated or not self.specialize else _NO_FLAGS
         upload, cells = self.backend.upload, mixture.cells
@@ -68,7 +68,7 @@ class BeamPipeline(ScanPipeline):
 
     @property
     def _top(self) -> float:
-        """Largest range below a max reading to a table: one that is rounded to range_max is still a range."""
+        """Largest range of a table below a max reading: a range rounded to range_max remains a range."""
         if not self.mixture.cells:
             return math.inf
         return float(np.nextafter(self.real.type(self.scanner.range_max), self.real.type(0)))
@@ -85,7 +85,7 @@ class BeamPipeline(ScanPipeline):
         arrays = dict(ray=vectors.astype(self.real), reading=values)
         if several:
             arrays["fixed_of"] = (scans.constants + self.setting.constant_term).astype(self.real)
-        given = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
+        uploaded = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
         start = counts = self.nothing
         if several:
             begins = np.append(0, np.cumsum(scans.ray_counts)).astype(np.int32)
@@ -96,8 +96,8 @@ class BeamPipeline(ScanPipeline):
         flags = ({"SHARED_RAYS"} if shared else _NO_FLAGS) | ({"SCANS"} if several else _NO_FLAGS)
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, frozenset(flags),
-            dict(ray=given["ray"], reading=given["reading"], first=first, start=start),
-            dict(counts=counts, fixed_of=given.get("fixed_of", self._terms), fixed=fixed),
+            dict(ray=uploaded["ray"], reading=uploaded["reading"], first=first, start=start),
+            dict(counts=counts, fixed_of=uploaded.get("fixed_of", self._terms), fixed=fixed),
             (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings)),
         )  # fmt: skip
 

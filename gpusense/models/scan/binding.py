@@ -20,12 +20,12 @@ from gpusense.models.scan.bound import BoundCall, DeviceCall
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
 
-# Cells of a map whose table is made as a whole for a short call.
+# Most cells of a map for which a short call makes the whole table.
 _MOST_CELLS = 1 << 22
-# Bytes of what is copied with the launches; more is copied in the ordinary way.
+# Most bytes that are copied with the launches; longer arrays take the ordinary call.
 _LARGEST = 256 << 10
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
-# Bytes between the beginnings of arrays that are copied as one: every device can begin there.
+# Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
 
 
@@ -40,7 +40,7 @@ def bind(
         score: ``log_likelihood`` of the model.
         poses: (N, 3) poses.
         ranges: (K,) readings.
-        out: Where log-likelihoods go, or None.
+        out: The array for the log-likelihoods, or None.
     """
     for name, array in (("poses", poses), ("ranges", ranges)):
         if not (isinstance(array, np.ndarray) or hasattr(array, "__dlpack__") or arrays.on_device(array)):
@@ -132,34 +132,34 @@ class _HostCall(BoundCall):
 
 
 class _Pack:
-    """Arrays that are copied as one, on the host and on the device.
+    """Packed arrays, on the host and on the device, that are copied as one.
 
     Attributes:
-        host: What is copied.
-        there: Where it is on the device.
+        host: The packed array on the host.
+        on_device: The packed array on the device.
         views: The arrays on the host.
         parts: The arrays on the device.
     """
 
     def __init__(self, backend: Backend, dtype: np.dtype, *arrays: tuple[int, np.dtype]) -> None:
         begins, size = [], 0
-        for count, own in arrays:
+        for count, dtype_of in arrays:
             begins.append(size)
-            size += -(-count * own.itemsize // _ALIGNED) * _ALIGNED
+            size += -(-count * dtype_of.itemsize // _ALIGNED) * _ALIGNED
         self.host = np.zeros(size // dtype.itemsize, dtype)
-        self.there = backend.upload(self.host, backend.blank(self.host.size, dtype))
+        self.on_device = backend.upload(self.host, backend.blank(self.host.size, dtype))
         numbers = self.host.view(np.uint8)
         self.views, self.parts = [], []
-        for begin, (count, own) in zip(begins, arrays, strict=True):
-            self.views.append(numbers[begin : begin + count * own.itemsize].view(own))
-            self.parts.append(backend.part(self.there, begin // own.itemsize, count, own))
+        for begin, (count, dtype_of) in zip(begins, arrays, strict=True):
+            self.views.append(numbers[begin : begin + count * dtype_of.itemsize].view(dtype_of))
+            self.parts.append(backend.part(self.on_device, begin // dtype_of.itemsize, count, dtype_of))
 
 
 class _StagedCall(BoundCall):
     """A call of few particles: inputs go to the device as one array, and results come back as one.
 
-    A copy of few numbers takes as long as a launch. Poses and readings are float64 on the device, which keeps float32
-    as it is; limits of readings are rounded to the readings' own precision, as on the host.
+    A copy of few numbers takes as long as a launch. Poses and readings are float64 on the device, which is
+    exact for float32. Limits of readings are rounded to the precision of the readings, as on the host.
     """
 
     waits = True
@@ -190,13 +190,13 @@ class _StagedCall(BoundCall):
             ranges[...] = self._ranges
             try:
                 with self._space:
-                    backend.upload(inputs.host, inputs.there, wait=False)
+                    backend.upload(inputs.host, inputs.on_device, wait=False)
                     self._device.begin()
-                    backend.download(outputs.there, outputs.host, wait=not backend.gathers)
+                    backend.download(outputs.on_device, outputs.host, wait=not backend.gathers)
                     if backend.gathers:
                         backend.synchronize()
             except MemoryError:
-                # The whole table of a map that has changed; the ordinary call needs but a part of it.
+                # The whole table of a map that has changed; the ordinary call needs only a part of it.
                 return self._host()
             if not status[0]:
                 self.out[...] = log_p
@@ -214,9 +214,9 @@ class _StagedCall(BoundCall):
         """See BoundCall.check."""
 
 
-def _shape_of(name: str, given: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
+def _shape_of(name: str, value: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
     """Return the shape of an array in host memory; each call reads its numbers anew."""
-    found = np.shape(cast(Any, arrays.to_host(given, name)))
-    if len(found) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, found, strict=True)):
-        raise ValueError(f"{name}: shape must be {checks.shape_text(shape)}, got {checks.shape_text(found)}")
-    return found
+    actual = np.shape(cast(Any, arrays.to_host(value, name)))
+    if len(actual) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, actual, strict=True)):
+        raise ValueError(f"{name}: shape must be {checks.shape_text(shape)}, got {checks.shape_text(actual)}")
+    return actual

@@ -1,4 +1,4 @@
-"""Bound calls: arrays that stay where they are, one start a call, nothing checked again.
+"""Bound calls: arrays that stay in place, one start per call, no repeated checks.
 
 The host takes longer over a call of few particles than its kernels do: checks, the preparation of the scan, a start for
 each launch. Where poses and readings are on the device, all of it is done once. The kernel file ``scan`` classes and
@@ -29,11 +29,20 @@ _INT = np.dtype(np.int32)
 
 
 class BoundCall(ABC):
-    """A call of ``log_likelihood`` with arrays that stay where they are; ``bind`` of a model makes it.
+    """A call of ``log_likelihood`` with arrays that stay in place, as ``bind`` of a model returns.
 
     Attributes:
         out: (N,) log-likelihoods, in the memory and of the library of the poses; every call writes them.
         waits: Whether a call has ended when it returns.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> grid, poses = gs.OccupancyGrid([[0] * 20 + [100]]), np.array([(1.0, 0.05, 0.0), (0.5, 0.05, 0.0)])
+        >>> model = gs.BeamModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> call = model.bind(poses, np.array([0.5]))
+        >>> poses[0] = (0.4, 0.05, 0.0)
+        >>> bool((call() == model.log_likelihood(poses, [0.5])).all())
+        True
     """
 
     out: Any
@@ -52,8 +61,8 @@ class BoundCall(ABC):
             ``out``; where ``waits`` is False, the device may yet be about to write it.
 
         Raises:
-            TypeError: a stream that is none, or for a call that waits.
-            TypeError, ValueError: of a call that waits, what ``log_likelihood`` says of the arrays.
+            TypeError: not a stream, or a stream for a call that waits.
+            TypeError, ValueError: for a call that waits, the errors of ``log_likelihood``.
         """
 
     @abstractmethod
@@ -68,7 +77,7 @@ class BoundCall(ABC):
         """Wait until all calls have ended.
 
         Raises:
-            ValueError: a pose was not finite in some call since the last check; a call that waits says so itself.
+            ValueError: a pose was not finite in some call since the last check; a call that waits reports it at once.
         """
 
 
@@ -79,7 +88,7 @@ class DeviceCall(BoundCall):
         pipeline: The stages of the model.
         lock: Held while the model's buffers are in use.
         poses, ranges, out: See ``ScanModel.bind``.
-        status: The buffer of the non-finite flag of another owner, who inspects it; None for one of its own.
+        status: A shared buffer for the non-finite flag, which its owner inspects; None for a private one.
         limits: The type to which the scanner's limits are rounded; None for the type of the ranges.
     """
 
@@ -105,7 +114,7 @@ class DeviceCall(BoundCall):
         self.out = arrays.lent(poses, backend, self._log_p, (count,), real) if out is None else out
         # The owners of the memory that is read and written.
         self._owners = (poses, ranges, adopted, self.out)
-        # Buffers of its own: other calls of the model may come between.
+        # Private buffers: other calls of the model may come between.
         self._space = Workspace(backend)
         if status is not None:
             self._space.share(POSE_STATUS[0], status, 2, _INT)
@@ -129,7 +138,7 @@ class DeviceCall(BoundCall):
         return self._recording.explain()
 
     def begin(self) -> None:
-        """Start the recording, as part of the call that this thread gathers."""
+        """Start the recording, as part of the call gathered by this thread."""
         self._pipeline.backend.replay(self._current())
 
     def check(self) -> None:
@@ -140,7 +149,7 @@ class DeviceCall(BoundCall):
         finish(self._space, on_device=True)
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:
-        """Return the readings as the kernel ``place_inputs`` leaves them."""
+        """Return the readings as the kernel ``place_inputs`` places them."""
         pipeline, space = self._pipeline, self._space
         sensing = pipeline.sensing()
         placing, filled = device_readings(sensing, adopted.buffer, adopted.dtype, limits, space)
@@ -158,21 +167,21 @@ class DeviceCall(BoundCall):
         self._pipeline.backend.check_process()
         if self._recording is not None and self._pipeline.map.version == self._version:
             return self._recording
-        # The map has changed, or its table is another one.
+        # The map, or its table, has changed.
         if self._recording is not None:
             self._recording.wait()
         return self._recorded()
 
     def _recorded(self) -> Recording:
-        """Make the table where there is none, and record the program of a call; nothing is started."""
+        """Make the table if it is missing, and record the program of a call; nothing is started."""
         backend, pipeline = self._pipeline.backend, self._pipeline
         with self._lock:
-            # Kept, since another call of the model may need another table; the last one first makes room.
+            # Keep the table, since another call of the model may replace it; free the last one first.
             self._table = self._recording = None
             self._table, _ = self._poses.window(pipeline.map, (0, self._poses.count))
             self._version = pipeline.map.version
             recording = backend.record(self._program())
-        # Other streams may come first to the buffers of this one.
+        # Other streams may use the buffers of this one first.
         backend.synchronize()
         self._recording = recording
         return recording

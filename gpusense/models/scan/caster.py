@@ -8,7 +8,7 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense.backends import BackendInfo, Selection, get_backend
-from gpusense.models.arguments import check_scene, real_dtype
+from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
 from gpusense.models.scan.cones import Cones, require_exact
 from gpusense.models.scan.map_caster import MapCaster
@@ -22,15 +22,20 @@ _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class CasterMethod:
-    """A way to find expected ranges.
+    """A method for expected ranges.
 
     Attributes:
-        name: What to pass as ``method=`` or ``caster=``.
+        name: Value of ``caster=``.
         error: ``"exact"``, or the bound of its error.
         memory: Bytes on the device.
-        precomputation: What is made of the map beforehand.
-        backends: Where it runs.
-        knobs: What its error and its time depend on; arguments of the class in ``gpusense.casters``.
+        precomputation: Table computed from the map beforehand.
+        backends: Backends that have it.
+        knobs: Parameters on which its error and its time depend; arguments of the class in ``gpusense.casters``.
+
+    Example:
+        >>> import gpusense as gs
+        >>> [method.name for method in gs.RayCaster.methods()]
+        ['exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup']
     """
 
     name: str
@@ -46,11 +51,11 @@ class RayCaster:
 
     Args:
         grid: The map.
-        range_max: Longest range [m], > 0; what a ray without a nearer obstacle returns.
+        range_max: Longest range [m], > 0; the range of a ray without a nearer obstacle.
         caster: A name of ``RayCaster.methods()``, or a caster of ``gs.casters`` with its knobs, such as
             ``gs.casters.March(tolerance=0.02)``; ``"exact"`` by default.
         method: The same as ``caster``.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
@@ -58,6 +63,15 @@ class RayCaster:
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0, 0, 0, 100]], resolution=0.5)
+        >>> caster = gs.RayCaster(grid, range_max=5.0, precision="float64", backend="numpy")
+        >>> caster
+        RayCaster(1 x 4 cells, resolution=0.5, range_max=5.0, caster=Exact(), precision='float64', backend='numpy')
+        >>> caster.cast([(0.25, 0.25, 0.0)], [0.0]).tolist()
+        [[1.25]]
     """
 
     def __init__(
@@ -86,9 +100,15 @@ class RayCaster:
             device, real, grid, _NO_MOUNT, self.range_max, self.caster, unknown=unknown, outside=outside, crop=True
         )
 
+    def __repr__(self) -> str:
+        return (
+            f"RayCaster({map_words(self.grid)}, range_max={self.range_max}, caster={self.caster}, "
+            f"precision={self.precision!r}, backend={self.device.selection!r})"
+        )
+
     @staticmethod
     def methods() -> tuple[CasterMethod, ...]:
-        """The methods there are, with their error, memory, precomputation, backends and knobs."""
+        """Return the available methods, with their error, memory, precomputation, backends and knobs."""
         everywhere = ("numpy", "opencl", "warp")
         return tuple(
             CasterMethod(kind.name, kind.error, kind.memory, kind.precomputation, everywhere, kind.knobs)
@@ -127,8 +147,8 @@ class RayCaster:
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every range is that of a caster of the changed grid.
 
-        The exact caster mends its table where rectangles can hold a changed obstacle, up to 254 cells off; the others
-        make theirs anew with the next cast.
+        The exact caster updates its table where rectangles can hold a changed obstacle, up to 254 cells away. Other
+        casters make their tables anew with the next cast.
 
         Args:
             cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
@@ -144,7 +164,7 @@ class RayCaster:
         """Write the look-up table, whole or not at all, for ``casters.Lookup(bins, file=path)``.
 
         Raises:
-            ValueError: the method has no table that is worth keeping: only ``"lookup"`` has.
+            ValueError: the method is not ``"lookup"``.
             OSError: the file cannot be written.
         """
         if not isinstance(self.caster, casters.Lookup):
@@ -152,17 +172,17 @@ class RayCaster:
         self._caster.save(checks.path("path", path), self.caster.bins)
 
     def cast(self, poses: object, bearings: object, *, out: Any = None) -> Any:
-        """Expected ranges.
+        """Return expected ranges.
 
         Args:
-            poses: (N, 3) ray origins and headings in the world [m, m, rad]. Arrays of other libraries are used where
-                they are, and ranges come back in the same library; see ``BeamModel.log_likelihood``.
+            poses: (N, 3) ray origins and headings in the world [m, m, rad]. Arrays of other libraries are used
+                without a copy, and ranges are arrays of the same library; see ``BeamModel.log_likelihood``.
             bearings: (K,) directions relative to the heading [rad].
-            out: Where to write the ranges: (N, K) in the caster's precision, C-contiguous, where the poses are.
+            out: The array for the ranges: (N, K) in the caster's precision, C-contiguous, in the memory of the poses.
 
         Returns:
-            (N, K) metres in the caster's precision: 0 inside an occupied cell, exactly ``range_max`` where nothing is
-            nearer.
+            (N, K) metres in the caster's precision: 0 inside an occupied cell, exactly ``range_max`` without a nearer
+            obstacle.
 
         Raises:
             TypeError, ValueError: arguments that are not finite numbers of these shapes.
@@ -171,18 +191,18 @@ class RayCaster:
         return self._caster.cast(poses, vectors, out)
 
     def incidence(self, poses: object, bearings: object, *, out: Any = None) -> Any:
-        """Angles of incidence: between each ray and the normal of the surface that it hits.
+        """Return angles of incidence, between each ray and the normal of the surface that it hits.
 
-        Normals are those of ``surface_normals``, of the cell in which the exact ray ends; a cell without one counts as
-        met head-on.
+        Normals are computed as by ``surface_normals``, in the cell in which the exact ray ends. A cell without a normal
+        has the angle 0.
 
         Args:
             poses: As for ``cast``.
             bearings: As for ``cast``.
-            out: Where to write the angles, as for ``cast``.
+            out: The array for the angles, as for ``cast``.
 
         Returns:
-            (N, K) radians in [0, pi / 2], 0 head-on; NaN where nothing is nearer than ``range_max``.
+            (N, K) radians in [0, pi / 2], 0 head-on; NaN without an obstacle nearer than ``range_max``.
 
         Raises:
             TypeError, ValueError: arguments that are not finite numbers of these shapes, or a method that is not exact.

@@ -20,7 +20,7 @@ _NONE = np.zeros(0, np.intp)
 
 @dataclass(frozen=True)
 class Rules:
-    """How readings are classed, thinned and grouped.
+    """Rules by which readings are classed, thinned and grouped.
 
     Attributes:
         scanner: The scanner's geometry.
@@ -47,7 +47,7 @@ class Rules:
 
     @functools.cached_property
     def plain(self) -> bool:
-        """Whether ranges are evaluated each on a ray of its own, and max readings are constant."""
+        """Whether each range is evaluated on a separate ray, and max readings are constant."""
         return self.specialize and self.distinct and not (self.max_is_range or self.max_depends)
 
 
@@ -81,7 +81,7 @@ class ClassedScans:
         ray_counts: (S,) rays of each scan.
         counts: (S,) readings of each scan.
         constants: (S,) constant terms: log-likelihoods of the readings that do not depend on the pose.
-        left_out: The readings of the last scan that are not here.
+        left_out: The other readings of the last scan.
     """
 
     columns: np.ndarray
@@ -127,7 +127,7 @@ class ClassedScans:
         )  # fmt: skip
 
     def groups(self) -> Iterator[tuple[int, int]]:
-        """Yield neighbouring scans that one program may score: with shared rays, or without; alone without readings."""
+        """Yield neighbouring scans that one program may score: all with shared rays, or none; empty ones alone."""
         kinds = np.where(self.counts == 0, 0, np.where(self.counts == self.ray_counts, 1, 2)).tolist()
         begin = 0
         while begin < len(kinds):
@@ -179,10 +179,10 @@ def check_beams(beams: Beams, count: int) -> Beams:
 
 
 def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
-    """Return readings of one scan (K,) or of several (S, K), checked, in their own float dtype."""
-    given = as_array("ranges", ranges)
-    shape = ("S", scanner.count) if given.ndim == 2 else (scanner.count,)
-    return array("ranges", given, shape=shape, finite=False, dtype=None)
+    """Return readings of one scan (K,) or of several (S, K), checked, in their float dtype."""
+    readings = as_array("ranges", ranges)
+    shape = ("S", scanner.count) if readings.ndim == 2 else (scanner.count,)
+    return array("ranges", readings, shape=shape, finite=False, dtype=None)
 
 
 def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
@@ -276,7 +276,7 @@ def _with_ranges(
         ranges: (S, K) metres.
         hit: (S, K) whether a reading is a range that is used.
         far: (S, K) whether it is a max reading that is used.
-        rules: How readings are classed.
+        rules: The rules for readings.
         kinds: (K,) classes of the last scan's readings where beams are chosen, else None.
     """
     beams, z_max = rules.scanner.count, rules.z_max
@@ -292,7 +292,7 @@ def _with_ranges(
             constants = np.where(far_counts > 0, far_counts * np.log(z_max), 0.0)
         values, vectors = ranges[hit].astype(np.float64), rules.vectors[columns]
     else:
-        # Scans without gaps need no choice.
+        # Scans without gaps need no selection.
         values = ranges.reshape(-1).astype(np.float64)
         vectors = rules.vectors if len(ranges) == 1 else rules.vectors[columns]
     kept = int(counts[-1]) + len(constant_max)

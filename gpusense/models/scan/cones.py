@@ -1,4 +1,4 @@
-"""How a sensor hears: along one ray or in a cone of them, from surfaces at any angle or only from those met head-on."""
+"""Cones of a sensor: one ray or several, with returns from surfaces at any angle of incidence or only up to a limit."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from gpusense.tables.casters import Caster
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Scanner
 
-# Between every cosine and what kernels have for one where nothing returns.
+# Between the largest cosine, 1, and 2, the kernels' value for a ray without a return.
 _BEYOND = 1.5
 
 
 @dataclass(frozen=True)
 class Cones:
-    """How a sensor hears.
+    """Cones of a sensor.
 
     Attributes:
         rays: Rays of each cone; 1 for a laser.
-        critical: Least cosine of an angle of incidence at which a surface returns; 0 where all do.
-        incidence: Whether angles of incidence are wanted, not ranges.
+        critical: Least cosine of an angle of incidence at which a surface returns; 0 without a limit.
+        incidence: Whether angles of incidence are computed, not ranges.
     """
 
     rays: int = 1
@@ -43,13 +43,13 @@ class Cones:
         return frozenset({"ECHO"} if self.rays > 1 else ())
 
     def words(self, critical: float | None) -> str:
-        """What a plan's title says of it; ``critical`` is the largest angle that returns [rad]."""
+        """Return the words of a plan's title; ``critical`` is the largest angle that returns [rad]."""
         cone = f", cones of {self.rays} rays" if self.rays > 1 else ""
         return cone + (f", no return beyond {critical:g} rad of incidence" if critical is not None else "")
 
 
 def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
-    """How a scanner hears; ``incidence`` says whether its model depends on angles of incidence.
+    """Return the cones of a scanner; ``incidence`` says whether its model depends on angles of incidence.
 
     Raises:
         ValueError: angles of incidence matter, and the caster is not exact.
@@ -65,7 +65,7 @@ def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
 
 
 def bins_of(incidence: IncidenceParameters) -> tuple[tuple[BeamParameters, ...], np.ndarray]:
-    """The mixtures in the kernels' order, that of beams that hit nothing first, and the cosines that part them."""
+    """Return the mixtures in the kernels' order, first for beams without a hit, and the cosines between them."""
     cosines = np.cos(incidence.edges[1:])
     if incidence.no_surface is None:
         return incidence.parameters, cosines
@@ -73,7 +73,7 @@ def bins_of(incidence: IncidenceParameters) -> tuple[tuple[BeamParameters, ...],
 
 
 def require_exact(argument: str, method: Caster) -> None:
-    """Refuse casters that do not say in which cell a ray ends.
+    """Refuse casters that do not find the cell in which a ray ends.
 
     Raises:
         ValueError: the caster is not exact.

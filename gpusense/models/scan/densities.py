@@ -1,10 +1,10 @@
-"""The components of the beam mixture on their own, for any expected range; sources of every formula beside it.
+"""The components of the beam mixture, for any expected range, with the source of each formula.
 
-Kernels see expected ranges in [0, range_max], which is what casting returns. Who fits parameters or predicts ranges by
-other means may ask outside of that, and far in a tail the textbook's normaliser is 0. These functions stay finite
-there. They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
+Kernels see expected ranges in [0, range_max], as casters return them. Learning, and other predictions of ranges, may
+need values outside this interval, where the textbook's normaliser underflows to 0. These functions stay finite.
+They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
 
-The ``naive_`` functions are the textbook's formulas as printed. They are here to be compared with, not to be used.
+The ``naive_`` functions are the textbook's formulas as printed. They serve comparisons only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
 
 
 def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
-    """Log density of a normal around z*, truncated to [0, range_max] and renormalised (book equations 6.4 to 6.6).
+    """Return the log density of a normal around z*, truncated to [0, range_max] (book equations 6.4 to 6.6).
 
     For z* in [0, Z] the mass is ``(erf(z* / (sigma sqrt 2)) + erf((Z - z*) / (sigma sqrt 2))) / 2``, a sum of positive
     terms: nothing cancels, however large sigma is. Then ``-u^2 / 2 - log(sigma sqrt(2 pi) mass)``, u = (z - z*) /
@@ -47,7 +47,7 @@ def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: Arra
         range_max: Longest ranges Z, > 0 [m].
 
     Returns:
-        Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, Z]. NaN where an argument is.
+        Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, Z]. NaN for NaN arguments.
     """
     z, expected, sigma, range_max = _arrays(z, expected, sigma, range_max)
     real = z.dtype.type
@@ -68,7 +68,7 @@ def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: Arra
 
 
 def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
-    """Log density of an exponential on [0, z*], renormalised (book equations 6.7 to 6.9).
+    """Return the log density of an exponential on [0, z*], renormalised (book equations 6.7 to 6.9).
 
     With x = rate z*, ``log p = log(x / (1 - exp(-x))) - log z* - rate z`` for x <= 1 and ``log(rate / (1 - exp(-x))) -
     rate z`` above, ``1 - exp(-x)`` being ``-expm1(-x)``: no difference of nearly equal numbers, and no two logarithms
@@ -93,7 +93,7 @@ def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
 
 
 def log_rand(z: ArrayLike, range_max: ArrayLike) -> Any:
-    """Log density of the uniform distribution on [0, range_max) (book equation 6.11); -inf elsewhere."""
+    """Return the log density of the uniform distribution on [0, range_max) (book equation 6.11); -inf elsewhere."""
     z, range_max = _arrays(z, range_max)
     flat = np.where(np.isnan(z), z, -np.log(range_max))
     return _scalar(np.where((z < 0) | (z >= range_max), z.dtype.type(-np.inf), flat))
@@ -111,7 +111,7 @@ def log_mixture(
     lambda_short: ArrayLike,
     range_max: ArrayLike,
 ) -> Any:
-    """log p(z | z*) of the whole mixture (book equation 6.12); ``**BeamParameters(...).to_dict()`` fits its arguments.
+    """Return log p(z | z*) of the mixture (book equation 6.12); ``**BeamParameters(...).to_dict()`` fits.
 
     The components are added as logarithms, the largest taken out, so none is lost by underflow and a mixture that is 0
     is -inf, not NaN. Continuous part and atom have mass 1 together, but for p_short's share where z* <= 0. An obstacle
@@ -149,7 +149,7 @@ def log_mixture(
 
 
 def naive_log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
-    """Equations 6.4 to 6.6 as printed, the normaliser a difference of two cumulative normals. Only to compare with."""
+    """Evaluate equations 6.4 to 6.6 as printed, the normaliser a difference of two cumulative normals."""
     z, expected, sigma, range_max = _arrays(z, expected, sigma, range_max)
     real = z.dtype.type
     with np.errstate(all="ignore"):
@@ -160,7 +160,7 @@ def naive_log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max
 
 
 def naive_log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
-    """Equations 6.7 to 6.9 as printed, with ``1 - exp(-rate z*)``. Only to compare with."""
+    """Evaluate equations 6.7 to 6.9 as printed, with ``1 - exp(-rate z*)``."""
     z, expected, rate = _arrays(z, expected, rate)
     real = z.dtype.type
     with np.errstate(all="ignore"):
@@ -181,7 +181,7 @@ def naive_log_mixture(
     lambda_short: ArrayLike,
     range_max: ArrayLike,
 ) -> Any:
-    """Equation 6.12 as printed, components of weight 0 left out, z_max at z >= Z. Only to compare with."""
+    """Evaluate equation 6.12 as printed, components of weight 0 left out, z_max at z >= Z."""
     z, expected, hit, short, top, rand, sigma, rate, range_max = _arrays(
         z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max
     )
@@ -192,7 +192,7 @@ def naive_log_mixture(
 
 
 def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
-    """``-u (a + u / 2) - log(sigma I)`` for a >= 0; see log_hit."""
+    """Return ``-u (a + u / 2) - log(sigma I)`` for a >= 0; see log_hit."""
     real = u.dtype.type
     fall = w * (a + real(0.5) * w)
     scaled = real(_ROOT_HALF_PI) * (
@@ -207,7 +207,7 @@ def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
 
 
 def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
-    """The arguments broadcast to one shape in one dtype: float32 where arrays are and nothing is wider, else float64.
+    """Broadcast arguments to one shape and dtype: float32 if the widest array is float32, else float64.
 
     Python numbers take the dtype of the others.
     """
@@ -218,5 +218,5 @@ def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
 
 
 def _scalar(array: Floats) -> Any:
-    """A NumPy scalar where the shape is ()."""
+    """Convert an array of shape () to a NumPy scalar."""
     return array[()]

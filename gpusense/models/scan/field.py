@@ -18,26 +18,35 @@ from gpusense.world.scanner import Scanner
 class LikelihoodFieldModel(ScanModel):
     """log p(z | x, m) of a scan by the distance of its end points to the nearest obstacle.
 
-    Per hit ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, which is also its value
-    outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book table 6.3).
+    Each hit has the density ``z_hit N(d; 0, sigma_hit) + z_rand / range_max``; d is capped at ``max_distance``, which
+    is also its value outside the grid. Max readings add ``log z_max`` where z_max > 0 and are left out otherwise (book
+    table 6.3).
 
     Args:
         grid: The map.
         scanner: The scanner's geometry.
         parameters: Weights, deviation, cap and interpolation.
-        backend: Where it runs, see ``gpusense.devices()``; or a queue of pyopencl.
+        backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
         outside: ``"free"`` (the default), or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
         temperature: In (0, 1]: multiplies the sum over beams. 1 is the book's plain product.
-        beams: Use only so many informative beams, evenly chosen, or the beams of these indices.
-        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights that these programs compute, with their default
+        beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
+        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default
             parameters; see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:
         TypeError: an argument is of the wrong kind.
         ValueError: an argument breaks its rule, or the device is absent; the message names both.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> log_p = model.log_likelihood([(0.2, 0.05, 0.0), (0.5, 0.05, 0.0)], [1.5])
+        >>> int(log_p.argmax())
+        1
     """
 
     def __init__(
@@ -85,7 +94,7 @@ class LikelihoodFieldModel(ScanModel):
     def update_map(self, cells: object, region: object) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.
 
-        Only distances that can have changed, those within ``max_distance`` of a changed obstacle, are computed again.
+        Only distances within ``max_distance`` of a changed obstacle are computed again.
 
         Args:
             cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
@@ -98,7 +107,7 @@ class LikelihoodFieldModel(ScanModel):
             self._field_pipeline.grid = self._field_pipeline.map.update(cells, region)
 
     def explain(self) -> str:
-        """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
+        """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
         p, pipeline = self.parameters, self._field_pipeline
         bilinear = p.interpolation == "bilinear"
         components = [

@@ -25,7 +25,7 @@ from gpusense.world.parameters import LikelihoodFieldParameters
 
 # Particles of a work-group of ``field_blocks`` or of vectors, as in the kernel file ``field``.
 _GROUP = 64
-# In eps and cells of a reading and 2 more: within this of a cell's edge an end point is found with more digits.
+# Distance from a cell's edge below which an end point is computed with more digits, in eps times its length + 2 cells.
 _GUARD = 3.25
 _NO_FLAGS, _INSIDE = frozenset[str](), frozenset({"INSIDE"})
 
@@ -34,10 +34,10 @@ class FieldPipeline(ScanPipeline):
     """The stages of a likelihood field.
 
     Attributes:
-        table: Makes the map's table.
+        table: Maker of the map's table.
         components: Flags of the mixture.
         log_table: Whether cells hold log densities or cubes of densities, not distances.
-        quick: Whether GPUs round to find cells, and look again with more digits where that is in doubt.
+        quick: Whether GPUs find cells in working precision, and again with more digits near edges of cells.
     """
 
     kept_parts = 1 / BLOCK_TERMS
@@ -77,7 +77,7 @@ class FieldPipeline(ScanPipeline):
 
     @property
     def table_bytes(self) -> int:
-        """Bytes of the map's table on the device; 0 before there is one."""
+        """Bytes of the map's table on the device; 0 before it is made."""
         window = self._map.window
         return 0 if window is None else self.real.itemsize * (window.rows + 2 * RING) * (window.cols + 2 * RING)
 
@@ -112,7 +112,7 @@ class FieldPipeline(ScanPipeline):
         cells = scans.readings / self.grid.resolution
         lengths = cells
         if not self.specialize:
-            # Missing and max readings are no lengths, and stay what they are as points.
+            # Missing and max readings have no length; their points hold nan and inf.
             finite = np.isfinite(cells)
             lengths = np.where(finite, cells, 0.0)
         high, low = split(scans.vectors * lengths[:, None], self.real)
@@ -125,7 +125,7 @@ class FieldPipeline(ScanPipeline):
         several = scans.scans > 1
         if several:
             arrays["fixed_of"] = (scans.constants + self.setting.constant_term).astype(self.real)
-        given = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
+        uploaded = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
         start = counts = self.nothing
         if several:
             blocks = -(-scans.counts // BLOCK_TERMS)
@@ -134,8 +134,8 @@ class FieldPipeline(ScanPipeline):
         fixed = float(scans.constants[0]) + self.setting.constant_term
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, frozenset({"SCANS"} if several else ()),
-            dict(point=given["point"], point_low=given["point_low"], guard=given.get("guard"), start=start),
-            dict(counts=counts, fixed_of=given.get("fixed_of", self._terms), fixed=fixed),
+            dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
+            dict(counts=counts, fixed_of=uploaded.get("fixed_of", self._terms), fixed=fixed),
             (scans.scans, scans.most_readings, len(scans.readings)), longest + 2,
         )  # fmt: skip
 

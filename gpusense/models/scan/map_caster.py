@@ -38,7 +38,7 @@ class MapCaster:
         grid: The map.
         mount: The sensor's pose on the robot; its yaw belongs to the ray vectors.
         range_max: Longest range [m].
-        method: How ranges are found.
+        method: The method for ranges.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
         crop: False prepares the whole map at once.
@@ -60,7 +60,7 @@ class MapCaster:
         self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
         self.limit = range_max / grid.resolution
         self.method, self.outside, self._table_bytes = method, outside, 0
-        # Normals of the map's walls, and the window they belong to.
+        # Window of the normals of the map's walls, the normals, and their bytes.
         self._normals: tuple[Window, Buffer, int] | None = None
         self._no_normals = backend.upload(np.zeros(2, real))
         self.map = ReachableMap(
@@ -68,7 +68,7 @@ class MapCaster:
         )
         self._fixed_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
         self._fixed_flags |= {method.entry.flag} if method.entry.flag else set()
-        # With those of the table once there is one.
+        # Include the table's flags once it is made.
         self.flags = self._fixed_flags
         self._wide = {"FLOAT64"} if real == np.float64 else set()
         self._workspace = Workspace(backend)
@@ -81,7 +81,7 @@ class MapCaster:
         return self._table_bytes + (0 if self._normals is None else self._normals[2])
 
     def normals(self, window: Window, flags: frozenset[str]) -> Buffer:
-        """Normals of the walls in a window, where flags ask for them; made once for a window.
+        """Return the normals of the walls in a window, where flags need them; made once for a window.
 
         Raises:
             TableMemoryError: the device cannot hold them.
@@ -103,7 +103,7 @@ class MapCaster:
         return dict(zip(("bins", "slack", "tolerance"), self.method.scalars(), strict=True))
 
     def omission(self) -> Omission | None:
-        """What cropping the map left out, once a cloud has been seen."""
+        """Return the omission by cropping the map, None before the first cloud."""
         window = self.map.window
         return self.map.omission(self.table_bytes / window.cells) if window is not None else None
 
@@ -139,38 +139,38 @@ class MapCaster:
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
     def cast(self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER) -> Any:
-        """Cast rays, in pieces that fit.
+        """Cast rays, in pieces that fit the memory.
 
         Args:
             poses: (N, 3) poses.
             vectors: (K, 2) ray vectors, or (K, C, 2) of cones.
-            out: Where to write the result, or None.
-            cones: How the sensor hears.
+            out: The array for the result, or None.
+            cones: Cones of the sensor.
 
         Returns:
             (N, K) expected ranges, or angles of incidence.
         """
-        given, rays = Poses(poses, self.backend), len(vectors)
-        shape = given.count, rays
+        checked, rays = Poses(poses, self.backend), len(vectors)
+        shape = checked.count, rays
         target: Any = arrays.check_out(out, shape, self.real, poses, self.backend)
-        if given.on_device:
-            target = arrays.blank(self.backend, given.count * rays, self.real) if target is None else target
+        if checked.on_device:
+            target = arrays.blank(self.backend, checked.count * rays, self.real) if target is None else target
             flat = target
         else:
             target = np.empty(shape, self.real) if target is None else target
             flat = target.reshape(-1)
-        if given.count * rays:
+        if checked.count * rays:
             with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
                 chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
                 run_pieces(
-                    self._workspace, Piece(0, given.count, given.count), chunk,
-                    lambda piece: self._cast(given, piece, ray, rays, flat, cones),
+                    self._workspace, Piece(0, checked.count, checked.count), chunk,
+                    lambda piece: self._cast(checked, piece, ray, rays, flat, cones),
                 )  # fmt: skip
-                finish(self._workspace, given.on_device)
+                finish(self._workspace, checked.on_device)
         if out is not None:
             return out
-        if given.on_device:
+        if checked.on_device:
             return arrays.lent(poses, self.backend, target, shape, self.real)
         return arrays.like(poses, target)
 

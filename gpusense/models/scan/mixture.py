@@ -1,4 +1,4 @@
-"""The beam model's mixture as kernels have it: flags of its components, its numbers, and a table in its place."""
+"""The beam model's mixture for kernels: flags of its components, its numbers, or a table in its place."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable
 
-# Bins of a sensor's table along each axis: 268 MB in float32.
+# Most bins of a sensor's table along each axis: 268 MB in float32.
 _MOST_BINS = 8192
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """The mixture of a beam model as kernels take it.
+    """The mixture of a beam model, as arguments of kernels.
 
     Attributes:
         flags: Flags of its components.
@@ -56,7 +56,7 @@ def mixture_on_device(
     specialize: bool,
     max_depends: bool,
 ) -> Mixture:
-    """Return a beam model's mixture as kernels take it.
+    """Return a beam model's mixture as arguments of kernels.
 
     Args:
         mixtures: Parameters of each bin of angles of incidence.
@@ -65,7 +65,7 @@ def mixture_on_device(
         range_max: Longest range [m].
         real: Precision.
         width: Width of the bins in which the mixture is tabulated [m]; None evaluates it.
-        compat: The program whose weights are computed, or None.
+        compat: The program whose weights are reproduced, or None.
         specialize: False leaves nothing out.
         max_depends: Whether the probability of a max reading depends on the pose.
 
@@ -90,14 +90,14 @@ def mixture_on_device(
 def mixture_of(
     kinds: Sequence[BeamParameters], range_max: float, real: np.dtype, *, specialize: bool, max_depends: bool
 ) -> tuple[frozenset[str], np.ndarray]:
-    """Flags of the components, and the numbers of the kernel file ``mixture`` for each bin of angles of incidence.
+    """Return flags of the components, and the numbers of the kernel file ``mixture`` for each bin of incidence.
 
     Raises:
         ValueError: a number is beyond what the precision can hold.
     """
     weights = {name: max(getattr(p, f"z_{name.lower()}") for p in kinds) for name in ("HIT", "SHORT", "RAND")}
     flags = {name for name, weight in weights.items() if weight > 0 or not specialize}
-    # Where no range is possible at any angle, something must say so of each.
+    # If no range is possible at any angle, a component must evaluate to -inf.
     flags |= {"RAND"} if max_depends and not flags else set()
     peaks = [_peak(p) for p in kinds]
     if specialize and len(flags) == 1:
@@ -115,7 +115,7 @@ def mixture_of(
 def peer_mixture(
     p: BeamParameters, range_max: float, real: np.dtype, *, amcl: bool
 ) -> tuple[frozenset[str], np.ndarray]:
-    """Flags and numbers of the kernel file ``compat``.
+    """Return flags and numbers of the kernel file ``compat``.
 
     Raises:
         ValueError: a number is beyond what the precision can hold.
@@ -127,7 +127,7 @@ def peer_mixture(
 
 
 def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype) -> np.ndarray:
-    """log p in bins of readings and expected ranges, both with a last one for range_max.
+    """Return log p in bins of readings and expected ranges, both with a last bin for range_max.
 
     Raises:
         TypeError, ValueError: a width that is no number, too small or more than range_max.
@@ -139,7 +139,7 @@ def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype)
     middle = (np.arange(cells) + 0.5) * (range_max / cells)
     expected = np.append(middle, range_max)
     table = np.full((cells + 1, cells + 1), log_weight(p.z_max), real)
-    # In blocks of rows: the densities need some forty numbers for each of theirs.
+    # In blocks of rows: temporary arrays take about forty numbers per density.
     for first in range(0, cells, 64):
         rows = slice(first, first + 64)
         table[:-1][rows] = log_mixture(middle[rows, None], expected, range_max=range_max, **p.to_dict())

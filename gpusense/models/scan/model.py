@@ -1,4 +1,4 @@
-"""The public side of scan models: what every one of them has."""
+"""The public interface that all scan models share."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from gpusense._util import checks
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Omission, Plan, share
-from gpusense.models.arguments import check_scene, real_dtype
+from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.classed import Beams, Rules, check_beams
-from gpusense.models.scan.pipeline import LastCall, ScanPipeline, Setting
+from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
+from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world import compat as compat_module
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
@@ -27,7 +28,7 @@ from gpusense.world.scanner import Scanner
 
 
 class ScanModel(ABC):
-    """A measurement model of whole scans; the base of the beam model and the likelihood field."""
+    """Base of the models of whole scans: the beam model and the likelihood field."""
 
     def __init__(
         self,
@@ -73,6 +74,24 @@ class ScanModel(ABC):
         self._lock = threading.Lock()
         self._last = LastCall()
 
+    def __repr__(self) -> str:
+        count, beams = self.scanner.count, self.beams
+        used = (
+            count if beams is None else min(int(beams), count) if isinstance(beams, (int, np.integer)) else len(beams)
+        )
+        parts = [
+            map_words(self.grid),
+            f"beams={count}" if used == count else f"beams={used} of {count}",
+            *self._options(),
+        ]
+        parts += [] if self.compat is None else [f"compat={self.compat!r}"]
+        parts += [f"precision={self.precision!r}", f"backend={self.device.selection!r}"]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _options(self) -> tuple[str, ...]:
+        """Return the options that only this kind of model has, as ``repr`` shows them."""
+        return ()
+
     @property
     @abstractmethod
     def _pipeline(self) -> ScanPipeline:
@@ -111,20 +130,20 @@ class ScanModel(ABC):
     def log_likelihood(
         self, poses: object, ranges: object, *, per_beam: bool = False, out: Any = None
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
-        """log p(z | x, m) of a scan for each particle, natural logarithm.
+        """Return log p(z | x, m) of a scan for each particle, natural logarithm.
 
-        Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy where they are: in host memory, or,
-        for ``warp:cuda`` backends, on the model's device; those of pyopencl where the model's backend is their queue.
-        The result is then an array of the same library there.
+        Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy, in host memory or, for
+        ``warp:cuda`` backends, on the model's device; arrays of pyopencl, if the model's backend is their queue. The
+        result is then an array of the same library in the same memory.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
                 float32 or float64 and C-contiguous.
             ranges: (K,) readings [m], or (S, K). NaN, -inf and readings below range_min are missing, +inf and readings
                 of range_max or more are max readings.
-            per_beam: Also return what each reading contributes, before the temperature; NumPy arrays.
-            out: Where to write the log-likelihoods: an array of their shape and precision in the memory where the poses
-                are, C-contiguous; it is what is returned.
+            per_beam: Also return the term of each reading, before the temperature; NumPy arrays.
+            out: The array for the log-likelihoods, which is returned: of their shape and precision, C-contiguous, in
+                the memory of the poses.
 
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
@@ -138,19 +157,19 @@ class ScanModel(ABC):
         """
         request = self._request(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            self._pipeline.run(request, self._workspace, self._last)
+            run(self._pipeline, request, self._workspace, self._last)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result(self._setting.backend)
         return (log_p, request.result_parts()) if per_beam else log_p
 
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
-        """A call of ``log_likelihood`` with arrays that stay where they are, for filters that repeat it.
+        """Bind arrays that stay in place to a call of ``log_likelihood``, for filters that repeat it.
 
-        Every call reads what the arrays hold then, and writes ``out``. Where poses and ranges are on the model's GPU, a
-        call is one start of a CUDA graph, or three launches of OpenCL whose arguments stay set: it checks nothing,
-        allocates nothing, copies nothing and does not wait; ``check`` waits, and says whether a pose was not finite.
-        NumPy arrays of few particles go to a GPU and back with one copy each way; everywhere else it is the ordinary
-        call, so that the same program runs on every backend.
+        Each call reads the present contents of the arrays, and writes ``out``. Where poses and ranges are on the
+        model's GPU, a call is one start of a CUDA graph, or three launches of OpenCL whose arguments stay set: it
+        checks nothing, allocates nothing, copies nothing and does not wait; ``check`` waits, and reports poses that
+        were not finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound
+        call is the ordinary one, so that the same program runs on every backend.
 
         Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
         repeat or, with a temperature below 1, no range depends on the pose, and for some of the beams by number with
@@ -159,18 +178,18 @@ class ScanModel(ABC):
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
             ranges: (K,) readings [m]; on the device float32 or float64 and C-contiguous.
-            out: (N,) where to write the log-likelihoods, as ``log_likelihood`` takes it.
+            out: (N,) array for the log-likelihoods, as ``log_likelihood`` takes it.
 
         Raises:
-            TypeError: not an array, one of numbers that cannot change, or on a device that the backend cannot read.
+            TypeError: not an array, an immutable one, or one on a device that the backend cannot read.
             ValueError: a wrong shape.
-            MemoryError: the device cannot hold the map's table, or what a call needs.
+            MemoryError: the device cannot hold the map's table, or the buffers of a call.
         """
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
     @abstractmethod
     def explain(self) -> str:
-        """What this scene does not need, why, and what leaving it out saves; readings and map as of the last call."""
+        """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
 
     def prepare(self, poses: object) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.

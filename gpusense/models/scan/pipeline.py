@@ -1,8 +1,8 @@
 """The pipeline of scan models: request, readings, poses, program, run.
 
-Every scan model and every kind of call goes through these five stages. A request is checked arguments. Readings and
-poses are brought to the device. A program follows from them: it starts nothing. Running it, in pieces that fit the
-memory of the device, is the only loop.
+Every scan model and every kind of call passes through these five stages. A request holds checked arguments. Readings
+and poses are brought to the device. The program follows from them and starts nothing. The file ``scoring`` runs it, in
+pieces that fit the memory of the device: the only loop.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
-from gpusense.interface.terms import log_weight
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
-from gpusense.models.run import Piece, chunk_of, run_pieces
+from gpusense.models.run import Piece, chunk_of
 from gpusense.models.scan.classed import ClassedScans, Rules, class_scans
 from gpusense.models.scan.readings import Readings, Sensing, placing_launches
 from gpusense.models.scan.request import Request
@@ -27,7 +26,6 @@ from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.compat import Peer
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.windows import whole
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
 # launches fill the device for longer than it takes to start them.
@@ -36,13 +34,13 @@ TOGETHER = {"gpu": 1 << 22, "cpu": 1 << 20}
 
 @dataclass(frozen=True)
 class Setting:
-    """What all models of scans have: the map, the device and the rules for readings.
+    """The device, and the rules for readings, of a scan model.
 
     Attributes:
         backend: The device.
         real: Precision.
         rules: How readings are classed; they hold the scanner.
-        peer: The program whose weights are computed; None for likelihoods.
+        peer: The program whose weights are reproduced; None for likelihoods.
         temperature: Multiplies the sum over readings.
         constant_term: The first term of that sum.
         possible: Whether some range is possible at some pose.
@@ -63,7 +61,7 @@ class Tiles:
 
     Attributes:
         spread: log2 of the number of groups of each tile.
-        order: The order of the particles, where that pays.
+        order: The order of the particles, where sorting pays.
     """
 
     spread: int
@@ -81,7 +79,7 @@ class Scoring:
         parts: Numbers that each particle's sum adds, or the log-likelihoods of the readings.
         log_p: The buffer for the log-likelihoods.
         flags: Flags of the scoring kernel.
-        tiles: How GPUs tile particles and rays, and sum in a second launch; None where one launch does it all.
+        tiles: The tiles of GPUs, which sum in a second launch; None where one launch does it all.
     """
 
     readings: Readings
@@ -98,26 +96,6 @@ class Scoring:
         return self.placed.count // self.readings.scans
 
 
-@dataclass
-class LastCall:
-    """The last call, as ``explain`` reports it.
-
-    Attributes:
-        flags: Flags of its launches.
-        scans: The readings of its last scans; None before there is a call.
-        together: Scans that shared launches.
-    """
-
-    flags: frozenset[str] = frozenset()
-    scans: ClassedScans | None = None
-    together: int = 0
-
-    @property
-    def scan(self) -> ClassedScans | None:
-        """The readings of its last scan."""
-        return None if self.scans is None else self.scans.part(self.scans.scans - 1, self.scans.scans)
-
-
 class ScanPipeline(ABC):
     """The stages of one scan model.
 
@@ -130,7 +108,7 @@ class ScanPipeline(ABC):
     # Rays of each beam, and numbers that GPUs keep for each reading until they are summed.
     rays_each: int = 1
     kept_parts: float = 1.0
-    # Whether readings are end points, whether poses are needed in two parts, and whether an order of particles may pay.
+    # Whether readings become end points, whether poses need low parts, and whether an order of particles may pay.
     end_points: bool = False
     careful: bool = False
     orders: bool = False
@@ -143,7 +121,7 @@ class ScanPipeline(ABC):
         # Flags by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
 
-    # ---- what a model adds
+    # ---- stages that depend on the model
 
     @property
     @abstractmethod
@@ -156,7 +134,7 @@ class ScanPipeline(ABC):
 
     @abstractmethod
     def sensing(self) -> Sensing:
-        """Return how readings that are on the device are taken."""
+        """Return the rules for readings that are on the device."""
 
     @abstractmethod
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
@@ -176,7 +154,7 @@ class ScanPipeline(ABC):
 
     @abstractmethod
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
-        """Return how many numbers each particle's sum adds, and in blocks of how many; see ``Parts``."""
+        """Return the count of numbers that each particle's sum adds, and their block size; see ``Parts``."""
 
     def numbers(self, scoring: Scoring) -> dict[str, float]:
         """Return the arguments of the launches that change from call to call."""
@@ -221,7 +199,7 @@ class ScanPipeline(ABC):
         return class_scans(ranges, self.rules)
 
     def value(self, scans: ClassedScans) -> float | None:
-        """Return the log-likelihood of scans that have the same at every pose; None where it depends on the pose."""
+        """Return the log-likelihood of scans where it is the same at every pose, None elsewhere."""
         if not len(scans.readings):
             with np.errstate(divide="ignore"):
                 constant = scans.constants[0] if self.setting.peer is None else np.log(self.setting.constant_term)
@@ -266,82 +244,3 @@ class ScanPipeline(ABC):
         order = () if tiles is None or tiles.order is None else tiles.order.launches()
         placing = placing_launches(scoring.placed, scoring.readings.placing)
         return (*placing, *order, *self.score_launches(scoring))
-
-    # ---- run
-
-    def run(self, request: Request, space: Workspace, last: LastCall) -> None:
-        """Start everything that a request needs; parts are complete on return."""
-        last.together = 0
-        for particles, scans in self.groups(request):
-            last.scans = scans
-            if not particles.count:
-                continue
-            most = self.chunk(scans.most_readings * self.rays_each, per_beam=request.per_beam)
-            run_pieces(space, particles, most, _Scorer(self, request, particles, scans, space, last))
-            if request.scans > 1:
-                space.start()
-
-
-class _Scorer:
-    """Runs the programs of one group of scans; their readings are uploaded once."""
-
-    def __init__(
-        self, pipeline: ScanPipeline, request: Request, particles: Piece, scans: ClassedScans, space: Workspace,
-        last: LastCall,
-    ) -> None:  # fmt: skip
-        self._pipeline, self._request, self._space, self._last = pipeline, request, space, last
-        self._first, self._scans = particles.scans[0], scans
-        self._uploaded: tuple[Part, Readings] | None = None
-
-    def __call__(self, piece: Piece) -> None:
-        first, last = piece.scans
-        scans = self._scans.part(first - self._first, last - self._first)
-        if (value := self._pipeline.value(scans)) is not None:
-            self._fill(piece, scans, value)
-            return
-        if self._uploaded is None or self._uploaded[0] != piece.scans:
-            self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
-        self._score(piece, scans, self._uploaded[1])
-
-    def _score(self, piece: Piece, scans: ClassedScans, readings: Readings) -> None:
-        """Score a piece; parts are complete on return."""
-        pipeline, request, space = self._pipeline, self._request, self._space
-        placed, table = pipeline.place(request.poses, piece.part, space)
-        with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
-            scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
-            key = (scoring.flags, placed.key, readings.key)
-            flags = space.run(
-                key, pipeline.numbers(scoring), (placed.source, log_p, table), lambda: pipeline.program(scoring),
-                version=pipeline.map.version, lasting=not request.poses.on_device,
-            )  # fmt: skip
-        self._last.flags = flags
-        if readings.scans > 1:
-            self._last.together = max(self._last.together, readings.scans)
-        if request.per_beam:
-            each = np.empty((piece.count, len(scans.readings)), pipeline.real)
-            rows = self._rows(piece)
-            rows[:, scans.columns] = pipeline.backend.download(scoring.parts.buffer, each)
-            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
-
-    def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
-        """Set log-likelihoods that do not depend on the poses; device poses are inspected all the same."""
-        pipeline, request, space = self._pipeline, self._request, self._space
-        if request.poses.on_device:
-            frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
-            placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
-            pipeline.backend.run(placed.launches())
-            with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
-                pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
-        else:
-            request.log_p[piece.begin : piece.end] = value
-        if request.per_beam:
-            rows, finite = self._rows(piece), np.isfinite(scans.readings)
-            rows[:, scans.columns[finite]] = -np.inf
-            rows[:, scans.columns[~finite]] = log_weight(pipeline.rules.z_max)
-            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
-
-    def _rows(self, piece: Piece) -> np.ndarray:
-        """Return the rows of a piece of one scan in the parts of the request."""
-        scan = piece.scans[0]
-        before = scan * piece.per_scan
-        return self._request.parts[scan, piece.begin - before : piece.end - before]

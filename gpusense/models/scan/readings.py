@@ -1,4 +1,4 @@
-"""Readings of scans on the device, as kernels that score them take them."""
+"""Readings of scans on the device, as arguments of the scoring kernels."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Readings:
         flags: Flags of kernels that score them.
         arguments: Their arguments of scoring kernels, by name.
         sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms.
-        key: Everything but buffers on which the launches depend.
-        reach: Longest range in cells, and a bound of its error; infinite where it is not known.
+        key: All values on which the launches depend, except buffers.
+        reach: Longest range in cells, and a bound of its error; infinite if unknown.
         constants_there: Whether a constant term of a single scan is in ``fixed_of`` on the device.
-        placing: The launch that places them, where the device does.
+        placing: The launch that places them on the device; None where the host has placed them.
     """
 
     scans: int
@@ -71,7 +71,7 @@ class Placing:
 
 @dataclass(frozen=True)
 class Sensing:
-    """How a model takes readings that are on the device.
+    """Rules for readings that are on the device.
 
     Attributes:
         scanner: The scanner's geometry.
@@ -101,7 +101,7 @@ class Sensing:
 
     @property
     def columns(self) -> np.ndarray:
-        """Beams whose readings are looked at."""
+        """Beams whose readings are read."""
         every = np.arange(self.scanner.count)
         if self.beams is None or isinstance(self.beams, (int, np.integer)):
             return every
@@ -116,7 +116,7 @@ class Sensing:
 
     @property
     def max_readings(self) -> int:
-        """How max readings count: left out, in the constant term, or in a place."""
+        """Treatment of max readings: left out, in the constant term, or in a place."""
         if self.z_max <= 0:
             return MAX_LEFT_OUT
         return MAX_PLACED if self.max_depends or not self.specialize else MAX_FIXED
@@ -142,7 +142,7 @@ def device_readings(
     """Allocate places for readings that are on the device, and describe the launch that fills them.
 
     Args:
-        sensing: How the model takes readings.
+        sensing: The rules for readings.
         ranges: (K,) readings.
         dtype: Their type.
         limits: The type to which the scanner's limits are rounded.

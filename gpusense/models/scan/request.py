@@ -24,13 +24,13 @@ class Request:
     """S scans of N poses each.
 
     Attributes:
-        array: The poses as the user passed them, whose library the result has.
+        array: The poses as the user passed them, which determine the library of the result.
         out: The array for the result as the user passed it, or None.
         ranges: (S, K) readings [m].
         poses: The S N poses, one scan after the other.
         shape: Shape of the result, (N,) or (S, N).
         log_p: Flat memory of the result: a NumPy array, or a buffer on the device.
-        parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not wanted.
+        parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
     """
 
     array: Any
@@ -53,7 +53,7 @@ class Request:
 
     @property
     def per_beam(self) -> bool:
-        """Whether the log-likelihoods of the readings are wanted."""
+        """Whether the log-likelihoods of the readings are requested."""
         return self.parts.shape[-1] > 0
 
     def result(self, backend: Backend) -> Any:
@@ -89,7 +89,7 @@ def make_request(
         scanner: The scanner of the readings.
         backend: The device.
         real: Precision of the result.
-        per_beam: Whether the log-likelihoods of the readings are wanted.
+        per_beam: Whether the log-likelihoods of the readings are requested.
         known: Poses that were checked before.
 
     Raises:
@@ -131,6 +131,6 @@ def _poses_of_scans(poses: Any, scans: int, backend: Backend) -> Poses:
     try:
         return Poses(read.reshape(-1, 3), backend)
     except ValueError:
-        # Its message names the place among all poses; this one names the scan.
+        # This check names the scan in its message; the first one names the index among all poses.
         checks.array("poses", read, (scans, "N", 3))
         raise

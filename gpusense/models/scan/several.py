@@ -10,29 +10,37 @@ from gpusense._util import checks
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish_all
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.scoring import run
 
 
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
-    """log p(z | x, m) of several beam models and likelihood fields, as ``log_likelihood`` of each, at once.
+    """Return log p(z | x, m) of several beam models and likelihood fields, as ``log_likelihood`` of each.
 
-    Every model queues its launches before the device is waited for, once. Models may differ in everything but the
-    device: maps (one of each floor, or of each robot's own), scanners, parameters, precision. The same model may stand
-    there several times.
+    All models queue their launches, and the call waits for the device once. Models may differ in everything but the
+    device: maps (of floors or robots), scanners, parameters, precision. A model may occur several times.
 
     Args:
         models: :class:`BeamModel` and :class:`LikelihoodFieldModel` objects of one device.
         poses: As for ``log_likelihood``, (N, 3) or (S, N, 3): one array for all models, or a list or tuple of one for
             each of them.
         ranges: (K,) or (S, K) readings: one array for all models, or a list or tuple of one for each of them.
-        out: None, or a list or tuple of where to write each model's result, or None, as in ``log_likelihood``.
+        out: None, or a list or tuple of an array for each model's result, or None, as in ``log_likelihood``.
 
     Returns:
-        A list of what ``log_likelihood`` of each model returns, to the last bit: (N,) or (S, N).
+        A list of the results of ``log_likelihood`` of each model, with the same bits: (N,) or (S, N).
 
     Raises:
-        TypeError: models that are not such, or an argument of one of them that breaks its rule.
+        TypeError: models of another type, or an argument of one of them that breaks its rule.
         ValueError: models of several devices, a list of another length, or an argument that breaks its rule.
         MemoryError: the device cannot hold a map's table, or even a few particles.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]]), gs.Scanner([0.0], range_max=4.0)
+        >>> models = [kind(grid, scanner, backend="numpy") for kind in (gs.BeamModel, gs.LikelihoodFieldModel)]
+        >>> poses, ranges = np.array([(0.5, 0.05, 0.0), (0.4, 0.05, 0.0)]), np.array([0.5])
+        >>> [log_p.shape for log_p in gs.log_likelihoods(models, poses, ranges)]
+        [(2,), (2,)]
     """
     chosen = _checked(models)
     if not chosen:
@@ -47,17 +55,17 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         # Poses that several models share are checked once.
         shared = known.setdefault(id(model_poses), {})
         requests.append(model._request(model_poses, model_ranges, model_out, known=shared))
-    # Always in one order, so that two such calls cannot wait for each other.
+    # One order of locks, so that two such calls cannot deadlock.
     different = sorted({id(model): model for model in chosen}.items())
     with contextlib.ExitStack() as stack:
         for _, model in different:
             stack.enter_context(model._lock)
         for _, model in different:
             stack.push(lambda kind, *error, space=model._workspace: space.abandon() if kind else None)
-        # Left first: gathered work is started before an error forgets its memory.
+        # Left first: gathered work is started before an error abandons its memory.
         stack.enter_context(chosen[0]._workspace)
         for model, request in zip(chosen, requests, strict=True):
-            model._pipeline.run(request, model._workspace, model._last)
+            run(model._pipeline, request, model._workspace, model._last)
             model._workspace.start()
         on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])
@@ -65,10 +73,10 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
 
 
 def _checked(models: object) -> list[ScanModel]:
-    """Models of one device.
+    """Return models of one device as a list.
 
     Raises:
-        TypeError, ValueError: they are not.
+        TypeError, ValueError: not models of scans, or models of several devices.
     """
     if not isinstance(models, (list, tuple)):
         raise TypeError(f"models: must be a list or tuple of models, got {checks.show(models)}")
@@ -77,19 +85,19 @@ def _checked(models: object) -> list[ScanModel]:
             rule = "must be BeamModel or LikelihoodFieldModel objects"
             raise TypeError(f"models: {rule}, got {checks.show(model)} at index {i}")
         if model._setting.backend is not models[0]._setting.backend:
-            found = f"{models[0].device.selection} and, at index {i}, {model.device.selection}"
-            raise ValueError(f"models: must be of one device, got {found}")
+            selections = f"{models[0].device.selection} and, at index {i}, {model.device.selection}"
+            raise ValueError(f"models: must be of one device, got {selections}")
     return list(models)
 
 
-def _one_each(name: str, given: Any, count: int) -> list[Any]:
-    """An argument of each model: lists and tuples have one for each, anything else is all models'.
+def _one_each(name: str, value: Any, count: int) -> list[Any]:
+    """Return an argument of each model: an entry of a list or tuple, or the same value for all.
 
     Raises:
         ValueError: a list of another length.
     """
-    if not isinstance(given, (list, tuple)):
-        return [given] * count
-    if len(given) != count:
-        raise ValueError(f"{name}: a list must have one entry for each of {count} models, got {len(given)}")
-    return list(given)
+    if not isinstance(value, (list, tuple)):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{name}: a list must have one entry for each of {count} models, got {len(value)}")
+    return list(value)

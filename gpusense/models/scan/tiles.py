@@ -15,11 +15,11 @@ from gpusense.world.windows import extent
 
 _INT = np.dtype(np.int32)
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
-# Particle-beams from which an order saves more time than it takes, and particles.
+# Least particle-beams, and least particles, for which sorting saves more time than it takes.
 LEAST_ORDERED = (1 << 22, 1 << 12)
 # Work-items that fill any device.
 ENOUGH = 1 << 21
-# The same for the likelihood field, whose work-items are short, so that their beginnings count.
+# The same for the likelihood field, whose short work-items have a relatively costly start.
 ENOUGH_SHORT = 1 << 19
 
 
@@ -50,7 +50,7 @@ class Order:
     flags: frozenset[str]
 
     def launches(self) -> Program:
-        """Return the launches that find it."""
+        """Return the launches that compute the order."""
         count, poses = self.placed.count, dict(pose_cell=self.placed.cell, pose=self.placed.pose)
         bins = dict(bounds=self.bounds, bins=self.bins)
         return (
@@ -65,7 +65,7 @@ class Order:
 
 
 def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -> Order | None:
-    """Return an order of the particles where that pays, and upload its bounds."""
+    """Return an order of the particles where sorting pays, and upload its bounds."""
     count = placed.count
     if count * rays < LEAST_ORDERED[0] or count < LEAST_ORDERED[1]:
         return None
@@ -81,7 +81,7 @@ def spread_of(items: int, groups: int, enough: int) -> int:
 
     Args:
         items: Work-items before the split.
-        groups: Groups of readings or rays of each, the most parts there can be.
+        groups: Groups of readings or rays of each, the largest number of parts.
         enough: Work-items that fill the device.
     """
     spread = 0
@@ -129,7 +129,7 @@ def sum_launch(
         parts: Their numbers.
         order: Order of the particles.
         sums: Constant terms and counts of the scans; see ``Readings.sums``.
-        log_p: Where the sums go.
+        log_p: The buffer for the sums.
         temperature: Multiplies them.
         per_scan: Particles of each scan.
     """

@@ -1,0 +1,122 @@
+"""Run the programs of a request in pieces; readings of a group of scans are uploaded once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.terms import log_weight
+from gpusense.models.poses import Frame, Part, place
+from gpusense.models.run import Piece, run_pieces
+from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.readings import Readings
+from gpusense.models.scan.request import Request
+from gpusense.world.windows import whole
+
+
+@dataclass
+class LastCall:
+    """The last call, as ``explain`` reports it.
+
+    Attributes:
+        flags: Flags of its launches.
+        scans: The readings of its last scans; None before there is a call.
+        together: Scans that shared launches.
+    """
+
+    flags: frozenset[str] = frozenset()
+    scans: ClassedScans | None = None
+    together: int = 0
+
+    @property
+    def scan(self) -> ClassedScans | None:
+        """The readings of its last scan."""
+        return None if self.scans is None else self.scans.part(self.scans.scans - 1, self.scans.scans)
+
+
+def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCall) -> None:
+    """Start all launches of a request; log-likelihoods of readings are complete on return.
+
+    Args:
+        pipeline: The stages of the model.
+        request: The checked arguments.
+        space: Holds the buffers.
+        last: Receives the facts that ``explain`` reports.
+    """
+    last.together = 0
+    for particles, scans in pipeline.groups(request):
+        last.scans = scans
+        if not particles.count:
+            continue
+        most = pipeline.chunk(scans.most_readings * pipeline.rays_each, per_beam=request.per_beam)
+        run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
+        if request.scans > 1:
+            space.start()
+
+
+class _Scorer:
+    """Run the programs of one group of scans; their readings are uploaded once."""
+
+    def __init__(
+        self, pipeline: ScanPipeline, request: Request, particles: Piece, scans: ClassedScans, space: Workspace,
+        last: LastCall,
+    ) -> None:  # fmt: skip
+        self._pipeline, self._request, self._space, self._last = pipeline, request, space, last
+        self._first, self._scans = particles.scans[0], scans
+        self._uploaded: tuple[Part, Readings] | None = None
+
+    def __call__(self, piece: Piece) -> None:
+        first, last = piece.scans
+        scans = self._scans.part(first - self._first, last - self._first)
+        if (value := self._pipeline.value(scans)) is not None:
+            self._fill(piece, scans, value)
+            return
+        if self._uploaded is None or self._uploaded[0] != piece.scans:
+            self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
+        self._score(piece, scans, self._uploaded[1])
+
+    def _score(self, piece: Piece, scans: ClassedScans, readings: Readings) -> None:
+        """Score a piece; log-likelihoods of readings are complete on return."""
+        pipeline, request, space = self._pipeline, self._request, self._space
+        placed, table = pipeline.place(request.poses, piece.part, space)
+        with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
+            scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
+            key = (scoring.flags, placed.key, readings.key)
+            flags = space.run(
+                key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
+                lambda: pipeline.program(scoring), version=pipeline.map.version,
+            )  # fmt: skip
+        self._last.flags = flags
+        if readings.scans > 1:
+            self._last.together = max(self._last.together, readings.scans)
+        if request.per_beam:
+            each = np.empty((piece.count, len(scans.readings)), pipeline.real)
+            rows = self._rows(piece)
+            rows[:, scans.columns] = pipeline.backend.download(scoring.parts.buffer, each)
+            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
+
+    def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
+        """Set log-likelihoods that do not depend on the poses; device poses are inspected all the same."""
+        pipeline, request, space = self._pipeline, self._request, self._space
+        if request.poses.on_device:
+            frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
+            placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
+            pipeline.backend.run(placed.launches())
+            with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
+                pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
+        else:
+            request.log_p[piece.begin : piece.end] = value
+        if request.per_beam:
+            rows, finite = self._rows(piece), np.isfinite(scans.readings)
+            rows[:, scans.columns[finite]] = -np.inf
+            rows[:, scans.columns[~finite]] = log_weight(pipeline.rules.z_max)
+            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
+
+    def _rows(self, piece: Piece) -> np.ndarray:
+        """Return the rows of a piece of one scan in the parts of the request."""
+        scan = piece.scans[0]
+        before = scan * piece.per_scan
+        return self._request.parts[scan, piece.begin - before : piece.end - before]

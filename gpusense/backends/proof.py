@@ -56,7 +56,7 @@ class Verdict:
         lanes: Lanes of kernels in vectors that were proved; 1 where only scalar ones were.
         float64: Whether float64 kernels were proved.
         reason: The failures, empty where nothing failed.
-        remedy: What helps against them.
+        remedy: The remedy for them.
         rate: Calls of a scan per second, by which devices of one class are compared; 0 where it was not measured.
     """
 

@@ -104,7 +104,7 @@ class Absent(NamedTuple):
     """A part of a backend that this machine lacks.
 
     Attributes:
-        name: What is absent.
+        name: The library or device that is absent.
         kind: The kind of device that it would give, ``"cpu"`` or ``"gpu"``.
         reason: Why, with the remedy.
     """

@@ -105,7 +105,7 @@ class Absent(NamedTuple):
     """A part of a backend that this machine lacks.
 
     Attributes:
-        name: The name of the absent part.
+        name: The library or device that is absent.
         kind: The kind of device that it would give, ``"cpu"`` or ``"gpu"``.
         reason: The reason, with the remedy.
     """

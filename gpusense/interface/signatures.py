@@ -39,7 +39,7 @@ FLAGS = {
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "HUGE_HEADINGS": "some heading is beyond 2^20 rad",
     "ORDERED": "particles come in an order in which neighbours have much the same position and heading",
-    "STRANDED": "readings are so many that a work-item adds up whole strands of them",
+    "STRANDED": "there are enough readings for a work-item to add up whole strands of them",
     "QUICK": "nearest cells are found by rounding, and again with more digits only where that is in doubt",
     "INSIDE": "no end point of the cloud leaves the field's table",
     "SCANS": "several scans are scored together, each with readings and particles of its own",
@@ -97,7 +97,7 @@ class Argument:
         return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
 
     def elements(self, values: Mapping[str, Any]) -> int:
-        """Number of elements of an array by its shape: sums and products of integers and of the scalars' names."""
+        """Return the number of elements of an array: its shape sums and multiplies integers and names of scalars."""
         assert self.shape is not None
         return _evaluate(ast.parse(self.shape, mode="eval").body, values)
 

@@ -1,4 +1,4 @@
-"""Where am I, if I see beacons? Locate a robot from ranges, bearings and both, and draw the solutions."""
+"""Locate a robot from ranges and bearings of beacons, and draw the solutions."""
 
 import sys
 

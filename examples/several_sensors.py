@@ -1,4 +1,4 @@
-"""Where is the robot? Combine a laser, a compass, a position fix and a bumper, each of them vague."""
+"""Combine a laser, a compass, a position fix and a bumper, each of them vague."""
 
 import numpy as np
 

@@ -85,7 +85,7 @@ class World:
 
 @dataclasses.dataclass
 class Device:
-    """Where cases run: what models take as backend, and what makes arrays there, where there is such a thing."""
+    """Name a device: the backend that models take; ``there`` copies an array to it, ``change`` writes into one."""
 
     backend: Any
     there: Callable[[np.ndarray], Any] | None
@@ -95,7 +95,7 @@ class Device:
 
 @dataclasses.dataclass
 class Case:
-    """What an action needs."""
+    """Hold the arguments of an action."""
 
     rng: np.random.Generator
     device: Device
@@ -569,7 +569,7 @@ def expect(case: Case) -> Outcome:
 
 
 def score_large(case: Case) -> Outcome:
-    """Score so many particles that GPUs put them in an order; elsewhere it would take too long."""
+    """Score the number of particles from which GPUs sort them; skip devices that are not GPUs, which are too slow."""
     rays = max(case.world.scanner.count, 1)
     if not case.device.gpu or "slow" in case.config or rays < 64:
         yield from score(case)
@@ -824,7 +824,7 @@ def outcome_of(action: Callable[[Case], Outcome], case: Case) -> list[list[Any]]
 
 
 class Record:
-    """What was recorded so far, and how far that is."""
+    """Collect the results of cases, and print the progress."""
 
     def __init__(self) -> None:
         self.cases: dict[str, list[list[Any]]] = {}

@@ -118,7 +118,7 @@ class Backend(ABC):
 
     @property
     def replays(self) -> bool:
-        """Whether a bound call of few particles gains by a recording although its NumPy arrays must be copied."""
+        """Tell whether to record bound calls of few particles, although a recording must copy their NumPy arrays."""
         return False
 
     # ---- calls: where starts take longer than small work, the work of a call is gathered and started together
@@ -137,7 +137,7 @@ class Backend(ABC):
 
     @property
     def gathers(self) -> bool:
-        """Whether launches and copies of this thread are gathered now."""
+        """Tell whether this thread is recording launches and copies."""
         return False
 
     def address(self, buffer: Buffer) -> int:

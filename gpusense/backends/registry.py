@@ -51,7 +51,7 @@ class Entry:
 
     @property
     def has_parts(self) -> bool:
-        """Whether a selection string goes on after the name."""
+        """Tell whether a selection string may name a device after the backend's name."""
         return any(":" in selection for selection in self.selections)
 
     @property

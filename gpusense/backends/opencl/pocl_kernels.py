@@ -54,7 +54,7 @@ class PoclKernels:
 
     @property
     def changed(self) -> bool:
-        """Whether kernels were compiled since the last :meth:`save`."""
+        """Tell whether kernels were compiled since the last :meth:`save`."""
         return bool(self._changed)
 
     def save(self) -> None:

@@ -46,10 +46,9 @@ class Launch:
         # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.
         self._types = [_set_as(argument, real) for argument in row.arguments]
         self._packers = [
-            (place, struct.Struct(structs.layout(argument.type, real)).pack)
-            for place, argument in enumerate(row.arguments)
-            if argument.is_struct
+            (place, _Packer(argument.type, real)) for place, argument in enumerate(row.arguments) if argument.is_struct
         ]
+        self._last_size: tuple[Any, Any] = (None, None)
         with without_caches():
             kernel.set_arg_types(self._types)
 
@@ -59,7 +58,9 @@ class Launch:
         # Arguments belong to the kernel object, so two threads must not interleave.
         with self._lock, driver_errors():
             self._kernel.set_args(*self._packed(arguments))
-            self._backend.enqueue(self._kernel, *self._sizes(size))
+            if size != self._last_size[0]:
+                self._last_size = size, self._sizes(size)
+            self._backend.enqueue(self._kernel, *self._last_size[1])
 
     def bind(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> BoundLaunch:
         """Set the arguments of a new kernel object, and start nothing."""
@@ -74,7 +75,7 @@ class Launch:
         """Return the arguments with structs as the bytes that the device reads."""
         packed = list(arguments)
         for place, pack in self._packers:
-            packed[place] = pack(*packed[place])
+            packed[place] = pack(packed[place])
         return packed
 
     def _before_first(self) -> None:
@@ -87,6 +88,21 @@ class Launch:
         """Return the size in whole groups, and the group."""
         group = (self._group, *(1 for _ in size[1:]))
         return (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:]), group
+
+
+class _Packer:
+    """Packs a struct into the bytes that the device reads; calls mostly repeat the last one."""
+
+    def __init__(self, name: str, real: np.dtype) -> None:
+        self._pack = struct.Struct(structs.layout(name, real)).pack
+        self._last: tuple[Any, bytes] = (None, b"")
+
+    def __call__(self, value: tuple[Any, ...]) -> bytes:
+        last, packed = self._last
+        if value is not last:
+            packed = self._pack(*value)
+            self._last = value, packed
+        return packed
 
 
 def _set_as(argument: Argument, real: np.dtype) -> Any:

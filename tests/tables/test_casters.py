@@ -27,8 +27,8 @@ from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "casters.md"
 KINDS = [
-    *(Exact(), Dda(), Bresenham(), March(), March(0.02), March(1.5, "centre")),
-    *(Cddt(), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),
+    *(make() for name, make in casters.CASTERS.items() if name != "lookup"),
+    *(March(0.02), March(1.5, "centre"), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),
 ]
 CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]

@@ -208,7 +208,7 @@ def _case_rows(case: Case, device: Backend, precision: str) -> Iterator[Row]:
         if recorder.launches:
             truth = np.concatenate([_truth(launch, parameters) for launch in recorder.launches])
             parts = np.concatenate([launch.parts for launch in recorder.launches])
-            fixed = float(recorder.launches[0].values["fixed"])
+            fixed = float(recorder.launches[0].values["score"].constant_term)
             worst = tolerance.difference(parts, truth)
             yield _row(case.name, f"{name}, {tolerance.unit}", worst, tolerance.value, parts, truth)
         total = truth.sum(axis=1) + fixed
@@ -227,7 +227,7 @@ def _truth(launch: Launch, parameters: Any) -> Floats:
     """Compute log p of a launch's beams in float64, on its rounded readings and expected ranges."""
     if launch.expected is None:
         return replay(launch)[1]
-    z, top = launch.values["reading"].astype(np.float64), float(launch.values["range_max"])
+    z, top = launch.values["reading"].astype(np.float64), float(launch.values["scale"].range_max)
     expected = np.repeat(launch.expected.astype(np.float64), np.diff(launch.values["first"]), axis=1)
     # A reading below range_max may round to range_max in the launch's precision, and is still a hit.
     z = np.where(z == top, np.nextafter(top, 0), z)

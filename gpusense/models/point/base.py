@@ -13,6 +13,7 @@ from gpusense._util import checks
 from gpusense.backends import BackendInfo, Selection, arrays, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.models.arguments import real_dtype
@@ -55,7 +56,7 @@ class PointModel(ABC):
         self._workspace = Workspace(self._backend)
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
-        self._flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
+        self._flags = flags_if(FLOAT64=self._real == np.float64)
         # Flags of the last call's kernels, None before a call, and omissions by its readings.
         self._last_code: frozenset[str] | None = None
         self._last_left_out: list[Omission] = []

@@ -12,6 +12,7 @@ from gpusense._util import checks
 from gpusense.backends import Backend, arrays
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
@@ -66,11 +67,11 @@ class MapCaster:
         self.map = ReachableMap(
             backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._refresh
         )
-        self._fixed_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
-        self._fixed_flags |= {method.entry.flag} if method.entry.flag else set()
+        # The exact caster has no flag.
+        self._fixed_flags = flags_if(OUTSIDE_OCCUPIED=outside == "occupied", **{method.entry.flag: method.entry.flag})
         # Include the table's flags once it is made.
         self.flags = self._fixed_flags
-        self._wide = {"FLOAT64"} if real == np.float64 else set()
+        self._precision_flags = flags_if(FLOAT64=real == np.float64)
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
         self._lock = threading.Lock()
@@ -188,8 +189,7 @@ class MapCaster:
     ) -> Program:
         """Return the launches that cast the rays of placed poses."""
         space, window, count = self._workspace, placed.frame.window, placed.count
-        flags = self.flags | self._wide | cones.flags
-        flags |= set() if all_within(placed, 0) else {"ORIGINS_OUTSIDE"}
+        flags = self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
         common = dict(
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, rows=window.rows, cols=window.cols,
             particles=count, rays=rays, **self.knobs, limit=self.limit, resolution=self.grid.resolution,
@@ -205,7 +205,7 @@ class MapCaster:
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         if self.backend.info.kind == "gpu":
             order = order_of(space, placed, rays, self.real)
-            flags |= {"ORDERED"} if order is not None else set()
+            flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles_of(count, rays)
             places = placed.cell if order is None else order.order
             tiles = launch("cast_tiles", flags, (items,), **common, ranges=result, order=places, spread=spread)

@@ -11,13 +11,13 @@ import numpy as np
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import Beams
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
-_NO_FLAGS = frozenset[str]()
 # The kernel places readings by whole groups of work-items, so that those of poses begin with a group.
 _GROUP = 64
 
@@ -53,7 +53,7 @@ class Readings:
     @property
     def sum_flags(self) -> frozenset[str]:
         """Flags of ``sum_parts``."""
-        return frozenset({"SCANS"}) if self.constants_there else _NO_FLAGS
+        return flags_if(SCANS=self.constants_there)
 
 
 @dataclass(frozen=True)
@@ -160,11 +160,10 @@ def device_readings(
         guard=space.empty("guard", -(-places // BLOCK_TERMS) if end_points else 1, real),
         fixed=space.empty("fixed", 1, real),
     )
-    flags = {"END_POINTS"} if end_points else set()
-    flags |= {"FLOAT64"} if real == np.float64 else set()
-    flags |= set() if sensing.specialize else {"ALL_READINGS"}
-    flags |= {"RANGES_FLOAT32"} if dtype == np.float32 else set()
-    flags |= set() if np.array_equal(columns, np.arange(sensing.scanner.count)) else {"SOME_BEAMS"}
+    flags = flags_if(
+        END_POINTS=end_points, FLOAT64=real == np.float64, ALL_READINGS=not sensing.specialize,
+        RANGES_FLOAT32=dtype == np.float32, SOME_BEAMS=len(columns) < sensing.scanner.count,
+    )  # fmt: skip
     nearest, farthest = sensing.limits(limits)
     chosen = min(int(sensing.beams), len(columns)) if isinstance(sensing.beams, (int, np.integer)) else len(columns)
     kind = sensing.max_readings
@@ -175,7 +174,7 @@ def device_readings(
         nearest=nearest, farthest=farthest, log_max=float(np.log(sensing.z_max)) if kind == MAX_FIXED else 0.0,
         top=sensing.top, guard_scale=sensing.guard_scale,
     )  # fmt: skip
-    return Placing(frozenset(flags), arguments), filled
+    return Placing(flags, arguments), filled
 
 
 def placing_launches(placed: PlacedPoses, placing: Placing | None) -> Program:

@@ -12,11 +12,11 @@ from gpusense.backends import Selection
 from gpusense.models.arguments import check_discrete
 from gpusense.models.scan.beam_explain import title_and_omissions
 from gpusense.models.scan.beam_pipeline import BeamPipeline
-from gpusense.models.scan.classed import Beams
 from gpusense.models.scan.cones import bins_of, cones_of, require_exact
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import mixture_on_device
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.rules import Beams
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
 from gpusense.world import compat as compat_module

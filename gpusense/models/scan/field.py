@@ -6,9 +6,9 @@ from gpusense._util import checks
 from gpusense.backends import Selection
 from gpusense.interface.plan import Omission, launch_omissions, scene_omissions
 from gpusense.interface.terms import HIGH_PEAK
-from gpusense.models.scan.classed import Beams
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.rules import Beams
 from gpusense.world import compat as compat_module
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters

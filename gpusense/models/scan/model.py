@@ -17,9 +17,9 @@ from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
-from gpusense.models.scan.classed import Beams, Rules, check_beams
 from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
+from gpusense.models.scan.rules import Beams, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world import compat as compat_module
 from gpusense.world.frames import ray_vectors
@@ -75,10 +75,7 @@ class ScanModel(ABC):
         self._last = LastCall()
 
     def __repr__(self) -> str:
-        count, beams = self.scanner.count, self.beams
-        used = (
-            count if beams is None else min(int(beams), count) if isinstance(beams, (int, np.integer)) else len(beams)
-        )
+        count, used = self.scanner.count, self._setting.rules.choice.most
         parts = [
             map_words(self.grid),
             f"beams={count}" if used == count else f"beams={used} of {count}",

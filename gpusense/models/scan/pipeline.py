@@ -19,9 +19,10 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
 from gpusense.models.run import Piece, chunk_of
-from gpusense.models.scan.classed import ClassedScans, Rules, class_scans
+from gpusense.models.scan.classed import ClassedScans, class_scans
 from gpusense.models.scan.readings import Readings, Sensing, placing_launches
 from gpusense.models.scan.request import Request
+from gpusense.models.scan.rules import Rules
 from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.compat import Peer

@@ -14,7 +14,7 @@ from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, M
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.models.poses import PlacedPoses
-from gpusense.models.scan.classed import Beams
+from gpusense.models.scan.rules import BeamChoice, Beams
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
@@ -100,19 +100,19 @@ class Sensing:
     real: np.dtype
 
     @property
+    def choice(self) -> BeamChoice:
+        """The beams that are used."""
+        return BeamChoice.of(self.beams, self.scanner.count)
+
+    @property
     def columns(self) -> np.ndarray:
         """Beams whose readings are read."""
-        every = np.arange(self.scanner.count)
-        if self.beams is None or isinstance(self.beams, (int, np.integer)):
-            return every
-        return every[np.asarray(self.beams, np.intp)]
+        return self.choice.columns
 
     @property
     def places(self) -> int:
         """Places of readings; those at the end may be missing (nan)."""
-        count = len(self.columns)
-        chosen = min(int(self.beams), count) if isinstance(self.beams, (int, np.integer)) else count
-        return chosen if self.specialize else count
+        return self.choice.most if self.specialize else len(self.choice.columns)
 
     @property
     def max_readings(self) -> int:
@@ -165,7 +165,7 @@ def device_readings(
         RANGES_FLOAT32=dtype == np.float32, SOME_BEAMS=len(columns) < sensing.scanner.count,
     )  # fmt: skip
     nearest, farthest = sensing.limits(limits)
-    chosen = min(int(sensing.beams), len(columns)) if isinstance(sensing.beams, (int, np.integer)) else len(columns)
+    chosen = sensing.choice.most
     kind = sensing.max_readings
     arguments = dict(
         filled, ranges=ranges, beam=space.upload("beam", columns.astype(_INT)),

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import Backend, arrays
+from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
@@ -152,28 +153,17 @@ class MapCaster:
             (N, K) expected ranges, or angles of incidence.
         """
         checked, rays = Poses(poses, self.backend), len(vectors)
-        shape = checked.count, rays
-        target: Any = arrays.check_out(out, shape, self.real, poses, self.backend)
-        if checked.on_device:
-            target = arrays.blank(self.backend, checked.count * rays, self.real) if target is None else target
-            flat = target
-        else:
-            target = np.empty(shape, self.real) if target is None else target
-            flat = target.reshape(-1)
+        result = Result(poses, out, (checked.count, rays), self.real, self.backend)
         if checked.count * rays:
             with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
                 chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
                 run_pieces(
                     self._workspace, Piece(0, checked.count, checked.count), chunk,
-                    lambda piece: self._cast(checked, piece, ray, rays, flat, cones),
+                    lambda piece: self._cast(checked, piece, ray, rays, result.flat, cones),
                 )  # fmt: skip
                 finish(self._workspace, checked.on_device)
-        if out is not None:
-            return out
-        if checked.on_device:
-            return arrays.lent(poses, self.backend, target, shape, self.real)
-        return arrays.like(poses, target)
+        return result.array()
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         """Start to cast the rays of a piece."""

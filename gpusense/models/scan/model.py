@@ -156,7 +156,7 @@ class ScanModel(ABC):
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)
             finish(self._workspace, request.poses.on_device)
-        log_p = request.result(self._setting.backend)
+        log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p
 
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:

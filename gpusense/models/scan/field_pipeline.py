@@ -53,7 +53,7 @@ class FieldPipeline(ScanPipeline):
         outside: str,
     ) -> None:
         super().__init__(setting, grid)
-        bilinear, compat = parameters.interpolation == "bilinear", setting.peer is not None
+        bilinear, compat = parameters.interpolation == "bilinear", setting.weights.cubes
         self.log_table = (self.specialize or compat) and not bilinear
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
@@ -63,7 +63,7 @@ class FieldPipeline(ScanPipeline):
         range_max = self.scanner.range_max
         self.table = FieldTable(
             self.real, parameters, grid.resolution, range_max, outside=outside,
-            compat=None if setting.peer is None else setting.peer.name, log_table=self.log_table, flags=self.components,
+            compat=setting.weights.name, log_table=self.log_table, flags=self.components,
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(

@@ -52,7 +52,7 @@ class ScanModel(ABC):
             raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         self._first_grid = check_scene(grid, scanner.range_max)
         self.scanner = scanner
-        peer = compat_module.choose(compat)
+        weights = compat_module.choose(compat)
         self.compat = compat
         self.unknown = checks.choice("unknown", "free" if unknown is None else unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", "free" if outside is None else outside, ("free", "occupied"))
@@ -62,12 +62,12 @@ class ScanModel(ABC):
             raise TypeError(f"specialize: must be True or False, got {checks.show(specialize)}")
         device = get_backend(backend)
         rules = Rules(
-            scanner, ray_vectors(scanner.bearings, scanner.mount), z_max if peer is None else 0.0, self.beams,
-            specialize, max_is_range=peer is not None, max_depends=max_depends,
+            scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.cubes else z_max, self.beams,
+            specialize, max_is_range=weights.cubes, max_depends=max_depends,
         )  # fmt: skip
         self._setting = Setting(
-            device, real_dtype(precision, device), rules, peer, self.temperature, constant_term,
-            possible or peer is not None,
+            device, real_dtype(precision, device), rules, weights, self.temperature, constant_term,
+            possible or weights.cubes,
         )  # fmt: skip
         self._workspace = Workspace(device)
         # Threads may share a model: its buffers serve one call at a time.

@@ -8,166 +8,52 @@ NumPy alone; backends and drawing are loaded when they are asked for.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gpusense._version import __version__
+from gpusense._version import __version__ as __version__
 
-if TYPE_CHECKING:
-    from gpusense.backends import Device, devices
-    from gpusense.learning.beam.fit import fit_beam_parameters
-    from gpusense.learning.beam.incidence import IncidenceFit, fit_incidence_parameters
-    from gpusense.learning.beam.result import BeamFit
-    from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
-    from gpusense.learning.discrete.table import DiscreteBeamModel
-    from gpusense.learning.landmark.fit import fit_landmark_parameters
-    from gpusense.learning.landmark.result import LandmarkFit
-    from gpusense.learning.landmark.suspicious import suspicious_landmarks
-    from gpusense.localization.weights import Weights, normalize_weights, resample
-    from gpusense.logs import Odometry, Scan, read_log
-    from gpusense.models.landmark.model import LandmarkModel
-    from gpusense.models.point.absolute import HeadingModel, PositionModel
-    from gpusense.models.point.beacons import BeaconModel
-    from gpusense.models.point.bumper import BumperModel
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.bound import BoundCall
-    from gpusense.models.scan.caster import CasterMethod, RayCaster
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.models.scan.several import log_likelihoods
-    from gpusense.positions.bearings import triangulate, triangulate_triangle
-    from gpusense.positions.fix import PositionFix
-    from gpusense.positions.locate import locate
-    from gpusense.positions.ranges import trilaterate
-    from gpusense.tables.distances import distance_transform
-    from gpusense.tables.normals import surface_normals
-    from gpusense.world.grid import OccupancyGrid
-    from gpusense.world.landmarks import LandmarkMap
-    from gpusense.world.map_files import read_map, write_map
-    from gpusense.world.parameters import (
-        BeamParameters,
-        IncidenceParameters,
-        LandmarkParameters,
-        LikelihoodFieldParameters,
-    )
-    from gpusense.world.scanner import Reading, Scanner, classify
-    from gpusense.world.sensor_parameters import (
-        BeaconParameters,
-        BumperParameters,
-        HeadingParameters,
-        PositionParameters,
-    )
-
-_HOME = {
-    "BeaconModel": "gpusense.models.point.beacons",
-    "BeaconParameters": "gpusense.world.sensor_parameters",
-    "BeamFit": "gpusense.learning.beam.result",
-    "BeamModel": "gpusense.models.scan.beam",
-    "BeamParameters": "gpusense.world.parameters",
-    "BoundCall": "gpusense.models.scan.bound",
-    "BumperModel": "gpusense.models.point.bumper",
-    "BumperParameters": "gpusense.world.sensor_parameters",
-    "CasterMethod": "gpusense.models.scan.caster",
-    "Device": "gpusense.backends",
-    "DiscreteBeamModel": "gpusense.learning.discrete.table",
-    "DiscreteCauses": "gpusense.learning.discrete.causes",
-    "DiscreteFit": "gpusense.learning.discrete.causes",
-    "HeadingModel": "gpusense.models.point.absolute",
-    "HeadingParameters": "gpusense.world.sensor_parameters",
-    "IncidenceFit": "gpusense.learning.beam.incidence",
-    "IncidenceParameters": "gpusense.world.parameters",
-    "LandmarkFit": "gpusense.learning.landmark.result",
-    "LandmarkMap": "gpusense.world.landmarks",
-    "LandmarkModel": "gpusense.models.landmark.model",
-    "LandmarkParameters": "gpusense.world.parameters",
-    "LikelihoodFieldModel": "gpusense.models.scan.field",
-    "LikelihoodFieldParameters": "gpusense.world.parameters",
-    "OccupancyGrid": "gpusense.world.grid",
-    "Odometry": "gpusense.logs",
-    "PositionFix": "gpusense.positions.fix",
-    "PositionModel": "gpusense.models.point.absolute",
-    "PositionParameters": "gpusense.world.sensor_parameters",
-    "RayCaster": "gpusense.models.scan.caster",
-    "Reading": "gpusense.world.scanner",
-    "Scan": "gpusense.logs",
-    "Scanner": "gpusense.world.scanner",
-    "Weights": "gpusense.localization.weights",
-    "classify": "gpusense.world.scanner",
-    "devices": "gpusense.backends",
-    "distance_transform": "gpusense.tables.distances",
-    "fit_beam_parameters": "gpusense.learning.beam.fit",
-    "fit_incidence_parameters": "gpusense.learning.beam.incidence",
-    "fit_landmark_parameters": "gpusense.learning.landmark.fit",
-    "locate": "gpusense.positions.locate",
-    "log_likelihoods": "gpusense.models.scan.several",
-    "normalize_weights": "gpusense.localization.weights",
-    "read_log": "gpusense.logs",
-    "read_map": "gpusense.world.map_files",
-    "resample": "gpusense.localization.weights",
-    "surface_normals": "gpusense.tables.normals",
-    "suspicious_landmarks": "gpusense.learning.landmark.suspicious",
-    "triangulate": "gpusense.positions.bearings",
-    "triangulate_triangle": "gpusense.positions.bearings",
-    "trilaterate": "gpusense.positions.ranges",
-    "write_map": "gpusense.world.map_files",
+# The public names by their modules. Type checkers read the stub beside this file, which is made from this table:
+# run ``PYTHONPATH=tests python -m support.public_names`` after a change.
+_NAMES = {
+    "backends": ("Device", "devices"),
+    "learning.beam.fit": ("fit_beam_parameters",),
+    "learning.beam.incidence": ("IncidenceFit", "fit_incidence_parameters"),
+    "learning.beam.result": ("BeamFit",),
+    "learning.discrete.causes": ("DiscreteCauses", "DiscreteFit"),
+    "learning.discrete.table": ("DiscreteBeamModel",),
+    "learning.landmark.fit": ("fit_landmark_parameters",),
+    "learning.landmark.result": ("LandmarkFit",),
+    "learning.landmark.suspicious": ("suspicious_landmarks",),
+    "localization.weights": ("Weights", "normalize_weights", "resample"),
+    "logs": ("Odometry", "Scan", "read_log"),
+    "models.landmark.model": ("LandmarkModel",),
+    "models.point.absolute": ("HeadingModel", "PositionModel"),
+    "models.point.beacons": ("BeaconModel",),
+    "models.point.bumper": ("BumperModel",),
+    "models.scan.beam": ("BeamModel",),
+    "models.scan.bound": ("BoundCall",),
+    "models.scan.caster": ("RayCaster",),
+    "models.scan.field": ("LikelihoodFieldModel",),
+    "models.scan.several": ("log_likelihoods",),
+    "positions.bearings": ("triangulate", "triangulate_triangle"),
+    "positions.fix": ("PositionFix",),
+    "positions.locate": ("locate",),
+    "positions.ranges": ("trilaterate",),
+    "tables.distances": ("distance_transform",),
+    "tables.normals": ("surface_normals",),
+    "world.grid": ("OccupancyGrid",),
+    "world.landmarks": ("LandmarkMap",),
+    "world.map_files": ("read_map", "write_map"),
+    "world.parameters": ("BeamParameters", "IncidenceParameters", "LandmarkParameters", "LikelihoodFieldParameters"),
+    "world.scanner": ("Reading", "Scanner", "classify"),
+    "world.sensor_parameters": ("BeaconParameters", "BumperParameters", "HeadingParameters", "PositionParameters"),
 }
-
-__all__ = [
-    "BeaconModel",
-    "BeaconParameters",
-    "BeamFit",
-    "BeamModel",
-    "BeamParameters",
-    "BoundCall",
-    "BumperModel",
-    "BumperParameters",
-    "CasterMethod",
-    "Device",
-    "DiscreteBeamModel",
-    "DiscreteCauses",
-    "DiscreteFit",
-    "HeadingModel",
-    "HeadingParameters",
-    "IncidenceFit",
-    "IncidenceParameters",
-    "LandmarkFit",
-    "LandmarkMap",
-    "LandmarkModel",
-    "LandmarkParameters",
-    "LikelihoodFieldModel",
-    "LikelihoodFieldParameters",
-    "OccupancyGrid",
-    "Odometry",
-    "PositionFix",
-    "PositionModel",
-    "PositionParameters",
-    "RayCaster",
-    "Reading",
-    "Scan",
-    "Scanner",
-    "Weights",
-    "__version__",
-    "classify",
-    "devices",
-    "distance_transform",
-    "fit_beam_parameters",
-    "fit_incidence_parameters",
-    "fit_landmark_parameters",
-    "locate",
-    "log_likelihoods",
-    "normalize_weights",
-    "read_log",
-    "read_map",
-    "resample",
-    "surface_normals",
-    "suspicious_landmarks",
-    "triangulate",
-    "triangulate_triangle",
-    "trilaterate",
-    "write_map",
-]
-
-
 # Public modules.
 _MODULES = ("casters", "compat", "plots", "worlds")
+
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = sorted([*_HOME, "__version__"])
 
 
 def __getattr__(name: str) -> Any:
@@ -176,7 +62,7 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(f"gpusense.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'gpusense' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME[name]), name)
+    value = getattr(importlib.import_module(f"gpusense.{_HOME[name]}"), name)
     globals()[name] = value
     return value
 

@@ -116,11 +116,6 @@ def _check_numbers(adopted: Adopted, name: str) -> None:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")
 
 
-def blank(backend: Backend, count: int, real: np.dtype) -> Buffer:
-    """Return a buffer on the device for a result of exactly ``count`` numbers, 0 included."""
-    return backend.blank(count, real)
-
-
 def lent(poses: object, backend: Backend, buffer: Buffer, shape: tuple[int, ...], real: np.dtype) -> object:
     """Return a result on the device as an array of the library of the poses."""
     return _converted(poses, backend.lend(buffer, shape, real))

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording
-from gpusense.interface.launches import Launch, Program, flags_of
+from gpusense.interface.launches import Program, flags_of
 
 # Programs of earlier calls that are kept.
 _MOST_KEPT = 64
@@ -20,30 +20,39 @@ _ALIGNED = 64
 POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
-class _Kept:
+class KeptProgram:
     """A program of an earlier call, without the arguments that change from call to call.
 
     Attributes:
         flags: Flags of its launches.
-        recording: Its recording, which holds no buffers; None where launches are bound anew.
     """
 
-    def __init__(self, program: Program, changing: Iterable[str], recording: Recording | None) -> None:
-        self.flags, self.recording = flags_of(program), recording
-        self._launches: list[tuple[Launch, list[tuple[int, str]]]] = []
-        if recording is None:
-            names = frozenset(changing)
-            self._launches = [(one.without(names), one.places(names)) for one in program]
+    def __init__(self, program: Program, changing: Iterable[str]) -> None:
+        names = frozenset(changing)
+        self.flags = flags_of(program)
+        self._launches = [(one.without(names), one.places(names)) for one in program]
 
-    def program(self, changing: dict[str, Any]) -> Program:
-        """Return the program with the arguments of a call."""
+    def run(self, backend: Backend, changing: dict[str, Any]) -> None:
+        """Run the program with the arguments of a call."""
         launches = []
         for one, places in self._launches:
             arguments = list(one.arguments)
             for place, name in places:
                 arguments[place] = changing[name]
             launches.append(one._replace(arguments=tuple(arguments)))
-        return tuple(launches)
+        backend.run(tuple(launches))
+
+
+class KeptRecording(KeptProgram):
+    """The recording of a program of an earlier call, with all its arguments."""
+
+    def __init__(self, program: Program, recording: Recording) -> None:
+        super().__init__((), ())
+        self.flags, self._recording = flags_of(program), recording
+
+    def run(self, backend: Backend, changing: dict[str, Any]) -> None:
+        """Replay it; its key holds the arguments of the call."""
+        backend.replay(self._recording)
 
 
 class Workspace:
@@ -55,7 +64,7 @@ class Workspace:
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
         # Programs of earlier calls, by everything on which they depend.
-        self._programs: dict[Hashable, _Kept] = {}
+        self._programs: dict[Hashable, KeptProgram] = {}
         self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
 
@@ -106,14 +115,11 @@ class Workspace:
         kept = self._programs.get((records, key))
         if kept is None:
             program = make()
-            kept = _Kept(program, changing, backend.record(program) if records else None)
+            kept = KeptRecording(program, backend.record(program)) if records else KeptProgram(program, changing)
             if len(self._programs) >= _MOST_KEPT:
                 del self._programs[next(iter(self._programs))]
             self._programs[records, key] = kept
-        if kept.recording is not None:
-            backend.replay(kept.recording)
-        else:
-            backend.run(kept.program(changing))
+        kept.run(backend, changing)
         return kept.flags
 
     def _identity(self, value: Any) -> Hashable:

@@ -24,7 +24,7 @@ from gpusense.evaluation.agreement import Agreement, Comparison, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan, read_log
-from gpusense.models.scan.classed import choose_beams
+from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Reading, classify

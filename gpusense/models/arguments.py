@@ -48,15 +48,28 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     return dtype
 
 
+def check_absent(where: str, **options: object) -> None:
+    """Refuse options that must be None.
+
+    Args:
+        where: When they must be, in words of the message.
+        **options: Their values.
+
+    Raises:
+        ValueError: an option is set.
+    """
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(f"{name}: must be None {where}, got {checks.show(value)}")
+
+
 def check_discrete(model: SensorTable, scanner: Scanner, compat: object, sensor_table: object) -> None:
     """Refuse options that contradict a discrete model.
 
     Raises:
         ValueError: the scanner has another range_max, or an option of the mixture is set.
     """
-    for name, value in (("compat", compat), ("sensor_table", sensor_table)):
-        if value is not None:
-            raise ValueError(f"{name}: must be None with a DiscreteBeamModel, got {checks.show(value)}")
+    check_absent("with a DiscreteBeamModel", compat=compat, sensor_table=sensor_table)
     if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:
         rule = f"must have the scanner's range_max = {scanner.range_max}"
         raise ValueError(f"parameters: {rule}, got a DiscreteBeamModel for {model.range_max}")

@@ -17,6 +17,7 @@ from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import LARGEST_HEADING
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
@@ -201,7 +202,7 @@ def place(
     return PlacedPoses(
         count, corners, frame, space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real),
         space.empty("pose_low", 4 * count if careful else 4, real),
-        poses.flags | ({"FLOAT64"} if real == np.float64 else _PLAIN) | ({"CAREFUL"} if careful else _PLAIN),
+        poses.flags | flags_if(FLOAT64=real == np.float64, CAREFUL=careful),
         source, pose_status(space),
     )  # fmt: skip
 

@@ -55,6 +55,7 @@ class Caster(ABC):
         memory: Memory on the device, in words.
         precomputation: Work on the map before the first ray, in words.
         knobs: Parameters that trade error for time, in words.
+        backends: Backends that have it.
         whole: Whether the table needs the whole map at once.
         ring: Whether the table has a ring of cells that stands for space outside the grid.
     """
@@ -65,6 +66,7 @@ class Caster(ABC):
     memory: ClassVar[str]
     precomputation: ClassVar[str]
     knobs: ClassVar[str] = "none"
+    backends: ClassVar[tuple[str, ...]] = ("numpy", "opencl", "warp")
     whole: ClassVar[bool] = False
     ring: ClassVar[bool] = True
 

@@ -74,7 +74,43 @@ class FieldWeights(LikelihoodFieldParameters):
 
 
 @dataclass(frozen=True)
-class Peer:
+class Likelihood:
+    """The book's likelihoods: the rules of models without ``compat``.
+
+    Attributes:
+        name: None.
+        beam: Default parameters of the beam model.
+        field: Default parameters of the likelihood field.
+        constant_term: First term of the beam model's sum over readings.
+        outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
+        cubes: Whether weights are sums of cubes, in place of products of densities.
+        field_constant: First term of the likelihood field's sum over readings.
+        caster: Default caster of the beam model.
+        unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
+    """
+
+    name: str | None
+    beam: BeamParameters
+    field: LikelihoodFieldParameters
+    constant_term: float
+    outside: str
+
+    cubes: ClassVar[bool] = False
+    field_constant: ClassVar[float] = 0.0
+    caster: ClassVar[str] = "exact"
+    unknown: ClassVar[str] = "free"
+
+    def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
+        """Return readings as they are."""
+        return ranges
+
+    def without_readings(self, constant: float, first: float) -> float:
+        """Return the sum of a scan without evaluated readings, from its constant term and the first term of sums."""
+        return constant
+
+
+@dataclass(frozen=True)
+class Peer(Likelihood):
     """A program whose weights ``compat`` reproduces.
 
     Attributes:
@@ -88,8 +124,16 @@ class Peer:
     name: str
     beam: BeamWeights
     field: FieldWeights
-    constant_term: float
-    outside: str
+
+    cubes = True
+    field_constant = 1.0
+    caster = "bresenham"
+    unknown = "occupied"
+
+    def without_readings(self, constant: float, first: float) -> float:
+        """See Likelihood.without_readings; a sum of cubes has no constant terms."""
+        with np.errstate(divide="ignore"):
+            return float(np.log(first))
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
         """Convert readings to the peer's classes: NaN is left out, +inf is a max reading, all others are ranges.
@@ -116,14 +160,17 @@ PEERS = {
 }
 
 
-def choose(compat: object) -> Peer | None:
-    """Return the peer that ``compat`` names; None for None.
+LIKELIHOOD = Likelihood(None, BeamParameters(), LikelihoodFieldParameters(), 0.0, "free")
+
+
+def choose(compat: object) -> Likelihood:
+    """Return the peer that ``compat`` names; the book's likelihood for None.
 
     Raises:
         TypeError: ``compat`` is neither None nor a string.
         ValueError: ``compat`` names no peer.
     """
-    return None if compat is None else PEERS[checks.choice("compat", compat, tuple(PEERS))]
+    return LIKELIHOOD if compat is None else PEERS[checks.choice("compat", compat, tuple(PEERS))]
 
 
 def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat: object) -> None:

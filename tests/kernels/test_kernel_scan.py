@@ -14,7 +14,8 @@ from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.interface.structs import Frame, ReadingRules, Window
-from gpusense.models.scan.classed import Rules, choose_beams, class_scans
+from gpusense.models.scan.classed import class_scans
+from gpusense.models.scan.rules import Rules, choose_beams
 from gpusense.reference.scan import is_chosen
 from gpusense.world.frames import frame_of, ray_vectors, split
 from gpusense.world.scanner import Reading

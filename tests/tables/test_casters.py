@@ -174,7 +174,8 @@ def test_methods_list_every_caster():
     methods = {method.name: method for method in gs.RayCaster.methods()}
     assert list(methods) == list(ENTRIES) == list(casters.CASTERS)
     for name, method in methods.items():
-        assert all(dataclasses.astuple(method)) and method.backends == ("numpy", "opencl", "warp")
+        words = (method.name, method.error, method.memory, method.precomputation, method.knobs)
+        assert all(words) and method.backends == ("numpy", "opencl", "warp")
         assert method.error.startswith("exact") == casters.CASTERS[name].exact
         assert gs.RayCaster(place()[0], RANGE, method=name, backend="numpy").method == casters.CASTERS[name]()
 

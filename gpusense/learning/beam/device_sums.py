@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.backends import Backend
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.signatures import LANES
 from gpusense.interface.terms import log_weight, rounded_terms
@@ -69,7 +70,7 @@ class DeviceSums:
     def __init__(self, backend: Backend, real: np.dtype, pairs: Pairs) -> None:
         self._backend, self.real = backend, real
         self._range_max = pairs.range_max
-        self._flags = _FLAGS | (frozenset({"FLOAT64"}) if real == np.float64 else frozenset())
+        self._flags = _FLAGS | flags_if(FLOAT64=real == np.float64)
         self.passes = 0
         # The NumPy reference has the processor's layout: it loops over a block's places, over all blocks at once.
         gpu = backend.info.kind == "gpu"
@@ -119,7 +120,7 @@ class DeviceSums:
             (14,) or, with second derivatives, (40,) float64.
         """
         width = _SUMS[information]
-        flags = self._flags | (frozenset({"INFORMATION"}) if information else frozenset())
+        flags = self._flags | flags_if(INFORMATION=information)
         total = np.zeros(width)
         self.passes += 1
         if not self._chunks:

@@ -12,6 +12,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.plan import Omission
@@ -186,12 +187,11 @@ class LandmarkModel(PointModel):
 
     def _code(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
         """Return the flags of the kernels."""
-        names = ("RANGE", "BEARING", "SIGNATURE")
-        measured = np.asarray(prepared.measured.any(axis=0))
-        flags = {name for name, used in zip(names, measured.tolist(), strict=True) if used or not self._specialize}
-        flags |= {"FIELD"} if not full_circle(self.parameters) else set()
-        flags |= {"KNOWN"} if known else {"MARGINAL"} if self.association == "sum" else set()
-        return self._flags | flags | ({"PER_BEAM"} if each else set())
+        with_range, with_bearing, with_signature = np.any(prepared.measured, axis=0) | (not self._specialize)
+        return self._flags | flags_if(
+            RANGE=with_range, BEARING=with_bearing, SIGNATURE=with_signature, FIELD=not full_circle(self.parameters),
+            KNOWN=known, MARGINAL=not known and self.association == "sum", PER_BEAM=each,
+        )  # fmt: skip
 
     def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> _Call:
         """Return the values of (F, 3) possible features that all particles share."""

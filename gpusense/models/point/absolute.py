@@ -12,6 +12,7 @@ from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.terms import log_weight
@@ -177,7 +178,7 @@ class HeadingModel(PointModel):
             raise TypeError(f"parameters: must be HeadingParameters, got {checks.show(parameters)}")
         super().__init__(backend, precision, temperature)
         self._kind, terms = self._mixture()
-        self._flags |= {"RAND"} if self.parameters.z_rand else set()
+        self._flags |= flags_if(RAND=self.parameters.z_rand)
         self._terms_buffer = self._backend.upload(terms)
 
     def log_likelihood(self, poses: object, heading: object, *, out: Any = None) -> np.ndarray:

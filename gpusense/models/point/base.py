@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import BackendInfo, Selection, arrays, get_backend
+from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.base import Buffer
+from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.models.arguments import real_dtype
@@ -55,7 +57,7 @@ class PointModel(ABC):
         self._workspace = Workspace(self._backend)
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
-        self._flags = frozenset({"FLOAT64"} if self._real == np.float64 else ())
+        self._flags = flags_if(FLOAT64=self._real == np.float64)
         # Flags of the last call's kernels, None before a call, and omissions by its readings.
         self._last_code: frozenset[str] | None = None
         self._last_left_out: list[Omission] = []
@@ -133,19 +135,17 @@ class PointModel(ABC):
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend)
         count, on_device = checked.count, checked.on_device
-        flat = arrays.check_out(out, (count,), real, poses, backend)
-        if flat is None:
-            flat = arrays.blank(backend, count, real) if on_device else np.empty(count, real)
+        result = Result(poses, out, (count,), real, backend)
 
         def score(piece: Piece) -> None:
-            with space.result("log_p", flat, piece.begin, piece.count, real) as result:
+            with space.result("log_p", result.flat, piece.begin, piece.count, real) as log_p:
                 if program is None:
                     # Poses that are not finite are refused even without a measurement.
                     _, launches = self._relative(checked, piece.part, "place_relative", ORIGIN)
                     backend.run(launches)
-                    backend.upload(np.zeros(piece.count, real), result)
+                    backend.upload(np.zeros(piece.count, real), log_p)
                 else:
-                    launches = program(checked, piece.part, result)
+                    launches = program(checked, piece.part, log_p)
                     self._last_code = flags_of(launches)
                     backend.run(launches)
             after(piece.part)
@@ -153,13 +153,11 @@ class PointModel(ABC):
         with self._lock, space:
             self._last_code, self._last_left_out = None, left_out
             if program is None and not on_device:
-                flat[:] = 0
+                result.flat[:] = 0
             else:
                 run_pieces(space, Piece(0, count, count), chunk_of(backend, max(items, 1), itemsize), score)
             finish(space, on_device)
-        if out is not None:
-            return out
-        return arrays.lent(poses, backend, flat, (count,), real) if on_device else arrays.like(poses, flat)
+        return result.array()
 
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
         """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.

@@ -12,6 +12,7 @@ from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import BEACON, BEACON_TERMS, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.terms import log_weight
@@ -64,7 +65,7 @@ class BeaconModel(PointModel):
         self.xy = checks.array("xy", points.reshape(0, 2) if points.shape == (0,) else points, ("M", 2)).copy()
         self.xy.flags.writeable = False
         super().__init__(backend, precision, temperature)
-        self._flags |= {"RAND"} if self.parameters.z_rand else set()
+        self._flags |= flags_if(RAND=self.parameters.z_rand)
         # Poses and beacons are placed relative to the middle of the beacons.
         middle = (self.xy.min(axis=0) / 2 + self.xy.max(axis=0) / 2) if len(self.xy) else np.zeros(2)
         self._origin = float(middle[0]), float(middle[1])

@@ -12,6 +12,7 @@ from gpusense._util import checks
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import FIELD_RING
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.models.arguments import map_words
@@ -137,7 +138,7 @@ class BumperModel(PointModel):
         points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._all_points
         start = np.concatenate([[0], np.cumsum(sizes[valid])]).astype(np.int32)
         known = states[valid].astype(np.int32)
-        flags = self._flags | (frozenset({"CAREFUL"}) if self._real == np.float32 else frozenset())
+        flags = self._flags | flags_if(CAREFUL=self._real == np.float32)
         window, space = self._window, self._workspace
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:

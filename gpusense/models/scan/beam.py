@@ -9,14 +9,14 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Selection
-from gpusense.models.arguments import check_discrete
+from gpusense.models.arguments import check_absent, check_discrete
 from gpusense.models.scan.beam_explain import title_and_omissions
 from gpusense.models.scan.beam_pipeline import BeamPipeline
-from gpusense.models.scan.classed import Beams
 from gpusense.models.scan.cones import bins_of, cones_of, require_exact
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import mixture_on_device
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.rules import Beams
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
 from gpusense.world import compat as compat_module
@@ -88,12 +88,12 @@ class BeamModel(ScanModel):
         compat: str | None = None,
         specialize: bool = True,
     ) -> None:
-        peer = compat_module.choose(compat)
+        weights = compat_module.choose(compat)
         table = parameters if isinstance(parameters, SensorTable) else None
         if table is not None:
             check_discrete(table, scanner, compat, sensor_table)
         # A table of a sensor replaces the mixture.
-        mixture = (BeamParameters() if peer is None else peer.beam) if parameters is None or table else parameters
+        mixture = weights.beam if parameters is None or table else parameters
         if not isinstance(mixture, BeamParameters):
             rule = "must be BeamParameters or a DiscreteBeamModel"
             raise TypeError(f"parameters: {rule}, got {checks.show(parameters)}")
@@ -104,19 +104,17 @@ class BeamModel(ScanModel):
             _check_incidence(incidence, parameters=parameters, sensor_table=sensor_table, compat=compat)
             mixtures, cosines = bins_of(incidence)
         compat_module.check_weights(mixture, compat)
-        if peer is not None:
-            caster = "bresenham" if caster is None else caster
-            unknown = "occupied" if unknown is None else unknown
-            outside = peer.outside if outside is None else outside
-            if sensor_table is not None:
-                raise ValueError(f"sensor_table: must be None with compat, got {checks.show(sensor_table)}")
-        method = casters.choose("caster", "exact" if caster is None else caster)
+        if weights.cubes:
+            check_absent("with compat", sensor_table=sensor_table)
+        method = casters.choose("caster", weights.caster if caster is None else caster)
         max_depends = table is not None or len({p.z_max for p in mixtures}) > 1
         super().__init__(
-            grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
+            grid, scanner, backend=backend, precision=precision,
+            unknown=weights.unknown if unknown is None else unknown,
+            outside=weights.outside if outside is None else outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize,
             z_max=max(p.z_max for p in mixtures) if table is None else 1.0, max_depends=max_depends,
-            constant_term=0.0 if peer is None else peer.constant_term,
+            constant_term=weights.constant_term,
             # Where max readings depend on the pose, the kernel finds impossible ranges.
             possible=max_depends or any(p.z_hit or p.z_short or p.z_rand for p in mixtures),
         )  # fmt: skip
@@ -232,6 +230,4 @@ def _check_incidence(incidence: object, **others: object) -> None:
     """
     if not isinstance(incidence, IncidenceParameters):
         raise TypeError(f"incidence: must be IncidenceParameters, got {checks.show(incidence)}")
-    for name, value in others.items():
-        if value is not None:
-            raise ValueError(f"{name}: must be None with incidence, got {checks.show(value)}")
+    check_absent("with incidence", **others)

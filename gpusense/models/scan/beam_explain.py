@@ -41,7 +41,7 @@ def title_and_omissions(
         weights_note: Words of the title about weights of other programs.
     """
     caster, flags, scan = pipeline.caster, last.flags, last.scan
-    scanner, real, peer = pipeline.scanner, pipeline.real.name, pipeline.setting.peer
+    scanner, real, weights = pipeline.scanner, pipeline.real.name, pipeline.setting.weights
     components = [(name, max(getattr(p, name) for p in mixtures), cost) for name, cost in _COSTS]
     omissions = scene_omissions(
         components=[] if discrete else components, mount=scanner.mount, unknown=unknown, outside=caster.outside,
@@ -62,8 +62,8 @@ def title_and_omissions(
         omissions.append(
             Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
         )
-    if peer is not None:
-        omissions.append(Omission("normalised density", f"compat='{peer.name}' sums cubes", "the likelihood"))
+    if weights.cubes:
+        omissions.append(Omission("normalised density", f"compat='{weights.name}' sums cubes", "the likelihood"))
     else:
         omissions += _mixture_omissions(pipeline, discrete=discrete)
     omissions += launch_omissions(flags, LEAST_ORDERED if pipeline.backend.info.kind == "gpu" else None)

@@ -9,6 +9,7 @@ import numpy as np
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, strands_in
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MixtureTables
@@ -22,8 +23,6 @@ from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import ray_vectors
-
-_NO_FLAGS = frozenset[str]()
 
 
 class BeamPipeline(ScanPipeline):
@@ -47,10 +46,10 @@ class BeamPipeline(ScanPipeline):
         self.rays_each = cones.rays
         # The rays of each beam, several for a cone.
         self.cone_vectors = ray_vectors(self.scanner.ray_bearings, self.scanner.mount)
-        self._fixed_flags = mixture.flags | ({"FLOAT64"} if self.real == np.float64 else _NO_FLAGS)
         # Without possible ranges there are no components, but the kernel's code needs one.
-        self._fixed_flags |= _NO_FLAGS if mixture.flags else {"RAND", "SINGLE"}
-        self._fixed_flags |= {"ALL_READINGS"} if max_evaluated or not self.specialize else _NO_FLAGS
+        self._fixed_flags = (mixture.flags or frozenset({"RAND", "SINGLE"})) | flags_if(
+            FLOAT64=self.real == np.float64, ALL_READINGS=max_evaluated or not self.specialize
+        )
         upload, cells = self.backend.upload, mixture.cells
         self._terms = upload(mixture.terms)
         self._constants = dict(
@@ -93,9 +92,8 @@ class BeamPipeline(ScanPipeline):
             start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
         # Kernels without shared rays read no first reading, but NumPy's does, of a single scan.
         first = space.upload("first", scans.first) if shared and (several or scans.shared) else self._one_each
-        flags = ({"SHARED_RAYS"} if shared else _NO_FLAGS) | ({"SCANS"} if several else _NO_FLAGS)
         return Readings(
-            scans.scans, scans.most_rays, scans.most_readings, frozenset(flags),
+            scans.scans, scans.most_rays, scans.most_readings, flags_if(SHARED_RAYS=shared, SCANS=several),
             dict(ray=uploaded["ray"], reading=uploaded["reading"], first=first, start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
             float(scans.constants[0]) + self.setting.constant_term,
@@ -123,20 +121,19 @@ class BeamPipeline(ScanPipeline):
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
         """See ScanPipeline.conditions."""
-        inside = self.specialize and all_within(placed, 0)
-        flags = self.caster.flags if inside else self.caster.flags | {"ORIGINS_OUTSIDE"}
-        if tiles is None:
-            return flags
-        flags |= {"ORDERED"} if tiles.order is not None else _NO_FLAGS
-        strands = "SHARED_RAYS" not in readings.flags and stranded(readings.rays, tiles.spread)
-        return flags | {"STRANDED"} if strands else flags
+        shared = "SHARED_RAYS" in readings.flags
+        return self.caster.flags | flags_if(
+            ORIGINS_OUTSIDE=not (self.specialize and all_within(placed, 0)),
+            ORDERED=tiles and tiles.order,
+            STRANDED=tiles and not shared and stranded(readings.rays, tiles.spread),
+        )
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """See ScanPipeline.flags."""
         flags = self._fixed_flags | self.cones.flags | conditions
         if tiled:
             return flags
-        return widened(self.backend.info.lanes, "score_beams", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
+        return widened(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend, arrays
+from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.models.scan.bound import BoundCall, DeviceCall
 from gpusense.models.scan.pipeline import ScanPipeline
@@ -68,7 +69,7 @@ def bind(
 
 def _host_task(pipeline: ScanPipeline) -> str:
     """Return the preparation of a scan that only the host can do; empty where the device can do all of it."""
-    if pipeline.setting.peer is not None:
+    if pipeline.setting.weights.cubes:
         return "the host classes the readings for another program's weights"
     if not pipeline.backend.info.float64:
         return "the host places the poses, as the device has no float64"
@@ -95,12 +96,8 @@ class _HostCall(BoundCall):
             arrays.adopt_readings(ranges, backend, beams, in_place=False)
         else:
             _shape_of("ranges", ranges, (beams,))
-        arrays.check_out(out, (count,), real, poses, backend)
-        if out is None and arrays.on_device(poses):
-            out = arrays.lent(poses, backend, arrays.blank(backend, count, real), (count,), real)
-        elif out is None:
-            out = arrays.like(poses, np.empty(count, real))
-        self.out, self.pipeline, self.arrays, self._score = out, pipeline, (poses, ranges), score
+        self.out = Result(poses, out, (count,), real, backend).array()
+        self.pipeline, self.arrays, self._score = pipeline, (poses, ranges), score
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""

@@ -17,6 +17,7 @@ import numpy as np
 from gpusense.backends import arrays
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.recording import Recording
+from gpusense.backends.results import Result
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
@@ -109,9 +110,8 @@ class DeviceCall(BoundCall):
         self._poses = Poses(poses, backend, in_place=True)
         count = self._poses.count
         adopted = arrays.adopt_readings(ranges, backend, pipeline.scanner.count, in_place=True)
-        log_p = arrays.check_out(out, (count,), real, poses, backend)
-        self._log_p = arrays.blank(backend, count, real) if log_p is None else log_p
-        self.out = arrays.lent(poses, backend, self._log_p, (count,), real) if out is None else out
+        result = Result(poses, out, (count,), real, backend)
+        self._log_p, self.out = result.flat, result.array()
         # The owners of the memory that is read and written.
         self._owners = (poses, ranges, adopted, self.out)
         # Private buffers: other calls of the model may come between.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,32 +17,6 @@ from gpusense.world.frames import Mount, ray_vectors
 from gpusense.world.grid import OccupancyGrid
 
 _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class CasterMethod:
-    """A method for expected ranges.
-
-    Attributes:
-        name: Value of ``caster=``.
-        error: ``"exact"``, or the bound of its error.
-        memory: Bytes on the device.
-        precomputation: Table computed from the map beforehand.
-        backends: Backends that have it.
-        knobs: Parameters on which its error and its time depend; arguments of the class in ``gpusense.casters``.
-
-    Example:
-        >>> import gpusense as gs
-        >>> [method.name for method in gs.RayCaster.methods()]
-        ['exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup']
-    """
-
-    name: str
-    error: str
-    memory: str
-    precomputation: str
-    backends: tuple[str, ...]
-    knobs: str
 
 
 class RayCaster:
@@ -107,13 +80,15 @@ class RayCaster:
         )
 
     @staticmethod
-    def methods() -> tuple[CasterMethod, ...]:
-        """Return the available methods, with their error, memory, precomputation, backends and knobs."""
-        everywhere = ("numpy", "opencl", "warp")
-        return tuple(
-            CasterMethod(kind.name, kind.error, kind.memory, kind.precomputation, everywhere, kind.knobs)
-            for kind in casters.CASTERS.values()
-        )
+    def methods() -> tuple[type[Caster], ...]:
+        """Return the classes of ``gs.casters``: name, error, memory, precomputation, backends and knobs of each.
+
+        Example:
+            >>> import gpusense as gs
+            >>> [method.name for method in gs.RayCaster.methods()]
+            ['exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup']
+        """
+        return tuple(casters.CASTERS.values())
 
     @property
     def method(self) -> Caster:

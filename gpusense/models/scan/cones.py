@@ -9,6 +9,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface import structs
+from gpusense.interface.flags import flags_if
 from gpusense.tables.casters import Caster
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Scanner
@@ -39,9 +40,8 @@ class Cones:
     @property
     def flags(self) -> frozenset[str]:
         """The kernels' flags."""
-        if self.incidence or self.critical > 0:
-            return frozenset({"ECHO", "INCIDENCE"})
-        return frozenset({"ECHO"} if self.rays > 1 else ())
+        incidence = self.incidence or self.critical > 0
+        return flags_if(ECHO=incidence or self.rays > 1, INCIDENCE=incidence)
 
     def words(self, critical: float | None) -> str:
         """Return the words of a plan's title; ``critical`` is the largest angle that returns [rad]."""

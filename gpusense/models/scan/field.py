@@ -6,9 +6,9 @@ from gpusense._util import checks
 from gpusense.backends import Selection
 from gpusense.interface.plan import Omission, launch_omissions, scene_omissions
 from gpusense.interface.terms import HIGH_PEAK
-from gpusense.models.scan.classed import Beams
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.rules import Beams
 from gpusense.world import compat as compat_module
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
@@ -64,18 +64,17 @@ class LikelihoodFieldModel(ScanModel):
         compat: str | None = None,
         specialize: bool = True,
     ) -> None:
-        peer = compat_module.choose(compat)
-        default = LikelihoodFieldParameters() if peer is None else peer.field
-        self.parameters = default if parameters is None else parameters
+        weights = compat_module.choose(compat)
+        self.parameters = weights.field if parameters is None else parameters
         if not isinstance(self.parameters, LikelihoodFieldParameters):
             raise TypeError(f"parameters: must be LikelihoodFieldParameters, got {checks.show(parameters)}")
         compat_module.check_weights(self.parameters, compat)
-        if peer is not None:
+        if weights.cubes:
             checks.choice("interpolation", self.parameters.interpolation, ("nearest",))
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
             temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
-            max_depends=False, constant_term=0.0 if peer is None else 1.0,
+            max_depends=False, constant_term=weights.field_constant,
             possible=self.parameters.z_hit > 0 or self.parameters.z_rand > 0,
         )  # fmt: skip
         self._field_pipeline = FieldPipeline(

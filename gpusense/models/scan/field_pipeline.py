@@ -10,6 +10,7 @@ import numpy as np
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
@@ -28,7 +29,6 @@ from gpusense.world.parameters import LikelihoodFieldParameters
 _GROUP = 64
 # Distance from a cell's edge below which an end point is computed with more digits, in eps times its length + 2 cells.
 _GUARD = 3.25
-_NO_FLAGS, _INSIDE = frozenset[str](), frozenset({"INSIDE"})
 
 
 class FieldPipeline(ScanPipeline):
@@ -54,7 +54,7 @@ class FieldPipeline(ScanPipeline):
         outside: str,
     ) -> None:
         super().__init__(setting, grid)
-        bilinear, compat = parameters.interpolation == "bilinear", setting.peer is not None
+        bilinear, compat = parameters.interpolation == "bilinear", setting.weights.cubes
         self.log_table = (self.specialize or compat) and not bilinear
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
@@ -64,7 +64,7 @@ class FieldPipeline(ScanPipeline):
         range_max = self.scanner.range_max
         self.table = FieldTable(
             self.real, parameters, grid.resolution, range_max, outside=outside,
-            compat=None if setting.peer is None else setting.peer.name, log_table=self.log_table, flags=self.components,
+            compat=setting.weights.name, log_table=self.log_table, flags=self.components,
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(
@@ -87,24 +87,22 @@ class FieldPipeline(ScanPipeline):
     ) -> tuple[frozenset[str], np.ndarray]:
         """Return flags of the mixture, and the numbers of the kernel file ``field``."""
         range_max, everything = self.scanner.range_max, not self.specialize
-        flags = {"FLOAT64"} if self.real == np.float64 else {"CAREFUL"}
-        flags |= {"ALL_READINGS"} if everything else set()
-        flags |= {"BILINEAR"} if bilinear else set()
-        flags |= {"LOG_TABLE"} if self.log_table else set()
-        flags |= {"CUBES"} if cubes else set()
-        flags |= {"HIT"} if p.z_hit > 0 or everything else set()
         rand = p.z_rand / range_max
+        # 0 where z_hit is.
         peak = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-        if not self.log_table and ((p.z_hit > 0 and peak > HIGH_PEAK) or everything):
-            flags.add("SHARP")
-        if sums_linearly(rand, peak, self.real):
-            flags.add("LINEAR")
+        linear = sums_linearly(rand, peak, self.real)
+        flags = flags_if(
+            FLOAT64=not self.careful, CAREFUL=self.careful, ALL_READINGS=everything, BILINEAR=bilinear,
+            LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=linear,
+            SHARP=not self.log_table and (peak > HIGH_PEAK or everything),
+        )  # fmt: skip
+        if linear:
             head = (peak, rand)
         else:
             log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
             head = (log_scale, log_weight(p.z_rand) - math.log(range_max))
         terms = [head[0], 0.5 / p.sigma_hit / p.sigma_hit, head[1], log_weight(p.z_max)]
-        return frozenset(flags), rounded_terms(terms, self.real)
+        return flags, rounded_terms(terms, self.real)
 
     # ---- readings
 
@@ -133,7 +131,7 @@ class FieldPipeline(ScanPipeline):
             begins = np.append(0, np.cumsum(scans.counts))
             start, counts = space.upload_all("scans", [begins.astype(np.int32), blocks.astype(np.int32)])
         return Readings(
-            scans.scans, scans.most_rays, scans.most_readings, frozenset({"SCANS"} if several else ()),
+            scans.scans, scans.most_rays, scans.most_readings, flags_if(SCANS=several),
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
             float(scans.constants[0]) + self.setting.constant_term,
@@ -170,16 +168,14 @@ class FieldPipeline(ScanPipeline):
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
         """See ScanPipeline.conditions."""
-        inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
-        return _INSIDE if inside else _NO_FLAGS
+        return flags_if(INSIDE=tiles and self.quick and all_within(placed, readings.reach, RING))
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """See ScanPipeline.flags."""
         flags = self.components | conditions
-        if tiled:
-            return flags | ({"QUICK"} if self.quick else _NO_FLAGS)
-        flags = widened(self.backend.info.lanes, "score_field", flags | ({"PER_BEAM"} if per_beam else _NO_FLAGS))
-        return flags | {"QUICK"} if self.quick and self.backend.info.vector_loops else flags
+        if not tiled:
+            flags = widened(self.backend.info.lanes, "score_field", flags | flags_if(PER_BEAM=per_beam))
+        return flags | flags_if(QUICK=self.quick and (tiled or self.backend.info.vector_loops))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.backends import Backend, arrays
+from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
@@ -67,11 +69,11 @@ class MapCaster:
         self.map = ReachableMap(
             backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._refresh
         )
-        self._fixed_flags = frozenset({"OUTSIDE_OCCUPIED"} if outside == "occupied" else ())
-        self._fixed_flags |= {method.entry.flag} if method.entry.flag else set()
+        # The exact caster has no flag.
+        self._fixed_flags = flags_if(OUTSIDE_OCCUPIED=outside == "occupied", **{method.entry.flag: method.entry.flag})
         # Include the table's flags once it is made.
         self.flags = self._fixed_flags
-        self._wide = {"FLOAT64"} if real == np.float64 else set()
+        self._precision_flags = flags_if(FLOAT64=real == np.float64)
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
         self._lock = threading.Lock()
@@ -152,28 +154,17 @@ class MapCaster:
             (N, K) expected ranges, or angles of incidence.
         """
         checked, rays = Poses(poses, self.backend), len(vectors)
-        shape = checked.count, rays
-        target: Any = arrays.check_out(out, shape, self.real, poses, self.backend)
-        if checked.on_device:
-            target = arrays.blank(self.backend, checked.count * rays, self.real) if target is None else target
-            flat = target
-        else:
-            target = np.empty(shape, self.real) if target is None else target
-            flat = target.reshape(-1)
+        result = Result(poses, out, (checked.count, rays), self.real, self.backend)
         if checked.count * rays:
             with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
                 chunk = chunk_of(self.backend, rays * cones.rays, self.real.itemsize)
                 run_pieces(
                     self._workspace, Piece(0, checked.count, checked.count), chunk,
-                    lambda piece: self._cast(checked, piece, ray, rays, flat, cones),
+                    lambda piece: self._cast(checked, piece, ray, rays, result.flat, cones),
                 )  # fmt: skip
                 finish(self._workspace, checked.on_device)
-        if out is not None:
-            return out
-        if checked.on_device:
-            return arrays.lent(poses, self.backend, target, shape, self.real)
-        return arrays.like(poses, target)
+        return result.array()
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         """Start to cast the rays of a piece."""
@@ -189,8 +180,7 @@ class MapCaster:
     ) -> Program:
         """Return the launches that cast the rays of placed poses."""
         space, window, count = self._workspace, placed.frame.window, placed.count
-        flags = self.flags | self._wide | cones.flags
-        flags |= set() if all_within(placed, 0) else {"ORIGINS_OUTSIDE"}
+        flags = self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
         common = dict(
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=window, particles=count,
             rays=rays, caster=self.method.struct(), scale=self.scale,
@@ -205,7 +195,7 @@ class MapCaster:
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         if self.backend.info.kind == "gpu":
             order = order_of(space, placed, rays, self.real)
-            flags |= {"ORDERED"} if order is not None else set()
+            flags |= flags_if(ORDERED=order is not None)
             items, spread = tiles_of(count, rays)
             places = placed.cell if order is None else order.order
             tiles = launch("cast_tiles", flags, (items,), **common, ranges=result, order=places, spread=spread)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.interface.flags import flags_if
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable
@@ -79,7 +80,7 @@ def mixture_on_device(
     if table is not None:
         values = table.sensor_table(real)
         # Sums of finite numbers need no check for impossible readings.
-        flags = frozenset({"SENSOR_TABLE", "LINEAR"} if np.isfinite(values).all() else {"SENSOR_TABLE"})
+        flags = flags_if(SENSOR_TABLE=True, LINEAR=np.isfinite(values).all())
         return Mixture(flags, terms, cosines, values)
     if width is None:
         return Mixture(flags, terms, cosines)
@@ -95,21 +96,19 @@ def mixture_of(
     Raises:
         ValueError: a number is beyond what the precision can hold.
     """
-    weights = {name: max(getattr(p, f"z_{name.lower()}") for p in kinds) for name in ("HIT", "SHORT", "RAND")}
-    flags = {name for name, weight in weights.items() if weight > 0 or not specialize}
+    hit, short, rand = (max(getattr(p, name) for p in kinds) > 0 for name in ("z_hit", "z_short", "z_rand"))
     # If no range is possible at any angle, a component must evaluate to -inf.
-    flags |= {"RAND"} if max_depends and not flags else set()
-    peaks = [_peak(p) for p in kinds]
-    if specialize and len(flags) == 1:
-        flags.add("SINGLE")
-    if max(peaks) > HIGH_PEAK or not specialize:
-        flags.add("SHARP")
-    if all(
+    rand |= max_depends and not (hit or short)
+    peaks, everything = [_peak(p) for p in kinds], not specialize
+    linear = all(
         sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), real)
         for p, peak in zip(kinds, peaks, strict=True)
-    ):
-        flags.add("LINEAR")
-    return frozenset(flags), np.concatenate([_terms(p, range_max, real, "LINEAR" in flags) for p in kinds])
+    )
+    flags = flags_if(
+        HIT=hit or everything, SHORT=short or everything, RAND=rand or everything,
+        SINGLE=specialize and hit + short + rand == 1, SHARP=max(peaks) > HIGH_PEAK or everything, LINEAR=linear,
+    )  # fmt: skip
+    return flags, np.concatenate([_terms(p, range_max, real, linear) for p in kinds])
 
 
 def peer_mixture(
@@ -120,10 +119,10 @@ def peer_mixture(
     Raises:
         ValueError: a number is beyond what the precision can hold.
     """
-    flags = {"HIT", "SHORT", "RAND", "LINEAR", "CUBES"} | ({"AMCL"} if amcl else set())
+    flags = frozenset({"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}) | flags_if(AMCL=amcl)
     hit = p.z_hit if amcl else _peak(p)
     terms = [hit, *_shape(p), p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
-    return frozenset(flags), rounded_terms(terms, real)
+    return flags, rounded_terms(terms, real)
 
 
 def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype) -> np.ndarray:

@@ -17,9 +17,9 @@ from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
-from gpusense.models.scan.classed import Beams, Rules, check_beams
 from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
+from gpusense.models.scan.rules import Beams, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world import compat as compat_module
 from gpusense.world.frames import ray_vectors
@@ -52,7 +52,7 @@ class ScanModel(ABC):
             raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         self._first_grid = check_scene(grid, scanner.range_max)
         self.scanner = scanner
-        peer = compat_module.choose(compat)
+        weights = compat_module.choose(compat)
         self.compat = compat
         self.unknown = checks.choice("unknown", "free" if unknown is None else unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", "free" if outside is None else outside, ("free", "occupied"))
@@ -62,12 +62,12 @@ class ScanModel(ABC):
             raise TypeError(f"specialize: must be True or False, got {checks.show(specialize)}")
         device = get_backend(backend)
         rules = Rules(
-            scanner, ray_vectors(scanner.bearings, scanner.mount), z_max if peer is None else 0.0, self.beams,
-            specialize, max_is_range=peer is not None, max_depends=max_depends,
+            scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.cubes else z_max, self.beams,
+            specialize, max_is_range=weights.cubes, max_depends=max_depends,
         )  # fmt: skip
         self._setting = Setting(
-            device, real_dtype(precision, device), rules, peer, self.temperature, constant_term,
-            possible or peer is not None,
+            device, real_dtype(precision, device), rules, weights, self.temperature, constant_term,
+            possible or weights.cubes,
         )  # fmt: skip
         self._workspace = Workspace(device)
         # Threads may share a model: its buffers serve one call at a time.
@@ -75,10 +75,7 @@ class ScanModel(ABC):
         self._last = LastCall()
 
     def __repr__(self) -> str:
-        count, beams = self.scanner.count, self.beams
-        used = (
-            count if beams is None else min(int(beams), count) if isinstance(beams, (int, np.integer)) else len(beams)
-        )
+        count, used = self.scanner.count, self._setting.rules.choice.most
         parts = [
             map_words(self.grid),
             f"beams={count}" if used == count else f"beams={used} of {count}",
@@ -159,7 +156,7 @@ class ScanModel(ABC):
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)
             finish(self._workspace, request.poses.on_device)
-        log_p = request.result(self._setting.backend)
+        log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p
 
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:

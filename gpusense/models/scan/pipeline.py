@@ -21,12 +21,13 @@ from gpusense.interface.launches import Program
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
 from gpusense.models.run import Piece, chunk_of
-from gpusense.models.scan.classed import ClassedScans, Rules, class_scans
+from gpusense.models.scan.classed import ClassedScans, class_scans
 from gpusense.models.scan.readings import Readings, Sensing, placing_launches
 from gpusense.models.scan.request import Request
+from gpusense.models.scan.rules import Rules
 from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
-from gpusense.world.compat import Peer
+from gpusense.world.compat import Likelihood
 from gpusense.world.grid import OccupancyGrid
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
@@ -42,7 +43,7 @@ class Setting:
         backend: The device.
         real: Precision.
         rules: How readings are classed; they hold the scanner.
-        peer: The program whose weights are reproduced; None for likelihoods.
+        weights: The book's likelihood, or the program whose weights are reproduced.
         temperature: Multiplies the sum over readings.
         constant_term: The first term of that sum.
         possible: Whether some range is possible at some pose.
@@ -51,7 +52,7 @@ class Setting:
     backend: Backend
     real: np.dtype
     rules: Rules
-    peer: Peer | None
+    weights: Likelihood
     temperature: float
     constant_term: float
     possible: bool
@@ -196,16 +197,13 @@ class ScanPipeline(ABC):
 
     def classed(self, ranges: np.ndarray) -> ClassedScans:
         """Class, choose and group the readings of (S, K) scans."""
-        if self.setting.peer is not None:
-            ranges = self.setting.peer.readings(ranges, self.scanner, self.end_points)
-        return class_scans(ranges, self.rules)
+        return class_scans(self.setting.weights.readings(ranges, self.scanner, self.end_points), self.rules)
 
     def value(self, scans: ClassedScans) -> float | None:
         """Return the log-likelihood of scans where it is the same at every pose, None elsewhere."""
         if not len(scans.readings):
-            with np.errstate(divide="ignore"):
-                constant = scans.constants[0] if self.setting.peer is None else np.log(self.setting.constant_term)
-                return float(self.setting.temperature * constant)
+            constant = self.setting.weights.without_readings(scans.constants[0], self.setting.constant_term)
+            return float(self.setting.temperature * constant)
         if not self.setting.possible and np.isfinite(scans.readings).any():
             return -np.inf
         return None

@@ -11,14 +11,14 @@ import numpy as np
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
-from gpusense.models.scan.classed import Beams
+from gpusense.models.scan.rules import BeamChoice, Beams
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
-_NO_FLAGS = frozenset[str]()
 # The kernel places readings by whole groups of work-items, so that those of poses begin with a group.
 _GROUP = 64
 
@@ -56,7 +56,7 @@ class Readings:
     @property
     def sum_flags(self) -> frozenset[str]:
         """Flags of ``sum_parts``."""
-        return frozenset({"SCANS"}) if self.constants_there else _NO_FLAGS
+        return flags_if(SCANS=self.constants_there)
 
 
 @dataclass(frozen=True)
@@ -103,19 +103,19 @@ class Sensing:
     real: np.dtype
 
     @property
+    def choice(self) -> BeamChoice:
+        """The beams that are used."""
+        return BeamChoice.of(self.beams, self.scanner.count)
+
+    @property
     def columns(self) -> np.ndarray:
         """Beams whose readings are read."""
-        every = np.arange(self.scanner.count)
-        if self.beams is None or isinstance(self.beams, (int, np.integer)):
-            return every
-        return every[np.asarray(self.beams, np.intp)]
+        return self.choice.columns
 
     @property
     def places(self) -> int:
         """Places of readings; those at the end may be missing (nan)."""
-        count = len(self.columns)
-        chosen = min(int(self.beams), count) if isinstance(self.beams, (int, np.integer)) else count
-        return chosen if self.specialize else count
+        return self.choice.most if self.specialize else len(self.choice.columns)
 
     @property
     def max_readings(self) -> int:
@@ -163,13 +163,12 @@ def device_readings(
         guard=space.empty("guard", -(-places // BLOCK_TERMS) if end_points else 1, real),
         constant_term=space.empty("constant_term", 1, real),
     )
-    flags = {"END_POINTS"} if end_points else set()
-    flags |= {"FLOAT64"} if real == np.float64 else set()
-    flags |= set() if sensing.specialize else {"ALL_READINGS"}
-    flags |= {"RANGES_FLOAT32"} if dtype == np.float32 else set()
-    flags |= set() if np.array_equal(columns, np.arange(sensing.scanner.count)) else {"SOME_BEAMS"}
+    flags = flags_if(
+        END_POINTS=end_points, FLOAT64=real == np.float64, ALL_READINGS=not sensing.specialize,
+        RANGES_FLOAT32=dtype == np.float32, SOME_BEAMS=len(columns) < sensing.scanner.count,
+    )  # fmt: skip
     nearest, farthest = sensing.limits(limits)
-    chosen = min(int(sensing.beams), len(columns)) if isinstance(sensing.beams, (int, np.integer)) else len(columns)
+    chosen = sensing.choice.most
     kind = sensing.max_readings
     arguments = dict(
         filled, ranges=ranges, beam=space.upload("beam", columns.astype(_INT)),
@@ -179,7 +178,7 @@ def device_readings(
             sensing.guard_scale, len(columns), each, places, chosen, kind, int(sensing.possible),
         ),
     )  # fmt: skip
-    return Placing(frozenset(flags), arguments), filled
+    return Placing(flags, arguments), filled
 
 
 def placing_launches(placed: PlacedPoses, placing: Placing | None) -> Program:

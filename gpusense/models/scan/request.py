@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import MutableMapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend, arrays
+from gpusense.backends.results import Result
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.world.scanner import Scanner
@@ -24,21 +24,17 @@ class Request:
     """S scans of N poses each.
 
     Attributes:
-        array: The poses as the user passed them, which determine the library of the result.
-        out: The array for the result as the user passed it, or None.
         ranges: (S, K) readings [m].
         poses: The S N poses, one scan after the other.
         shape: Shape of the result, (N,) or (S, N).
-        log_p: Flat memory of the result: a NumPy array, or a buffer on the device.
+        result: Memory of the result.
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
     """
 
-    array: Any
-    out: Any
     ranges: np.ndarray
     poses: Poses
     shape: tuple[int, ...]
-    log_p: Any
+    result: Result
     parts: np.ndarray
 
     @property
@@ -55,14 +51,6 @@ class Request:
     def per_beam(self) -> bool:
         """Whether the log-likelihoods of the readings are requested."""
         return self.parts.shape[-1] > 0
-
-    def result(self, backend: Backend) -> Any:
-        """Return the log-likelihoods in the library of the poses."""
-        if self.out is not None:
-            return self.out
-        if self.poses.on_device:
-            return arrays.lent(self.array, backend, self.log_p, self.shape, self.parts.dtype)
-        return arrays.like(self.array, self.log_p.reshape(self.shape))
 
     def result_parts(self) -> np.ndarray:
         """Return the log-likelihoods of the readings, (N, K) or (S, N, K)."""
@@ -96,24 +84,18 @@ def make_request(
         TypeError, ValueError: an argument breaks its rule.
     """
     readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
-    scans = None if readings.ndim == 1 else len(readings)
-    checked = None if known is None else known.get(scans)
-    if checked is None:
-        checked = Poses(poses, backend) if scans is None else _poses_of_scans(poses, scans, backend)
-        if known is not None:
-            known[scans] = checked
-    shape: tuple[int, ...] = (checked.count,)
-    if scans is None:
-        readings = readings[None]
+    known = {} if known is None else known
+    shape: tuple[int, ...]
+    if readings.ndim == 1:
+        checked = known[None] = known.get(None) or Poses(poses, backend)
+        readings, shape = readings[None], (checked.count,)
     else:
+        scans = len(readings)
+        checked = known[scans] = known.get(scans) or _poses_of_scans(poses, scans, backend)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
-    log_p = arrays.check_out(out, shape, real, poses, backend)
-    if checked.on_device:
-        log_p = arrays.blank(backend, math.prod(shape), real) if log_p is None else log_p
-    else:
-        log_p = (np.empty(shape, real) if log_p is None else log_p).reshape(-1)
+    result = Result(poses, out, shape, real, backend)
     parts = np.zeros((len(readings), shape[-1], scanner.count if per_beam else 0), real)
-    return Request(poses, out, readings, checked, shape, log_p, parts)
+    return Request(readings, checked, shape, result, parts)
 
 
 def _poses_of_scans(poses: Any, scans: int, backend: Backend) -> Poses:

@@ -82,7 +82,7 @@ class _Scorer:
         """Score a piece; log-likelihoods of readings are complete on return."""
         pipeline, request, space = self._pipeline, self._request, self._space
         placed, table = pipeline.place(request.poses, piece.part, space)
-        with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
+        with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
             key = (scoring.flags, placed.key, readings.key)
             flags = space.run(
@@ -105,10 +105,10 @@ class _Scorer:
             frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)
             placed = place(request.poses, piece.part, frame, pipeline.backend, space, pipeline.real)
             pipeline.backend.run(placed.launches())
-            with space.result("log_p", request.log_p, piece.begin, piece.count, pipeline.real) as log_p:
+            with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
                 pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
         else:
-            request.log_p[piece.begin : piece.end] = value
+            request.result.flat[piece.begin : piece.end] = value
         if request.per_beam:
             rows, finite = self._rows(piece), np.isfinite(scans.readings)
             rows[:, scans.columns[finite]] = -np.inf

@@ -69,7 +69,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
             model._workspace.start()
         on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])
-    return [request.result(model._setting.backend) for model, request in zip(chosen, requests, strict=True)]
+    return [request.result.array() for request in requests]
 
 
 def _checked(models: object) -> list[ScanModel]:

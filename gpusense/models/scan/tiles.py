@@ -10,6 +10,7 @@ import numpy as np
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import ALL_BINS, BLOCK_TERMS, STRETCH, TILE, TILE_PARTICLES, TILE_RAYS
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.models.poses import PlacedPoses
 from gpusense.world.windows import extent
@@ -73,7 +74,7 @@ def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -
     return Order(
         placed, space.upload("bounds", _UNBOUNDED), space.empty("bins", ALL_BINS, _INT),
         space.empty("bin_of", count, _INT), space.empty("order", count, _INT),
-        frozenset({"FLOAT64"} if real == np.float64 else ()),
+        flags_if(FLOAT64=real == np.float64),
     )  # fmt: skip
 
 

@@ -16,7 +16,8 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import run
 from gpusense.models.scan import pipeline
-from gpusense.models.scan.classed import ClassedScans, LeftOut, Rules, _join, class_scans
+from gpusense.models.scan.classed import ClassedScans, LeftOut, _join, class_scans
+from gpusense.models.scan.rules import Rules
 
 BEAMS, RANGE = 37, 5.0
 RNG = np.random.default_rng(5)

@@ -1,0 +1,126 @@
+"""Rules for the readings of a scan: the beams that are used, and the classes of readings that are evaluated."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._util.checks import integer, show
+from gpusense.world.scanner import Reading, Scanner
+
+Beams = int | Sequence[int] | np.ndarray | None
+
+
+@dataclass(frozen=True)
+class BeamChoice:
+    """The beams that ``beams=`` chooses.
+
+    Attributes:
+        columns: Beams that may be used.
+        most: Readings of them that are used at most; of more an even choice.
+        every: Whether all beams are used.
+    """
+
+    columns: np.ndarray
+    most: int
+    every: bool
+
+    @staticmethod
+    def of(beams: Beams, count: int) -> BeamChoice:
+        """Return the choice for a scanner of ``count`` beams."""
+        if beams is None or isinstance(beams, (int, np.integer)):
+            most = count if beams is None else min(int(beams), count)
+            return BeamChoice(np.arange(count), most, most == count)
+        columns = np.asarray(beams, np.intp)
+        return BeamChoice(columns, len(columns), False)
+
+    def used(self, informative: np.ndarray) -> np.ndarray:
+        """Return which of the informative readings of a scan are used."""
+        places = self.columns[informative[self.columns]]
+        if len(places) > self.most:
+            places = places[(np.arange(self.most) * len(places)) // max(self.most, 1)]
+        used = np.zeros(len(informative), bool)
+        used[places] = True
+        return used
+
+    def among(self, hit: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return which of the ranges and of the informative max readings of (S, K) scans are used."""
+        if self.every:
+            return hit, far
+        used = np.array([self.used(each) for each in hit | far])
+        return hit & used, far & used
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Rules by which readings are classed, thinned and grouped.
+
+    Attributes:
+        scanner: The scanner's geometry.
+        vectors: (K, 2) float64 cosines and sines of the bearings, the mount's yaw included.
+        z_max: Probability of a max reading; 0 makes it missing.
+        beams: The beams that are used.
+        specialize: False keeps readings without information, and casts equal bearings one by one.
+        max_is_range: Evaluate finite max readings like ranges, at range_max.
+        max_depends: The probability of a max reading depends on the pose, so such readings are evaluated.
+    """
+
+    scanner: Scanner
+    vectors: np.ndarray
+    z_max: float
+    beams: Beams
+    specialize: bool
+    max_is_range: bool = False
+    max_depends: bool = False
+
+    @functools.cached_property
+    def choice(self) -> BeamChoice:
+        """The beams that are used."""
+        return BeamChoice.of(self.beams, self.scanner.count)
+
+    @functools.cached_property
+    def separate(self) -> bool:
+        """Whether each reading has a separate ray: no bearings are the same, or equal ones are cast one by one."""
+        return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)
+
+    @property
+    def max_is_constant(self) -> bool:
+        """Whether max readings add a constant term, and are not evaluated."""
+        return self.specialize and not self.max_depends
+
+    @functools.cached_property
+    def log_max(self) -> float:
+        """Log of the probability of a max reading that counts; 0 where none does."""
+        return float(np.log(self.z_max)) if self.z_max > 0 else 0.0
+
+
+def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:
+    """Return whether each reading is used: all, an even choice of ``beams`` informative ones, or those of indices."""
+    informative = (kinds == Reading.HIT) | ((kinds == Reading.MAX) & informative_max)
+    return BeamChoice.of(beams, len(kinds)).used(informative)
+
+
+def check_beams(beams: Beams, count: int) -> Beams:
+    """Validate ``beams=`` for a scanner of ``count`` beams.
+
+    Raises:
+        ValueError: a number below 0, or an index outside the scan.
+        TypeError: not an integer or a list of them.
+    """
+    if beams is None:
+        return None
+    if isinstance(beams, (int, np.integer)):
+        return integer("beams", beams, low=0)
+    try:
+        indices = np.asarray(beams)
+    except ValueError:
+        indices = np.empty((0, 0))
+    if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
+        raise TypeError(f"beams: must be a number of beams or a list of beam indices, got {show(beams)}")
+    outside = (indices < 0) | (indices >= count)
+    if outside.any():
+        raise ValueError(f"beams: indices must be in [0, {count}), got {indices[outside][0]}")
+    return np.unique(indices)

@@ -708,7 +708,7 @@ def act_tables(case: Case) -> Outcome:
     """Make tables of a map."""
     rng, grid = case.rng, draw_grid(case.rng, 2.3)
     kinds: list[Any] = ["free", "occupied"]
-    yield "distances", gs.distance_transform(grid.occupied, backend=case.device.backend)
+    yield "distances", gs.distance_transform(grid.occupied, squared=True, backend=case.device.backend)
     if rng.random() < 0.5:
         yield "normals", gs.surface_normals(grid, unknown=rng.choice(kinds), outside=rng.choice(kinds))
     ranges, world = rng.uniform(-1, 12, 50), case.world

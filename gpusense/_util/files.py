@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,8 +63,35 @@ def _fresh(path: Path) -> Iterator[BinaryIO]:
         fresh.unlink(missing_ok=True)
 
 
+@functools.cache
+def _loader() -> Any:
+    """Return PyYAML's safe loader with decimal numbers.
+
+    YAML 1.1 reads 010 as octal and 1:30 as sexagesimal. ROS reads both with yaml-cpp, by YAML 1.2: ten, and no number.
+    """
+    import yaml
+
+    class DecimalLoader(yaml.SafeLoader):
+        pass
+
+    def decimal(loader: Any, node: Any) -> Any:
+        text = loader.construct_scalar(node)
+        if ":" in text:
+            return text
+        if re.fullmatch("[-+]?0[0-9_]+", text):
+            return int(text.replace("_", ""))
+        construct = "construct_yaml_float" if node.tag.endswith("float") else "construct_yaml_int"
+        return getattr(loader, construct)(node)
+
+    # PyYAML takes 08 as text.
+    DecimalLoader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile("[-+]?0[0-9_]+$"), list("-+0"))
+    for kind in ("int", "float"):
+        DecimalLoader.add_constructor(f"tag:yaml.org,2002:{kind}", decimal)
+    return DecimalLoader
+
+
 def read_mapping(file: Path) -> dict[Any, Any]:
-    """Read the mapping in a YAML file of plain values.
+    """Read the mapping in a YAML file of plain values; numbers are decimal.
 
     Raises:
         ValueError: The file is too large, is not plain YAML, or holds no mapping.
@@ -74,7 +103,7 @@ def read_mapping(file: Path) -> dict[Any, Any]:
     if len(text) > _LARGEST_YAML_BYTES:
         raise ValueError(f"{file}: must be a YAML file of at most {_LARGEST_YAML_BYTES} bytes, got a larger file")
     try:
-        data = yaml.safe_load(text)
+        data = yaml.load(text, _loader())
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         problem = getattr(error, "problem", None) or type(error).__name__
         mark = getattr(error, "problem_mark", None)

@@ -81,8 +81,9 @@ class Workspace:
 
     def abandon(self) -> None:
         """Drop the non-finite flag after an error: the next call has a cleared one."""
-        if self._buffers.pop(POSE_STATUS, None) is not None:
+        if POSE_STATUS in self._buffers:
             self._forget()
+            del self._buffers[POSE_STATUS]
 
     def start(self) -> None:
         """Start the gathered work of the call."""
@@ -105,8 +106,9 @@ class Workspace:
         backend = self._backend
         records = backend.info.graphs and backend.gathers
         if version != self._version:
-            self._version = version
+            # In this order: an interrupt in between must not leave programs of the old table.
             self._programs.clear()
+            self._version = version
         if records:
             # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
             key = (key, *map(self._identity, changing.values()))

@@ -167,7 +167,7 @@ def _tables(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     """Compute the map's tables, and compare the distance transform with SciPy's."""
     name, obstacles = backend.info.selection, scene.grid.obstacles()
     rows, cols = obstacles.shape
-    squared, exact = distance_transform(obstacles, backend=backend), TOLERANCES["distance transform"]
+    squared, exact = distance_transform(obstacles, squared=True, backend=backend), TOLERANCES["distance transform"]
     planes = backend.download(empty_rectangles(backend, obstacles, 1), np.empty(4 * (rows + 2) * (cols + 2), np.uint16))
     sides = np.minimum(planes & 255, planes >> 8)
     results: Results = {exact.name: (squared, exact), "empty squares": (sides, TOLERANCES["empty squares"])}

@@ -7,6 +7,7 @@ underflows to 0 nor overflows. Cumulative sums for resampling are integers and t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -76,26 +77,30 @@ def normalize_weights(log_p: object) -> Weights:
     return Weights(weights, largest + float(np.log(total / count)), 1.0 / float(np.sum(weights * weights)), False)
 
 
-def resample(weights: object, count: int, rng: np.random.Generator) -> np.ndarray:
+def resample(weights: object, count: int, rng: Any = None) -> np.ndarray:
     """Draw a new set of particles by systematic resampling (book table 4.4, the low-variance sampler).
 
     Args:
         weights: (N,) weights >= 0 with a positive sum, N > 0; they need not sum to 1.
         count: Number of new particles, >= 0.
-        rng: Random generator, from which one number is drawn.
+        rng: Random generator, from which one number is drawn: a Generator or RandomState of NumPy, or any seed that
+            ``numpy.random.default_rng`` takes. None draws fresh numbers from the system.
 
     Returns:
         (count,) int64 indices in ascending order; particle i appears ``floor`` or ``ceil`` of ``count * w_i`` times.
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: A weight is negative or not finite, or the sum is 0.
+        ValueError: A weight is negative or not finite, the sum is 0, or ``rng`` is a negative seed.
 
     Example:
         >>> import gpusense as gs, numpy as np
         >>> gs.resample([0.5, 0.25, 0.25], 8, np.random.default_rng(0)).tolist()
         [0, 0, 0, 0, 1, 1, 2, 2]
+        >>> gs.resample([0.5, 0.25, 0.25], 4, 7).tolist()
+        [0, 0, 1, 2]
     """
+    generator = _generator(rng)
     values = checks.array("weights", weights, ("N",))
     size = checks.integer("count", count, low=0)
     if values.size == 0 or not values.max() > 0:
@@ -112,5 +117,27 @@ def resample(weights: object, count: int, rng: np.random.Generator) -> np.ndarra
     # The marks (k + u) / size of the unit interval as exact integers: (k total + start) // size without overflow.
     whole, rest = divmod(total, size)
     k = np.arange(size, dtype=np.int64)
-    marks = k * whole + (k * rest + rng.integers(0, total)) // size
+    marks = k * whole + (k * rest + _below(total, generator)) // size
     return np.searchsorted(ends, marks, side="right")
+
+
+def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
+    """Return a generator as it is, or a new one from a seed.
+
+    Raises:
+        TypeError, ValueError: It is neither.
+    """
+    if isinstance(rng, (np.random.Generator, np.random.RandomState)):
+        return rng
+    try:
+        return np.random.default_rng(rng)
+    except (TypeError, ValueError) as error:
+        rule = "must be None, a Generator, a RandomState or a seed of numpy.random.default_rng"
+        raise type(error)(f"rng: {rule}, got {checks.show(rng)}") from error
+
+
+def _below(end: int, rng: np.random.Generator | np.random.RandomState) -> int:
+    """Draw an integer from 0 to before ``end``."""
+    if isinstance(rng, np.random.Generator):
+        return int(rng.integers(0, end))
+    return int(rng.randint(0, end, dtype=np.int64))

@@ -70,17 +70,17 @@ def triangulate(
         return problem.fix([], status)
     sets = subsets(len(problem.xy), least)
     starts, rho, clarity = _rays(problem, sets) if heading is not None else _triples(problem, sets)
+    if heading is None and not (clarity > _triple_blur(problem, sets)).any():
+        return problem.fix([], _line_or_circle(problem))
     if len(problem.xy) == least:
-        return _exact(problem, starts, rho[0], clarity[0])
-    if heading is None and not (clarity > _blur(problem)).any():
-        return problem.fix([], "circle")
+        return _on_circle(problem, sets, clarity, _exact(problem, starts, rho[0]))
     linear = _nearest_point(problem) if heading is not None else _linear_pose(problem)
     states, status = pick(*minima(problem, np.vstack([linear, starts])), known_sigma=sigma is not None)
     if problem.at_beacon(states[0]):
         status = "at a beacon"
     elif status == "unique" and np.abs(problem.residuals(states[:1])).max() > np.pi / 2:
         status = "behind"
-    return problem.fix(states, status)
+    return _on_circle(problem, sets, clarity, problem.fix(states, status))
 
 
 def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike | None = None) -> PositionFix:
@@ -118,8 +118,11 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
     status = _no_solution(problem)
     if status:
         return problem.fix([], status)
-    states, rho, clarity = _triples(problem, np.array([[0, 1, 2]]))
-    return _exact(problem, states, rho[0], clarity[0])
+    triple = np.array([[0, 1, 2]])
+    states, rho, clarity = _triples(problem, triple)
+    if not clarity[0] > _triple_blur(problem, triple)[0]:
+        return problem.fix([], _line_or_circle(problem))
+    return _on_circle(problem, triple, clarity, _exact(problem, states, rho[0]))
 
 
 def _angle_rounding(problem: Problem) -> float:
@@ -129,8 +132,55 @@ def _angle_rounding(problem: Problem) -> float:
 
 
 def _blur(problem: Problem) -> float:
-    """Return the rounding error of a zero angle between lines of sight, or of a zero |w| in :func:`three_bearings`."""
+    """Return the rounding error of a zero angle between lines of sight."""
     return _angle_rounding(problem) + 2 * problem.noise / problem.spread
+
+
+def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | None = None) -> Floats:
+    """Return the rounding error of the clarity of triples, see :func:`three_bearings`.
+
+    Args:
+        problem: The measurements.
+        triples: (N, 3) beacons.
+        state: A pose; None for a robot as far away as the beacons are from one another. The rounding of coordinates
+            turns the direction to a near beacon most.
+
+    The terms m_i exp(-i b_i) sin(b_j - b_k) change with the sines by |m_i| cos(b_j - b_k) times the error of an angle.
+    This is larger than the terms themselves where the beacons are seen in nearly one direction.
+
+    Returns:
+        (N,) errors.
+    """
+    assert problem.bearings is not None
+    points, bearings = problem.points[triples], problem.bearings[triples]
+    away = np.abs(points - points.mean(axis=1, keepdims=True))
+    angle = bearings[:, [1, 2, 0]] - bearings[:, [2, 0, 1]]
+    sines = np.abs(np.sin(angle))
+    size = np.sum(away * sines, axis=1)
+    far = np.full(len(problem.xy), problem.spread) if state is None else np.hypot(*(problem.xy - state[:2]).T)
+    blur = (_angle_rounding(problem) + 2 * problem.noise / np.maximum(far, problem.touch))[triples]
+    both = blur[:, [1, 2, 0]] + blur[:, [2, 0, 1]]
+    error = np.sum(away * (sines * blur + np.abs(np.cos(angle)) * both), axis=1)
+    error += 2 * problem.noise * np.sum(sines, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(size > 0, error / size, np.inf)
+
+
+def _line_or_circle(problem: Problem) -> str:
+    """Return the status of bearings that do not determine a pose."""
+    return "in line" if in_line(problem.xy, problem.noise) else "circle"
+
+
+def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix: PositionFix) -> PositionFix:
+    """Return a result, or none with the status "circle" where one circle holds the beacons and the robot, to rounding.
+
+    Bearings of unknown heading have a singular Jacobian only there.
+    """
+    if problem.heading is not None or fix.status not in ("singular", "unique"):
+        return fix
+    if fix.status == "unique" and (clarity > _triple_blur(problem, triples, fix.best[:2] - problem.origin)).any():
+        return fix
+    return problem.fix([], _line_or_circle(problem))
 
 
 def _no_solution(problem: Problem) -> str:
@@ -167,10 +217,8 @@ def _triples(problem: Problem, triples: NDArray[np.intp]) -> tuple[Floats, Float
     return np.column_stack([point.real, point.imag, heading]), rho, clarity
 
 
-def _exact(problem: Problem, states: Floats, rho: Floats, clarity: float) -> PositionFix:
+def _exact(problem: Problem, states: Floats, rho: Floats) -> PositionFix:
     """Make the result for as many bearings as unknowns: the closed form's solution, if it is valid."""
-    if problem.heading is None and clarity <= _blur(problem):
-        return problem.fix([], "in line" if in_line(problem.xy, problem.noise) else "circle")
     if problem.at_beacon(states[0]):
         return problem.fix(states, "at a beacon")
     return problem.fix([], "behind") if rho.min() < 0 else problem.fix(states, "unique")

@@ -74,26 +74,36 @@ def _by_cells(backend: Backend, obstacles: np.ndarray, squared: Buffer, most: in
     search((cols, rows), nearest, least, squared, rows, cols, blocks, most)
 
 
-def distance_transform(obstacles: Any, *, backend: Selection = "auto") -> np.ndarray:
-    """Compute the exact squared Euclidean distance transform.
+def distance_transform(
+    obstacles: Any, *, resolution: float = 1.0, squared: bool = False, backend: Selection = "auto"
+) -> np.ndarray:
+    """Compute the exact Euclidean distance from each cell's centre to the nearest obstacle's centre.
 
     Args:
         obstacles: (H, W) bool or integers; any cell that is not 0 is an obstacle.
+        resolution: Side of a cell [m], > 0. With 1, distances are in cells.
+        squared: Return squared distances in cells, which are integers and do not depend on ``resolution``.
         backend: The device, see :func:`gpusense.devices`.
 
     Returns:
-        (H, W) int32 squared distance from each cell's centre to the nearest obstacle's centre [cells^2]; 2^31 - 1
-        everywhere if there is no obstacle. Equal to the square of ``scipy.ndimage.distance_transform_edt(~obstacles)``.
+        (H, W) float64 distances [m], inf everywhere if there is no obstacle: ``resolution`` times those of
+        ``scipy.ndimage.distance_transform_edt(~obstacles)``. With ``squared`` (H, W) int32 squared distances [cells^2],
+        2^31 - 1 everywhere if there is no obstacle.
 
     Raises:
-        ValueError: The array is not two-dimensional, is empty, or is too large.
-        TypeError: The array holds neither bool nor integers.
+        ValueError: The array is not two-dimensional, is empty, or is too large; or ``resolution`` is not > 0.
+        TypeError: The array holds neither bool nor integers, or an option has the wrong type.
 
     Example:
         >>> import gpusense as gs
-        >>> gs.distance_transform([[1, 0, 0], [0, 0, 0]], backend="numpy").tolist()
+        >>> gs.distance_transform([[1, 0, 0], [0, 0, 0]], resolution=0.5, backend="numpy").round(3).tolist()
+        [[0.0, 0.5, 1.0], [0.5, 0.707, 1.118]]
+        >>> gs.distance_transform([[1, 0, 0], [0, 0, 0]], squared=True, backend="numpy").tolist()
         [[0, 1, 4], [1, 2, 5]]
     """
+    side = checks.real("resolution", resolution, above=0)
+    if not isinstance(squared, bool):
+        raise TypeError(f"squared: must be True or False, got {checks.show(squared)}")
     cells = checks.as_array("obstacles", obstacles)
     if cells.dtype.kind not in "biu":
         raise TypeError(f"obstacles: must hold bool or integers, got dtype {cells.dtype}")
@@ -103,5 +113,9 @@ def distance_transform(obstacles: Any, *, backend: Selection = "auto") -> np.nda
         size = f"{cells.shape[0]} x {cells.shape[1]}"
         raise ValueError(f"obstacles: must have at most {LONGEST_SIDE} rows and columns, got {size}")
     device = get_backend(backend)
-    squared = squared_distances(device, cells != 0)
-    return device.download(squared, np.empty(cells.shape, _INT))
+    squares = device.download(squared_distances(device, cells != 0), np.empty(cells.shape, _INT))
+    if squared:
+        return squares
+    distances: np.ndarray = np.sqrt(squares) * side
+    distances[squares == NO_OBSTACLE] = np.inf
+    return distances

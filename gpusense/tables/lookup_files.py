@@ -1,10 +1,14 @@
-"""Read and write look-up tables of expected ranges: a line of JSON that describes their inputs, then the numbers."""
+"""Read and write look-up tables of expected ranges.
+
+A file is a line of JSON, which describes the table's inputs and has the SHA-256 of its numbers, then the numbers.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -13,6 +17,9 @@ from gpusense._util.files import write_whole
 
 _LONGEST_HEADER = 4096
 _DTYPE = np.dtype("<u2")
+_FORMAT = "gpusense lookup 2"
+# Without a checksum.
+_OLD_FORMAT = "gpusense lookup 1"
 
 
 def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> dict[str, object]:
@@ -30,7 +37,7 @@ def describe(obstacles: np.ndarray, limit: float, outside: str, bins: int) -> di
     cells = hashlib.sha256(np.packbits(obstacles).tobytes()).hexdigest()
     rows, cols = obstacles.shape
     return {
-        "format": "gpusense lookup 1",
+        "format": _FORMAT,
         "rows": rows,
         "cols": cols,
         "bins": bins,
@@ -46,10 +53,12 @@ def write_lookup(path: Path, entries: np.ndarray, description: dict[str, object]
     Raises:
         OSError, ValueError: The file cannot be written.
     """
+    numbers = np.ascontiguousarray(entries, _DTYPE)
+    head = json.dumps({**description, "sha256": _checksum(numbers)}).encode() + b"\n"
 
-    def write(stream: object) -> None:
-        stream.write(json.dumps(description).encode() + b"\n")  # type: ignore[attr-defined]
-        stream.write(entries.astype(_DTYPE, copy=False).tobytes())  # type: ignore[attr-defined]
+    def write(stream: BinaryIO) -> None:
+        stream.write(head)
+        stream.write(numbers.data)
 
     write_whole(path, write)
 
@@ -59,18 +68,13 @@ def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, b
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: The file is no table, is truncated, or belongs to other inputs.
+        ValueError: The file is no table, is damaged, belongs to other inputs, or is of an old format.
     """
     required = describe(obstacles, limit, outside, bins)
     count = obstacles.size * bins
     with path.open("rb") as stream:
         line = stream.readline(_LONGEST_HEADER)
-        try:
-            header = json.loads(line)
-        except (ValueError, RecursionError):
-            header = None
-        if not isinstance(header, dict) or header.get("format") != required["format"]:
-            raise ValueError(f"file: must be a look-up table that gpusense wrote, got {path}")
+        header = _header(line, path)
         for key, value in required.items():
             if header.get(key) != value:
                 raise ValueError(
@@ -79,4 +83,34 @@ def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, b
         size = path.stat().st_size - len(line)
         if size != count * _DTYPE.itemsize:
             raise ValueError(f"file: must hold {count * _DTYPE.itemsize} bytes of ranges, got {size} in {path}")
-        return np.fromfile(stream, _DTYPE, count).astype(np.uint16, copy=False)
+        numbers = np.fromfile(stream, _DTYPE, count)
+    if header.get("sha256") != (actual := _checksum(numbers)):
+        raise ValueError(
+            f"file: must hold ranges of the SHA-256 in its header, {show(header.get('sha256'))}, got {actual} in {path}"
+        )
+    return numbers.astype(np.uint16, copy=False)
+
+
+def _header(line: bytes, path: Path) -> dict[str, Any]:
+    """Return the header in the first line of a file.
+
+    Raises:
+        ValueError: The file is no table, or one of an old format.
+    """
+    try:
+        header = json.loads(line)
+    except (ValueError, RecursionError):
+        header = None
+    kind = header.get("format") if isinstance(header, dict) else None
+    if kind == _OLD_FORMAT:
+        raise ValueError(
+            f"file: must be a look-up table with a checksum, {_FORMAT!r}, got {kind!r} in {path}: save the table again"
+        )
+    if not isinstance(header, dict) or kind != _FORMAT:
+        raise ValueError(f"file: must be a look-up table that gpusense wrote, got {path}")
+    return header
+
+
+def _checksum(numbers: np.ndarray) -> str:
+    """Return the SHA-256 of C-contiguous numbers."""
+    return hashlib.sha256(numbers.data).hexdigest()

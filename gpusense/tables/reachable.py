@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,8 +20,33 @@ class TableMemoryError(MemoryError):
     """Error of a device that cannot hold a map's table; smaller pieces of a cloud would not help."""
 
 
+@dataclass(frozen=True)
+class _State:
+    """The map and its table; a change replaces all of it by one assignment, so that no interrupt can split it.
+
+    Attributes:
+        grid: The map.
+        obstacles: (H, W) bool of the map; None where an update that was interrupted may have written them.
+        shared: Whether the array of obstacles belongs to the grid and is read-only.
+        table: The table; None without one.
+        window: The table's window.
+        preparations: Number of tables made.
+        version: Number that grows with every change.
+    """
+
+    grid: OccupancyGrid
+    obstacles: np.ndarray | None = None
+    shared: bool = True
+    table: Buffer = None
+    window: Window | None = None
+    preparations: int = 0
+    version: int = 0
+
+
 class ReachableMap:
     """A map and the table of its reachable window on a device.
+
+    An interrupt or an error leaves the map as it was before the call or as it is after it, never in between.
 
     Args:
         backend: The device.
@@ -32,12 +58,6 @@ class ReachableMap:
         crop: Whether to prepare the reachable window only; False prepares the whole map.
         refresh: Function that updates a table in place after obstacles changed in a part of its window, and returns
             whether it did; after False the table is made again.
-
-    Attributes:
-        obstacles: (H, W) bool, of the whole map.
-        window: The table's window; None without a table.
-        preparations: Number of tables made.
-        version: Number that grows whenever the map changes or the table is made again.
     """
 
     def __init__(
@@ -51,13 +71,42 @@ class ReachableMap:
         crop: bool,
         refresh: Callable[[Backend, np.ndarray, Buffer, Window], bool],
     ) -> None:
-        self._backend, self._grid, self._mount, self._reach, self._crop = backend, grid, mount, reach, crop
-        self._prepare, self._refresh, self._unknown, self._shared = prepare, refresh, unknown, True
-        self.obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")
-        self._table: Buffer = None
-        self.window: Window | None = None
-        self.preparations = 0
-        self.version = 0
+        self._backend, self._mount, self._reach, self._crop = backend, mount, reach, crop
+        self._prepare, self._refresh, self._unknown = prepare, refresh, unknown
+        self._state = _State(grid, self._obstacles_of(grid))
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map as it is."""
+        return self._state.grid
+
+    @property
+    def obstacles(self) -> np.ndarray:
+        """(H, W) bool, of the whole map."""
+        obstacles = self._state.obstacles
+        if obstacles is None:
+            obstacles = self._obstacles_of(self._state.grid)
+            self._state = replace(self._state, obstacles=obstacles, shared=True)
+        return obstacles
+
+    @property
+    def window(self) -> Window | None:
+        """The table's window; None before the first table."""
+        return self._state.window
+
+    @property
+    def preparations(self) -> int:
+        """Number of tables made."""
+        return self._state.preparations
+
+    @property
+    def version(self) -> int:
+        """Number that grows whenever the map changes, or the table is dropped or made again."""
+        return self._state.version
+
+    def drop(self) -> None:
+        """Drop the table; the next call makes it again."""
+        self._state = replace(self._state, table=None, version=self.version + 1)
 
     def ensure(self, corners: Corners | None) -> tuple[Buffer, Window]:
         """Return the table and its window; make both again if a sensor can reach beyond the window.
@@ -69,20 +118,19 @@ class ReachableMap:
             TableMemoryError: The device cannot hold the table.
         """
         if self._crop and corners is not None:
-            window = windows.choose(self._grid, self.window, corners, self._mount, self._reach)
+            window = windows.choose(self.grid, self.window, corners, self._mount, self._reach)
         else:
-            window = windows.whole(self._grid)
-        if window != self.window or self._table is None:
-            self._table, self.window = None, None
+            window = windows.whole(self.grid)
+        if window != self.window or self._state.table is None:
+            # Both tables together may not fit the device.
+            self._state = replace(self._state, table=None, window=None)
             try:
-                self._table = self._prepare(self._backend, window.cut(self.obstacles))
+                table = self._prepare(self._backend, window.cut(self.obstacles))
             except MemoryError as error:
                 raise TableMemoryError(*error.args) from error
-            self.window = window
-            self.preparations += 1
-            self.version += 1
-        assert self.window is not None
-        return self._table, self.window
+            count, version = self.preparations + 1, self.version + 1
+            self._state = replace(self._state, table=table, window=window, preparations=count, version=version)
+        return self._state.table, window
 
     def update(self, cells: object, place: object) -> OccupancyGrid:
         """Replace cells of the map; update the table now, or drop it so that the next call makes it again.
@@ -97,36 +145,40 @@ class ReachableMap:
         Raises:
             TypeError, ValueError: The cells or the place do not fit the grid; nothing has changed.
         """
-        grid = self._grid.with_cells(cells, place)  # type: ignore[arg-type]
+        grid = self.grid.with_cells(cells, place)  # type: ignore[arg-type]
         row, col = np.asarray(place).tolist()
         patch = OccupancyGrid(cells, occupied_threshold=grid.occupied_threshold)  # type: ignore[arg-type]
-        obstacles = patch.obstacles("occupied" if self._unknown == "occupied" else "free")
-        self._grid, part = grid, Window(row, col, *patch.shape)
-        self.version += 1
-        changed = windows.box(part.cut(self.obstacles) != obstacles)
+        patched, part = self._obstacles_of(patch), Window(row, col, *patch.shape)
+        changed = windows.box(part.cut(self.obstacles) != patched)
         if changed is None:
+            self._state = replace(self._state, grid=grid, version=self.version + 1)
             return grid
-        if self._shared:
-            # The array belongs to the grid and is read-only.
-            self.obstacles, self._shared = self.obstacles.copy(), False
-        part.cut(self.obstacles)[...] = obstacles
+        obstacles = self.obstacles.copy() if self._state.shared else self.obstacles
+        table = self._state.table
+        # The old map without obstacles and table: both are written in place, and an interrupt would leave them half so.
+        self._state = replace(self._state, obstacles=None, table=None, version=self.version + 1)
+        part.cut(obstacles)[...] = patched
+        table = self._refreshed(table, obstacles, changed.moved(row, col))
+        self._state = replace(self._state, grid=grid, obstacles=obstacles, shared=False, table=table)
+        return grid
+
+    def _refreshed(self, table: Buffer, obstacles: np.ndarray, changed: Window) -> Buffer:
+        """Return a table after obstacles changed in a part of the map; None where it must be made again."""
         window = self.window
-        if window is None or (near := window.shared(changed.moved(row, col))) is None or self._table is None:
-            return grid
-        # The table is dropped first, so that an error leaves no outdated table behind.
-        table, self._table = self._table, None
+        if window is None or table is None or (near := window.shared(changed)) is None:
+            return table
         try:
-            current = self._refresh(
-                self._backend, window.cut(self.obstacles), table, near.moved(-window.row, -window.col)
-            )
+            current = self._refresh(self._backend, window.cut(obstacles), table, near.moved(-window.row, -window.col))
         except MemoryError:
             current = False
-        self._table = table if current else None
-        return grid
+        return table if current else None
+
+    def _obstacles_of(self, grid: OccupancyGrid) -> np.ndarray:
+        return grid.obstacles("occupied" if self._unknown == "occupied" else "free")
 
     def omission(self, bytes_per_cell: float) -> Omission | None:
         """Describe the part of the map outside the window; None if there is none, or no cloud has come yet."""
-        everything = windows.whole(self._grid)
+        everything = windows.whole(self.grid)
         if self.window is None or self.window == everything:
             return None
         left = everything.cells - self.window.cells

@@ -1,4 +1,7 @@
-"""Read map images (PGM, PPM, PNG, BMP) strip by strip; memory is allocated only for data that the file holds."""
+"""Read map images (PGM, PPM, PNG, BMP) as greys, strip by strip; memory is allocated only for data that the file holds.
+
+Greys are those of nav2_map_server 1.4 to 1.5, which reads images with the 16-bit build of GraphicsMagick 1.3.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,11 @@ _MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on 
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
 
-# A strip of image rows, topmost first: the (h, w) sum of the colour channels, and the (h, w) mask of opaque pixels.
-_Strip = tuple[NDArray[np.uint32], NDArray[np.bool] | None]
+# Shares of red, green and blue in a grey, in thousandths (ITU-R BT.601).
+_LUMA = (299, 587, 114)
+
+# A strip of image rows, topmost first: (h, w) greys, 0 black to 255 white, and the (h, w) mask of opaque pixels.
+_Strip = tuple[NDArray[np.uint8], NDArray[np.bool] | None]
 
 
 @dataclass(frozen=True)
@@ -31,13 +37,11 @@ class Raster:
     Attributes:
         rows: Rows of pixels.
         cols: Columns of pixels.
-        white: Sum of the channels of a white pixel.
         strips: Strips of rows, topmost first.
     """
 
     rows: int
     cols: int
-    white: int
     strips: Iterator[_Strip]
 
 
@@ -92,6 +96,8 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
     if available < needed:
         raise ValueError(f"{file}: must have a raster of at least {needed} bytes, got {available}")
 
+    steps = _steps(maxval)
+
     def strips() -> Iterator[_Strip]:
         values = _plain_values(stream, file, count) if plain else None
         for top, end in _strip_rows(rows, cols):
@@ -102,9 +108,9 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
                 block = np.frombuffer(stream.read(width * (last - first)), f">u{width}")
             if block.max() > maxval:
                 raise ValueError(f"{file}: every value must be at most {maxval}, got {block.max()}")
-            yield _channel_sum(block.reshape(end - top, cols, channels)), None
+            yield _greys(block.reshape(end - top, cols, channels), steps), None
 
-    return Raster(rows, cols, channels * maxval, strips())
+    return Raster(rows, cols, strips())
 
 
 def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
@@ -211,7 +217,7 @@ def _open_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Raster:
     mode = {"1": "L", "P": "RGB"}.get(image.mode, image.mode)
     if transparent is not None:
         mode = {"L": "LA", "RGB": "RGBA"}.get(mode, mode)
-    deep = mode.startswith("I")  # 16 bits of grey
+    steps = _steps(65535 if mode.startswith("I") else 255)  # 16 bits of grey, or 8
     colours = 3 if mode.startswith("RGB") else 1
 
     def strips() -> Iterator[_Strip]:
@@ -224,9 +230,9 @@ def _open_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Raster:
                 opaque = values[:, :, -1] == 255
             elif transparent is not None:
                 opaque = values[:, :, 0] != transparent
-            yield _channel_sum(values[:, :, :colours]), opaque
+            yield _greys(values[:, :, :colours], steps), opaque
 
-    return Raster(rows, cols, 65535 if deep else 255 * colours, strips())
+    return Raster(rows, cols, strips())
 
 
 def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
@@ -256,9 +262,19 @@ def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
     return image
 
 
-def _channel_sum(values: NDArray[Any]) -> NDArray[np.uint32]:
-    """Return the (h, w) sum of (h, w, C) channels."""
-    total: NDArray[np.uint32] = values[:, :, 0].astype(np.uint32)
-    for channel in range(1, values.shape[2]):
-        total += values[:, :, channel]
-    return total
+def _steps(maxval: int) -> NDArray[np.uint32]:
+    """Return the 16-bit value of each value of a channel, rounded half up."""
+    values = np.arange(maxval + 1, dtype=np.uint64)
+    steps: NDArray[np.uint32] = ((2 * 65535 * values + maxval) // (2 * maxval)).astype(np.uint32)
+    return steps
+
+
+def _greys(values: NDArray[Any], steps: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Return the (h, w) greys of (h, w, C) channels: the luma in 16 bits, rounded half up, of which 8 bits are kept."""
+    if values.shape[2] == 1:
+        grey: NDArray[np.uint8] = (steps // 257).astype(np.uint8)[values[:, :, 0]]
+        return grey
+    luma = np.full(values.shape[:2], 500, np.uint32)
+    for channel, share in enumerate(_LUMA):
+        luma += (share * steps).astype(np.uint32)[values[:, :, channel]]
+    return (luma // 1000 // 257).astype(np.uint8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,9 @@ from gpusense._util import checks
 from gpusense._util.files import read_mapping
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import open_raster
+
+# The grey that map_saver writes for unknown cells.
+UNKNOWN_GREY = 205
 
 
 @dataclass(frozen=True)
@@ -33,18 +37,23 @@ class _MapYaml:
 def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> OccupancyGrid:
     """Read a map in the format of ROS map_server.
 
-    The values follow nav2_map_server. Let v be the mean of the colour channels as a fraction of white. The occupancy
-    is p = 1 - v, or v with ``negate``.
+    Cells have the bits of nav2_map_server 1.4 to 1.5 (``map_io.cpp``), which computes in float32; earlier versions
+    took the mean of the channels in float64. Let g be the grey of a pixel, 0 to 255: its value, or the luma
+    0.299 R + 0.587 G + 0.114 B of a colour. The occupancy is p = 1 - g / 255, or g / 255 with ``negate``.
 
     - Modes ``trinary`` (the default) and ``scale``: p >= ``occupied_thresh`` is 100, and p <= ``free_thresh`` is 0.
       Values between them are unknown in mode trinary, and in mode scale
       ``round(100 (p - free_thresh) / (occupied_thresh - free_thresh))``. A pixel that is not opaque is unknown.
-    - Mode ``raw``: round(255 v), unknown if that exceeds 100.
+    - Mode ``raw``: g, unknown if that exceeds 100.
+
+    Numbers of the YAML file are decimal, as nav2 reads them: 010 is ten, and 1:30 is refused.
 
     The image's bottom row is ``cells[0]``. Its content determines its format: PGM (P2, P5; 8 or 16 bits), PPM (P3,
-    P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. A 16-bit value is a
-    fraction of its own maximum; a PNG with colours or alpha counts with its upper 8 bits only. Memory is allocated
-    only after the file has been seen to hold the pixels that its header claims, at most 2^31.
+    P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. Of a 16-bit value the
+    grey keeps the upper 8 bits of its fraction of white. Three images differ from nav2's: a 16-bit PNG with colours or
+    alpha counts with its upper 8 bits only, the transparent colour of an 8-bit RGB PNG is unknown, and a PGM may have
+    any maximum. Memory is allocated only after the file has been seen to hold the pixels that its header claims, at
+    most 2^31.
 
     Args:
         path: The YAML file; the path of ``image`` in it is relative to its folder.
@@ -55,6 +64,9 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         TypeError: ``path`` or ``occupied_threshold`` has the wrong type.
         ValueError: A file breaks the format; the message names the file and the rule.
 
+    Warns:
+        UserWarning: A map of mode trinary has the grey 205 of unknown cells, and its ``free_thresh`` makes them free.
+
     Example:
         >>> import gpusense as gs, pathlib, tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -63,19 +75,28 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         ...     gs.read_map(path).cells.tolist()
         [[0, 100], [-1, 0]]
     """
-    meta = _read_yaml(checks.existing_file(checks.path("path", path)))
+    file = checks.existing_file(checks.path("path", path))
+    meta = _read_yaml(file)
     size = meta.image.stat().st_size
     with meta.image.open("rb") as stream:
         raster = open_raster(stream, meta.image, size)
-        table = _cell_table(meta, raster.white)
+        table = _cell_table(meta)
         cells = np.empty((raster.rows, raster.cols), np.int8)
-        end = raster.rows
-        for shade, opaque in raster.strips:
-            block = table[shade]
+        end, freed = raster.rows, 0
+        for greys, opaque in raster.strips:
+            block = table[greys]
             if opaque is not None and meta.mode != "raw":
                 block[~opaque] = -1
+            if _frees_unknown(meta, table):
+                freed += int(np.count_nonzero((greys == UNKNOWN_GREY) & (block == 0)))
             cells[end - len(block) : end] = block[::-1]
             end -= len(block)
+    if freed:
+        warnings.warn(
+            f"{file}: free_thresh: must be < {1 - UNKNOWN_GREY / 255:.6f} for cells of grey {UNKNOWN_GREY} to be "
+            f"unknown, got {meta.free_thresh}: {freed} such cells are free",
+            stacklevel=2,
+        )
     return OccupancyGrid(cells, meta.resolution, meta.origin, occupied_threshold=occupied_threshold)
 
 
@@ -126,7 +147,7 @@ def write_map(
     trinary = sum(np.count_nonzero(cells == value) for value in (0, 100, -1)) == cells.size
     greys = bytearray([*range(101), *[255] * 155])  # indexed by the cell's byte; unknown, -1, is byte 255
     if trinary:
-        greys[0], greys[100], greys[255] = 254, 0, 205
+        greys[0], greys[100], greys[255] = 254, 0, UNKNOWN_GREY
     pixels = cells[::-1].tobytes().translate(greys)
     meta = {
         "image": image.name,
@@ -225,17 +246,26 @@ def _number(file: Path, key: str, value: object, **limits: float) -> float:
         raise ValueError(str(error)) from None
 
 
-def _cell_table(meta: _MapYaml, white: int) -> NDArray[np.int8]:
-    """Return the cell for every sum of channels from 0 to ``white``, by nav2's rules in float64."""
-    shade = np.arange(white + 1, dtype=np.float64)
+def _cell_table(meta: _MapYaml) -> NDArray[np.int8]:
+    """Return the cell for every grey, by nav2's rules: each operation is rounded to float32."""
+    greys = np.arange(256)
     if meta.mode == "raw":
-        value = np.floor(shade * 255 / white + 0.5)
-        return np.where(value <= 100, value, -1).astype(np.int8)
-    p = (shade if meta.negate else white - shade) / white
-    cells = np.full(p.shape, -1.0)
+        return np.where(greys <= 100, greys, -1).astype(np.int8)
+    single = np.float32
+    p = greys.astype(single) / single(255)
+    p = p if meta.negate else single(1) - p
+    free, occupied = single(meta.free_thresh), single(meta.occupied_thresh)
+    cells = np.full(p.shape, -1, np.int8)
+    cells[p >= occupied] = 100
+    cells[p <= free] = 0
     if meta.mode == "scale":
-        ratio = (p - meta.free_thresh) / (meta.occupied_thresh - meta.free_thresh)
-        cells = np.floor(100 * ratio + 0.5)
-    cells[p >= meta.occupied_thresh] = 100
-    cells[p <= meta.free_thresh] = 0
-    return cells.astype(np.int8)
+        between = (p > free) & (p < occupied)
+        # The difference is rounded once, from float64. Halves are rounded up.
+        share = (p[between] - free) / single(meta.occupied_thresh - meta.free_thresh) * single(100)
+        cells[between] = np.floor(share.astype(np.float64) + 0.5)
+    return cells
+
+
+def _frees_unknown(meta: _MapYaml, table: NDArray[np.int8]) -> bool:
+    """Return whether the grey that map_saver writes for unknown cells is free."""
+    return meta.mode == "trinary" and not meta.negate and bool(table[UNKNOWN_GREY] == 0)

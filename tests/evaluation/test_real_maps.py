@@ -76,7 +76,10 @@ def test_no_map_is_forgotten(data_dir):
 @pytest.mark.parametrize("name", SMALL)
 def test_distance_transform_is_scipys(data_dir, opencl, name):
     obstacles = gs.read_map(data_dir / name).obstacles()
-    assert differing(gs.distance_transform(obstacles, backend=opencl), selftest.scipy_squares(obstacles)) == 0
+    assert (
+        differing(gs.distance_transform(obstacles, squared=True, backend=opencl), selftest.scipy_squares(obstacles))
+        == 0
+    )
 
 
 def scene_of(data_dir, name):
@@ -149,7 +152,7 @@ def test_yaw_of_a_map_turns_its_poses(data_dir):
 def test_distance_transform_of_120_million_cells(gigantic, opencl):
     """Exact at 100 000 places all over the map and its corners, by a search among all obstacles; no memory for more."""
     obstacles = gigantic.obstacles()
-    found = gs.distance_transform(obstacles, backend=opencl)
+    found = gs.distance_transform(obstacles, squared=True, backend=opencl)
     rows, cols = obstacles.shape
     random = np.random.default_rng(6)
     places = np.column_stack([random.integers(0, rows, 100_000), random.integers(0, cols, 100_000)])

@@ -34,7 +34,8 @@ rng = np.random.default_rng(0)
 cells = np.zeros((13, 17), int)
 cells[rng.random(cells.shape) < 0.08] = 100
 grid = gs.OccupancyGrid(cells, 0.1, (-0.3, 0.2, 0.3))
-wrong = np.count_nonzero(gs.distance_transform(cells, backend=BACKEND) != gs.distance_transform(cells, backend="numpy"))
+wrong = np.count_nonzero(gs.distance_transform(cells, squared=True, backend=BACKEND)
+                         != gs.distance_transform(cells, squared=True, backend="numpy"))
 device, numpy = get_backend(BACKEND), NumpyBackend()
 changed, part = cells > 0, Window(4, 0, 3, 5)
 part.cut(changed)[...] = ~part.cut(changed)
@@ -50,8 +51,8 @@ for kind in ("cpu", "gpu"):
     pretend(kind)
     # The second is taller than the block that a search for the nearest row looks at.
     for map_ in (cells, np.where(rng.random((70, 9)) < 0.02, 100, 0)):
-        wrong += np.count_nonzero(gs.distance_transform(map_, backend=device)
-                                  != gs.distance_transform(map_, backend=numpy))
+        wrong += np.count_nonzero(gs.distance_transform(map_, squared=True, backend=device)
+                                  != gs.distance_transform(map_, squared=True, backend=numpy))
     for sectors in (1, 2, 4):
         tables = []
         for one in (device, numpy):

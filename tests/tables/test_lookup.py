@@ -82,22 +82,42 @@ def test_a_table_of_something_else_is_refused(tmp_path):
         (whole[:-1], "hold 53760 bytes of ranges, got 53759"),
         (whole + b"\0", "hold 53760 bytes of ranges, got 53761"),
         (head.replace(b'"rows": 40', b'"rows": 4000000000000') + b"\n" + body, "same rows, 40, got 4000000000000"),
-        (head.replace(b"lookup 1", b"lookup 2") + b"\n" + body, "a look-up table that gpusense wrote"),
+        (head.replace(b"lookup 2", b"lookup 3") + b"\n" + body, "a look-up table that gpusense wrote"),
+        (head.replace(b"lookup 2", b"lookup 1") + b"\n" + body, "'gpusense lookup 2', got 'gpusense lookup 1'"),
         (b"", "a look-up table that gpusense wrote"),
         (bytes(range(256)) * 300, "a look-up table that gpusense wrote"),
         (b"7\n" + body, "a look-up table that gpusense wrote"),
     ):
         path.write_bytes(damage)
-        with pytest.raises(ValueError, match=f"^file: must .*{words}.*table$"):
+        with pytest.raises(ValueError, match=f"^file: must .*{words}.*table"):
             read()
     path.unlink()
     with pytest.raises(FileNotFoundError, match="table"):
         read()
 
 
+@pytest.mark.parametrize("place_of", [0, 26_879 * 2, 26_880 * 2 - 1])
+def test_a_changed_bit_of_a_range_is_refused(place_of, tmp_path):
+    grid, path = place()[0], tmp_path / "table"
+    saved(path)
+    inputs = grid.obstacles(), RANGE / grid.resolution, "free", 12
+    read_lookup(path, *inputs)
+    head, _, body = path.read_bytes().partition(b"\n")
+    damaged = bytearray(body)
+    damaged[place_of] ^= 1
+    path.write_bytes(head + b"\n" + damaged)
+    with pytest.raises(
+        ValueError, match=r"^file: must hold ranges of the SHA-256 in its header, '\w{64}', got \w{64} in"
+    ):
+        read_lookup(path, *inputs)
+    path.write_bytes(head.replace(b"sha256", b"sha512") + b"\n" + body)
+    with pytest.raises(ValueError, match=r"^file: must hold ranges of the SHA-256 in its header, None, got"):
+        read_lookup(path, *inputs)
+
+
 @pytest.mark.parametrize(
     "head",
-    [b"[" * 4000, b'{"format": "gpusense lookup 1", "rows": 1e9, "cols": 1000000000, "bins": 12}', b"{" * 70_000],
+    [b"[" * 4000, b'{"format": "gpusense lookup 2", "rows": 1e9, "cols": 1000000000, "bins": 12}', b"{" * 70_000],
     ids=["nested", "huge", "long"],
 )
 def test_a_file_that_claims_much_costs_nothing(head, tmp_path):

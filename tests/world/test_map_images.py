@@ -27,14 +27,14 @@ def test_raw_ignores_alpha(place):
     assert read_map(place(image, "map.png", mode="raw")).cells.tolist() == [[7, 9]]
 
 
-def test_colours_are_averaged(place):
-    rgb = np.array([[[255, 255, 255], [0, 0, 255], [0, 255, 0], [0, 0, 0]]], np.uint8)
+def test_colours_count_by_their_luma(place):
+    rgb = np.array([[[255, 255, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [0, 0, 0]]], np.uint8)
     grid = read_map(place(Image.fromarray(rgb), "map.png"))
-    assert grid.cells.tolist() == [[0, 100, 100, 100]]  # one channel of three: p = 0.667
+    assert grid.cells.tolist() == [[0, 100, -1, 100, 100]]  # greys 255, 29, 149, 76, 0
     grid = read_map(place(Image.fromarray(rgb), "map.png", mode="scale", free_thresh=0, occupied_thresh=1))
-    assert grid.cells.tolist() == [[0, 67, 67, 100]]
-    ppm = b"P6 4 1 255\n" + rgb.tobytes()
-    assert read_map(place(ppm)).cells.tolist() == [[0, 100, 100, 100]]
+    assert grid.cells.tolist() == [[0, 89, 42, 70, 100]]
+    ppm = b"P6 5 1 255\n" + rgb.tobytes()
+    assert read_map(place(ppm)).cells.tolist() == [[0, 100, -1, 100, 100]]
 
 
 @pytest.mark.parametrize(
@@ -60,16 +60,16 @@ def test_netpbm(place, name, image):
 
 
 def test_16_bits_are_a_fraction_of_their_own_maximum(place):
-    # p = 0.65 and one level less, out of 1000; then the same out of 60000.
-    file = place(pgm([[350, 351, 804, 803]], 1000), free_thresh=0.196)
+    # Greys 89 and 90, 206 and 205: 90 is reached at 90 / 255 of the maximum.
+    file = place(pgm([[352, 353, 808, 807]], 1000), free_thresh=0.196)
     assert read_map(file).cells.tolist() == [[100, -1, 0, -1]]
-    file = place(pgm([[21000, 21001, 48240, 48239]], 60000), free_thresh=0.196)
+    file = place(pgm([[21176, 21177, 48471, 48470]], 60000), free_thresh=0.196)
     assert read_map(file).cells.tolist() == [[100, -1, 0, -1]]
 
 
 def grey_png_16():
-    # 0.65 of 65535 is 42597.75: black of 22937 is occupied, 22938 is not.
-    rows = np.array([[22937, 22938]], ">u2")
+    # Grey 90, which is not occupied, begins at 90 * 257 = 23130.
+    rows = np.array([[23129, 23130]], ">u2")
     return png(2, 1, b"\0" + rows.tobytes(), depth=16)
 
 

@@ -37,9 +37,11 @@ def test_negate(place):
 
 
 def test_scale_rounds_half_up(place):
-    # With thresholds 0 and 1 the cell is round(100 p); 0.1 of 20 levels gives halves: p = 0.005 k.
-    grid = read_map(place(pgm([[200, 199, 198, 100, 1, 0]], 200), mode="scale", free_thresh=0, occupied_thresh=1))
-    assert grid.cells.tolist() == [[0, 1, 1, 50, 100, 100]]
+    # p = 0.2 k: with thresholds 0 and 1 the cell is 20 k; with 0.64 it is 31.25 k, and 62.5 for k = 2.
+    grid = read_map(place(pgm([[255, 204, 153, 51, 0]]), mode="scale", free_thresh=0, occupied_thresh=1))
+    assert grid.cells.tolist() == [[0, 20, 40, 80, 100]]
+    grid = read_map(place(pgm([[204, 153, 102]]), mode="scale", free_thresh=0, occupied_thresh=0.64))
+    assert grid.cells.tolist() == [[31, 63, 94]]
     grid = read_map(place(pgm([[255, 128, 0]]), mode="SCALE", free_thresh=0.25, occupied_thresh=0.75))
     assert grid.cells.tolist() == [[0, round(100 * (127 / 255 - 0.25) / 0.5), 100]]
 

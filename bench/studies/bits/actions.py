@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from typing import Any
@@ -280,7 +281,9 @@ def act_tables(case: Case) -> Outcome:
     """Make tables of a map."""
     rng, grid = case.rng, draw_grid(case.rng, 2.3)
     kinds: list[Any] = ["free", "occupied"]
-    yield "distances", gs.distance_transform(grid.occupied, backend=case.device.backend)
+    # Older trees return squared cells, and have no such argument.
+    squared = {"squared": True} if "squared" in inspect.signature(gs.distance_transform).parameters else {}
+    yield "distances", gs.distance_transform(grid.occupied, backend=case.device.backend, **squared)
     if rng.random() < 0.5:
         yield "normals", gs.surface_normals(grid, unknown=rng.choice(kinds), outside=rng.choice(kinds))
     ranges, world = rng.uniform(-1, 12, 50), case.world

@@ -214,6 +214,8 @@ class OpenCLBackend(ProcessBound, Backend):
 
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
         """Queue a launch of a kernel whose arguments are set."""
+        # Before, so that an interrupt leaves no launch uncounted; and after, for a thread that waits in between.
+        self._counted(1)
         cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
         self._counted(1)
 

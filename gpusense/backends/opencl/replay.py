@@ -37,6 +37,8 @@ class OpenCLRecording(Recording):
     def __call__(self, stream: Any = None) -> None:
         """See Recording.__call__."""
         queue = self._queue if stream is None else self._checked(stream)
+        # Before and after; see ``OpenCLBackend.enqueue``.
+        self._count(len(self._launches))
         # Launches of two threads must not interleave.
         with self._lock, driver_errors():
             if stream is not None and queue not in self._used:

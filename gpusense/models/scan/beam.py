@@ -171,7 +171,7 @@ class BeamModel(ScanModel):
                 from a file; nothing has changed.
         """
         with self._lock:
-            self._beam_pipeline.grid = self._caster.update(cells, region)
+            self._caster.update(cells, region)
 
     def expected_ranges(self, poses: object, *, out: Any = None) -> Any:
         """Return z* of every beam of the scanner at each pose; for a cone, the range of the nearest return.

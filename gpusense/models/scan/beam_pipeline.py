@@ -41,7 +41,7 @@ class BeamPipeline(ScanPipeline):
     def __init__(
         self, setting: Setting, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
     ) -> None:
-        super().__init__(setting, caster.grid)
+        super().__init__(setting)
         self.caster, self.cones, self.mixture = caster, cones, mixture
         self.rays_each = cones.rays
         # The rays of each beam, several for a cone.

@@ -60,7 +60,7 @@ class RayCaster:
         outside: str = "free",
     ) -> None:
         self.range_max = checks.real("range_max", range_max, above=0)
-        self.grid = check_scene(grid, self.range_max)
+        check_scene(grid, self.range_max)
         if caster is not None and method is not None:
             raise ValueError(f"method: must be None where caster is given, got {checks.show(method)}")
         named = ("caster", caster) if method is None else ("method", method)
@@ -89,6 +89,11 @@ class RayCaster:
             ['exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup']
         """
         return tuple(casters.CASTERS.values())
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map as it is now."""
+        return self._caster.grid
 
     @property
     def method(self) -> Caster:
@@ -133,7 +138,7 @@ class RayCaster:
             TypeError, ValueError: cells or a region that are not integers, or do not fit the grid, or a look-up table
                 from a file; nothing has changed.
         """
-        self.grid = self._caster.update(cells, region)
+        self._caster.update(cells, region)
 
     def save_table(self, path: str | Path) -> None:
         """Write the look-up table, whole or not at all, for ``casters.Lookup(bins, file=path)``.

@@ -103,7 +103,7 @@ class LikelihoodFieldModel(ScanModel):
             TypeError, ValueError: cells or a region that are not integers, or do not fit the grid; nothing has changed.
         """
         with self._lock:
-            self._field_pipeline.grid = self._field_pipeline.map.update(cells, region)
+            self._field_pipeline.map.update(cells, region)
 
     def explain(self) -> str:
         """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""

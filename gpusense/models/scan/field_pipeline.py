@@ -53,7 +53,7 @@ class FieldPipeline(ScanPipeline):
         unknown: str,
         outside: str,
     ) -> None:
-        super().__init__(setting, grid)
+        super().__init__(setting)
         bilinear, compat = parameters.interpolation == "bilinear", setting.weights.cubes
         self.log_table = (self.specialize or compat) and not bilinear
         self.careful = self.real == np.float32

@@ -60,7 +60,7 @@ class MapCaster:
         outside: str,
         crop: bool,
     ) -> None:
-        self.backend, self.real, self.grid, self.mount, self.range_max = backend, real, grid, mount, range_max
+        self.backend, self.real, self.mount, self.range_max = backend, real, mount, range_max
         self.limit = range_max / grid.resolution
         self.method, self.outside, self._table_bytes = method, outside, 0
         # Window of the normals of the map's walls, the normals, and their bytes.
@@ -77,6 +77,11 @@ class MapCaster:
         self._workspace = Workspace(backend)
         # Threads may share a caster: its buffers serve one call at a time.
         self._lock = threading.Lock()
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map as it is."""
+        return self.map.grid
 
     @property
     def table_bytes(self) -> int:
@@ -124,8 +129,9 @@ class MapCaster:
         if isinstance(self.method, casters.Lookup) and self.method.file is not None:
             raise ValueError(f"file: must be None where the map changes, got {checks.show(self.method.file)}")
         with self._lock:
-            self.grid, self._normals = self.map.update(cells, region), None
-            return self.grid
+            # First: an interrupt may come before the map has changed, but not between the map and its normals.
+            self._normals = None
+            return self.map.update(cells, region)
 
     def prepare(self, poses: Poses) -> None:
         """Make the table for some poses."""

@@ -50,7 +50,7 @@ class ScanModel(ABC):
     ) -> None:
         if not isinstance(scanner, Scanner):
             raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
-        self._first_grid = check_scene(grid, scanner.range_max)
+        check_scene(grid, scanner.range_max)
         self.scanner = scanner
         weights = compat_module.choose(compat)
         self.compat = compat

@@ -104,7 +104,6 @@ class ScanPipeline(ABC):
 
     Attributes:
         setting: The device and the rules.
-        grid: The map as it is.
         nothing: A buffer for arguments that are not read.
     """
 
@@ -116,8 +115,8 @@ class ScanPipeline(ABC):
     careful: bool = False
     orders: bool = False
 
-    def __init__(self, setting: Setting, grid: OccupancyGrid) -> None:
-        self.setting, self.grid = setting, grid
+    def __init__(self, setting: Setting) -> None:
+        self.setting = setting
         self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
@@ -130,6 +129,11 @@ class ScanPipeline(ABC):
     @abstractmethod
     def map(self) -> ReachableMap:
         """The map's table."""
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map as it is."""
+        return self.map.grid
 
     @abstractmethod
     def upload(self, scans: ClassedScans, space: Workspace) -> Readings:

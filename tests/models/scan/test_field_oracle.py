@@ -251,4 +251,4 @@ def test_distances_of_long_maps(shape, backend):
     obstacles = np.zeros(shape, bool)
     obstacles[0, 0] = True
     rows, cols = np.indices(shape)
-    np.testing.assert_array_equal(gs.distance_transform(obstacles, backend=backend), rows**2 + cols**2)
+    np.testing.assert_array_equal(gs.distance_transform(obstacles, squared=True, backend=backend), rows**2 + cols**2)

@@ -127,7 +127,7 @@ def test_every_cell_of_an_updated_field_is_that_of_a_new_one(outside, device):
         return model
 
     def table(model):
-        return device.download(model._pipeline.map._table, np.empty((shape[0] + 4, shape[1] + 4), np.float32))
+        return device.download(model._pipeline.map._state.table, np.empty((shape[0] + 4, shape[1] + 4), np.float32))
 
     model = make(gs.OccupancyGrid(np.zeros(shape, int), RESOLUTION))
     for cells, place in patches(rng, shape, 30):
@@ -225,12 +225,12 @@ def test_edits_that_change_no_obstacle_do_nothing(make, monkeypatch):
     model, poses = make(grid), poses_in(rng, (60, 50))
     table, says = tables(model, RANGES)
     before = says(poses)
-    buffer, preparations, obstacles = table._table, table.preparations, table.obstacles
+    buffer, preparations, obstacles = table._state.table, table.preparations, table.obstacles
     monkeypatch.setattr(table, "_refresh", None)
     model.update_map(np.where(grid.cells > 0, 70, 10), (0, 0))
     assert model.grid.cells.max() == 70 and grid.cells.max() == 100
     np.testing.assert_array_equal(says(poses), before)
-    assert (table._table, table.preparations, table.obstacles) == (buffer, preparations, obstacles)
+    assert (table._state.table, table.preparations, table.obstacles) == (buffer, preparations, obstacles)
 
 
 def test_before_the_first_call_only_the_map_changes(make):

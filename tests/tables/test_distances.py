@@ -1,0 +1,46 @@
+"""Distances of the public transform: metres by default, squared cells on request."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+
+import gpusense as gs
+
+OBSTACLES = np.random.default_rng(0).random((37, 53)) < 0.03
+
+
+@pytest.mark.parametrize("resolution", [0.05, 2.0])
+def test_distances_are_in_metres(backend, resolution):
+    found = gs.distance_transform(OBSTACLES, resolution=resolution, backend=backend)
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, distance_transform_edt(~OBSTACLES) * resolution)
+
+
+def test_distances_without_a_resolution_are_in_cells(backend):
+    np.testing.assert_array_equal(gs.distance_transform(OBSTACLES, backend=backend), distance_transform_edt(~OBSTACLES))
+
+
+def test_squares_are_integers(backend):
+    found = gs.distance_transform(OBSTACLES, resolution=0.05, squared=True, backend=backend)
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found, np.rint(distance_transform_edt(~OBSTACLES) ** 2))
+
+
+def test_no_obstacle_is_infinitely_far(backend):
+    assert (gs.distance_transform(np.zeros((3, 4), bool), backend=backend) == np.inf).all()
+    assert (gs.distance_transform(np.zeros((3, 4), bool), squared=True, backend=backend) == 2**31 - 1).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"resolution": 0}, ValueError, "resolution: must be finite and > 0, got 0"),
+        ({"resolution": "1"}, TypeError, "resolution: must be"),
+        ({"squared": 1}, TypeError, "squared: must be True or False, got 1"),
+    ],
+)
+def test_bad_options(options, error, message):
+    with pytest.raises(error, match=f"^{message}"):
+        gs.distance_transform(OBSTACLES, backend="numpy", **options)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 
-def flags_if(**conditions: object) -> frozenset[str]:
+
+@functools.cache
+def flags_if(**conditions: bool) -> frozenset[str]:
     """Return the flags whose conditions hold: ``flags_if(HIT=z_hit > 0, RAND=z_rand > 0)``."""
     return frozenset([flag for flag, holds in conditions.items() if holds])

@@ -33,6 +33,9 @@ class LeftOut:
     thinned: int
 
 
+_NOTHING = LeftOut(0, 0, np.zeros(0, np.intp), 0)
+
+
 @dataclass(frozen=True)
 class ClassedScans:
     """The readings of S scans that are evaluated at every pose, one scan after the other.
@@ -141,17 +144,18 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
         evaluated, constant = used | used_max | (not rules.specialize), np.zeros_like(far)
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
     columns, counts = evaluated.nonzero()[1], np.add.reduce(evaluated, axis=1)
-    # Adding 0 makes 0 of -0, the product without max readings.
-    constants = np.add.reduce(constant, axis=1) * rules.log_max + 0.0
-    if len(columns) < ranges.size:
+    if len(columns) < ranges.size or not rules.specialize:
+        # Adding 0 makes 0 of -0, the product without max readings.
+        constants = np.add.reduce(constant, axis=1) * rules.log_max + 0.0
         values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
+        left_out = _left_out(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules)
     else:
         # Scans without gaps need no selection.
-        values = ranges.reshape(-1).astype(np.float64)
+        constants, values, left_out = np.zeros(len(ranges)), ranges.reshape(-1).astype(np.float64), _NOTHING
         vectors = rules.vectors if len(ranges) == 1 else rules.vectors[columns]
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
-        _left_out(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules),
+        left_out,
     )  # fmt: skip
     return scans if rules.separate else _join([_grouped(scans.part(i, i + 1)) for i in range(scans.scans)])
 

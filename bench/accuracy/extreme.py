@@ -110,7 +110,10 @@ def judged(make: Callable[..., Any], backend: str, poses: np.ndarray, ranges: np
     recorder = Recorder(get_backend(backend))
     again, _ = make(backend=recorder).log_likelihood(poses, ranges, per_beam=True)
     truth, parts = replay(launch := recorder.launches[0])
-    error, bound = np.abs(found - truth), per_scan(parts, found.dtype, fixed=float(launch.values["fixed"]))
+    error, bound = (
+        np.abs(found - truth),
+        per_scan(parts, found.dtype, fixed=float(launch.values["score"].constant_term)),
+    )
     share, bits = float((error / bound).max()), differing(again, found)
     row = {"checked": len(poses), "error": float(error.max()), "bound_share": share, "other_bits": bits}
     return {**row, "ok": share <= 1 and bits == 0}

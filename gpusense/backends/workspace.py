@@ -123,8 +123,8 @@ class Workspace:
         return kept.flags
 
     def _identity(self, value: Any) -> Hashable:
-        """Return a number as it is, and a buffer by its address."""
-        return value if value is None or isinstance(value, (int, float)) else self._backend.address(value)
+        """Return a number or struct as it is, and a buffer by its address."""
+        return value if value is None or isinstance(value, (int, float, tuple)) else self._backend.address(value)
 
     def empty(self, name: str, count: int, dtype: np.dtype, *, zero: bool = False, lent: bool = False) -> Buffer:
         """Return a buffer of at least ``count`` numbers; its old contents are lost.

@@ -16,6 +16,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Launcher, Proxy
+from gpusense.interface import structs
 from gpusense.interface.signatures import KERNELS, Argument
 from gpusense.reference import field as field_kernels
 from gpusense.reference.beam import sum_terms
@@ -32,7 +33,7 @@ class Launch:
     Attributes:
         kernel: ``"score_beams"`` or ``"score_field"``.
         flags: Flags of the compiled kernel.
-        values: Arrays cut to their shapes, without the map's rectangles, and scalars in the launch's precision.
+        values: Arrays cut to their shapes, without the map's rectangles; scalars and structs in its precision.
         expected: (particles, rays) expected ranges of the same device for a beam launch, else None.
         incidence: (particles, rays) angles of incidence where the launch depends on them [rad], else None.
     """
@@ -76,7 +77,9 @@ class Recorder(Proxy):
         passed = dict(zip(KERNELS[kernel].arguments, arguments, strict=True))
         values: dict[str, Any] = {}
         for argument, value in passed.items():
-            if argument.shape is None:
+            if argument.is_struct:
+                values[argument.name] = structs.rounded(value, argument.type, real)
+            elif argument.shape is None:
                 dtype = argument.dtype(real)
                 values[argument.name] = int(value) if dtype.kind == "i" else dtype.type(value)
         # A kernel reads these arguments only where the flags are set. The map's table stays on the device.
@@ -87,7 +90,7 @@ class Recorder(Proxy):
             "normals": {"INCIDENCE"} & flags,
             "map_table": {},
             "start": {"SCANS"} & flags,
-            "fixed_of": {"SCANS"} & flags,
+            "constant_terms": {"SCANS"} & flags,
         }
         for argument, value in passed.items():
             if argument.shape is None or not needed.get(argument.name, True):
@@ -126,10 +129,7 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
     Returns:
         log p (particles,) and the beams' parts (particles, readings), both float64, in the order of the launch.
     """
-    values = {
-        name: value.astype(np.float64) if getattr(value, "dtype", np.dtype(int)).kind == "f" else value
-        for name, value in launch.values.items()
-    }
+    values = {name: _as_float64(value) for name, value in launch.values.items()}
     with np.errstate(all="ignore"):
         parts = (_replay_beams if launch.kernel == "score_beams" else _replay_field)(launch, values)
         if like is None and "PER_BEAM" in launch.flags:
@@ -148,7 +148,15 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
                 moved = _replay_field(launch, values, shift)
                 parts = np.where(np.abs(moved - like) < np.abs(parts - like), moved, parts)
         plain_sums = strand_sums if launch.kernel == "score_beams" else block_sums
-        return sum_terms(launch.flags, parts, values["fixed"], values["temperature"], plain_sums), parts
+        return sum_terms(launch.flags, parts, values["score"], plain_sums), parts
+
+
+def _as_float64(value: Any) -> Any:
+    """Return real numbers, also those of a struct, in float64; other values as they are."""
+    if isinstance(value, tuple):
+        made: type[Any] = type(value)
+        return made(*map(_as_float64, value))
+    return value.astype(np.float64) if getattr(value, "dtype", np.dtype(int)).kind == "f" else value
 
 
 def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) -> np.ndarray:
@@ -161,12 +169,12 @@ def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) ->
     if launch.incidence is not None:
         angle = launch.incidence.astype(np.float64)[:, ray_of]
         cosine = np.where(np.isnan(angle), 2, np.cos(angle) + shift)
-        terms = incidence_terms(terms, values["edges"], values["kinds"], cosine)
+        terms = incidence_terms(terms, values["edges"], values["tables"].incidence_bins, cosine)
     if "SENSOR_TABLE" in launch.flags:
         # In the launch's precision: otherwise a range next to a bin's border would fall into another bin.
-        bins = (launch.values[name] for name in ("sensor", "cells", "per_metre", "range_max"))
+        sensor, tables, scale = (launch.values[name] for name in ("sensor", "tables", "scale"))
         rounded = np.broadcast_to(launch.values["reading"], expected.shape), launch.expected[:, ray_of]
-        parts = tabulated_density(*rounded, *bins).astype(np.float64)
+        parts = tabulated_density(*rounded, sensor, tables, scale.range_max).astype(np.float64)
     else:
         parts = log_density(launch.flags, z, expected, terms)
     if "ALL_READINGS" in launch.flags:
@@ -180,7 +188,7 @@ def _replay_field(launch: Launch, values: dict[str, Any], shift: tuple[float, fl
     count, readings = values["particles"], values["readings"]
     parts = np.empty(count * readings)
     low = values.get("pose_low", np.zeros((count, 4))) + np.array([*shift, 0.0, 0.0])
-    single_scan = {"start": None, "fixed_of": None}
+    single_scan = {"start": None, "constant_terms": None}
     arguments = {**values, **single_scan, "pose_low": low, "log_p": np.empty(count), "parts": parts}
     flags = launch.flags | {"FLOAT64", "PER_BEAM", "CAREFUL"}
     field_kernels.score_field(flags, *(arguments[argument.name] for argument in KERNELS["score_field"].arguments))

@@ -21,6 +21,7 @@ from gpusense.backends import Backend, Selection, get_backend
 from gpusense.evaluation.replay import Launch, Recorder, replay
 from gpusense.evaluation.stiff_cases import Case, cases
 from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, per_scan
+from gpusense.interface import structs
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
@@ -113,9 +114,10 @@ def density_grid(backend: Selection, precision: str) -> Densities:
     cells = device.upload(np.array([(c, 0) for c in (40, 39, 39, 39, 37, 31, 24, 20)], np.int32))
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())
-    world, limits = (*obstacles.shape, count, 1), (RANGE_MAX, 1.0, RANGE_MAX)
-    exact, none, laser = (0, 0.0, 0.0), device.empty(2, real), (1, 1, 0.0)
-    device.compile("cast_ranges", wide)((1, count), rectangles, cells, pose, ray, ranges, *world, *exact, *limits)
+    world = structs.Window(0, 0, *obstacles.shape), count, 1
+    casting = structs.Caster(0, 0.0, 0.0), structs.RangeScale(RANGE_MAX, 1.0, RANGE_MAX)
+    none, laser = device.empty(2, real), (structs.MixtureTables(1, 0, 0.0), structs.Cone(1, 0.0))
+    device.compile("cast_ranges", wide)((1, count), rectangles, cells, pose, ray, ranges, *world, *casting)
     expected = device.download(ranges, np.empty(count, real))
 
     # Warp compiles each set of flags for seconds, so its kernel is unspecialised and compiled once.
@@ -133,7 +135,7 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         device.compile("score_beams", flags | mixture.flags)(
             (count,), rectangles, none, cells, pose, ray, first, device.upload(z),
             device.upload(mixture.terms), none, none, first, none, device.empty(count, real), parts, *world,
-            len(z), *laser, *exact, 0, 0.0, *limits, 0.0, 1.0, 1, 0,
+            len(z), *laser, *casting, structs.Score(0.0, 1.0), structs.ScanBatch(1, 0),
         )  # fmt: skip
         log_p = device.download(parts, np.empty(count * len(z), real))
         values = np.repeat(np.array([list(p.to_dict().values())], real).T, log_p.size, axis=1)
@@ -206,7 +208,7 @@ def _case_rows(case: Case, device: Backend, precision: str) -> Iterator[Row]:
         if recorder.launches:
             truth = np.concatenate([_truth(launch, parameters) for launch in recorder.launches])
             parts = np.concatenate([launch.parts for launch in recorder.launches])
-            fixed = float(recorder.launches[0].values["fixed"])
+            fixed = float(recorder.launches[0].values["score"].constant_term)
             worst = tolerance.difference(parts, truth)
             yield _row(case.name, f"{name}, {tolerance.unit}", worst, tolerance.value, parts, truth)
         total = truth.sum(axis=1) + fixed
@@ -225,7 +227,7 @@ def _truth(launch: Launch, parameters: Any) -> Floats:
     """Compute log p of a launch's beams in float64, on its rounded readings and expected ranges."""
     if launch.expected is None:
         return replay(launch)[1]
-    z, top = launch.values["reading"].astype(np.float64), float(launch.values["range_max"])
+    z, top = launch.values["reading"].astype(np.float64), float(launch.values["scale"].range_max)
     expected = np.repeat(launch.expected.astype(np.float64), np.diff(launch.values["first"]), axis=1)
     # A reading below range_max may round to range_max in the launch's precision, and is still a hit.
     z = np.where(z == top, np.nextafter(top, 0), z)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense.interface.signatures import KERNELS, Kernel
+from gpusense.interface.structs import STRUCTS
 
 _INTEGERS = (int, np.integer)
 _NUMBERS = (int, float, np.integer, np.floating)
@@ -24,7 +25,7 @@ class Launch(NamedTuple):
         kernel: Its name in the signature table.
         flags: Flags of its code.
         size: Work-items along each axis of the row's launch shape.
-        arguments: Buffers and scalars in the order of the row.
+        arguments: Buffers, scalars and structs in the order of the row.
     """
 
     kernel: str
@@ -56,7 +57,7 @@ def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **argume
         kernel: Its name in the signature table.
         flags: Flags of its code.
         size: Work-items along each axis.
-        **arguments: Every argument of the row: an array's buffer, an integer, or a real number.
+        **arguments: Every argument of the row: an array's buffer, an integer, a real number, or a struct.
 
     Raises:
         TypeError: an argument is missing, unknown, or of the wrong type; the message names it.
@@ -93,13 +94,15 @@ class _Row:
         """Hold the types of arguments to the row.
 
         Raises:
-            TypeError: a number in place of a buffer, a buffer in place of a number, or a real number in place of an
-                integer.
+            TypeError: a number in place of a buffer, a buffer in place of a number, a real number in place of an
+                integer, or another struct.
         """
         for argument, kind in zip(self._row.arguments, types, strict=True):
             is_number = issubclass(kind, _NUMBERS)
             if argument.shape is not None:
-                rule, holds = "a buffer", not is_number
+                rule, holds = "a buffer", not is_number and not issubclass(kind, tuple)
+            elif argument.is_struct:
+                rule, holds = f"a {argument.type}", issubclass(kind, STRUCTS[argument.type])
             elif argument.type == "int":
                 rule, holds = "an integer", issubclass(kind, _INTEGERS)
             else:

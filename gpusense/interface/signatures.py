@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.interface import casters
+from gpusense.interface.structs import STRUCTS
 
 FLAGS = {
     "FLOAT64": "real numbers are float64",
@@ -75,16 +76,18 @@ def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> int:
             return number
         case ast.Name(id=name):
             return int(values[name])
+        case ast.Attribute(value=ast.Name(id=name), attr=field):
+            return int(getattr(values[name], field))
         case ast.BinOp(left=left, op=ast.Add(), right=right):
             return _evaluate(left, values) + _evaluate(right, values)
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
             return _evaluate(left, values) * _evaluate(right, values)
-    raise ValueError(f"shape: must be a sum or product of integers and names, got {ast.unparse(node)!r}")
+    raise ValueError(f"shape: must be a sum or product of integers, names and fields, got {ast.unparse(node)!r}")
 
 
 @dataclass(frozen=True)
 class Argument:
-    """One argument of a kernel: an array (with its shape in words) or a scalar (shape None)."""
+    """One argument of a kernel: an array (with its shape in words), or a scalar or struct (shape None)."""
 
     name: str
     type: str
@@ -92,17 +95,22 @@ class Argument:
     output: bool = False
 
     @property
+    def is_struct(self) -> bool:
+        """Whether the argument is a struct."""
+        return self.type in STRUCTS
+
+    @property
     def width(self) -> int:
         """Numbers per element: 4 for real4."""
         return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
 
     def elements(self, values: Mapping[str, Any]) -> int:
-        """Return the number of elements of an array: its shape sums and multiplies integers and names of scalars."""
+        """Return an array's number of elements: its shape sums and multiplies integers, scalars and structs' fields."""
         assert self.shape is not None
         return _evaluate(ast.parse(self.shape, mode="eval").body, values)
 
     def dtype(self, real: np.dtype) -> np.dtype:
-        """NumPy dtype of one number of the argument."""
+        """NumPy dtype of one number of an array or scalar."""
         base = self.type.rstrip("24")
         return real if base == "real" else _SCALARS[base]
 
@@ -143,45 +151,44 @@ def _kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = Fa
 
 
 _MAP = ("int rows", "int cols")
+_WINDOW = "Window window"
 _POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
 # Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
-_NORMALS = ("real2 normals [(rows + 2) * (cols + 2)]",)
-_CONES = "real2 ray [rays * cone_rays]"
+_NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
+_CONES = "real2 ray [rays * cone.rays]"
 # A map as a caster has it: what an entry is, and how many there are, is the caster's.
 _CAST = ("entry map_table [map]",)
-_CASTER = ("int bins", "real slack", "real tolerance")
+_CASTING = ("Caster caster", "RangeScale scale")
 _PLANES = "ushort rectangles [4 * sectors * (rows + 2) * (cols + 2)]"
 _CHANGED = (
     *_MAP, "int sectors", "int first", "int band", "int top", "int left", "int bottom", "int right",
 )  # fmt: skip
 # Readings and expected ranges to learn from, in blocks of one length.
 _PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
-_RANGE = ("real limit", "real resolution", "real range_max")
 _LANDMARKS = ("real4 landmark [landmarks]", "real4 signature [landmarks]")
+_BUCKETS = "int start [buckets.rows * buckets.cols + 1]"
 # Poses on their way into a window of the grid.
 _GIVEN = (
     "coordinate poses [particles * 3]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
-    "out real4 pose_low [particles]", "out int verdict [2]",
+    "out real4 pose_low [particles]", "out int pose_status [2]",
 )  # fmt: skip
-_FRAME = (
-    "double origin_x", "double origin_y", "double resolution", "double mount_x", "double mount_y", "double yaw_cos",
-    "double yaw_sin", "int first_col", "int first_row", *_MAP, "int particles",
-)  # fmt: skip
+_FRAME = ("Frame frame", _WINDOW, "int particles")
 _PLACED = (*_POSES, "real4 pose_low [particles]")
+_FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
+_POINTS = ("real2 point [readings]", "real2 point_low [readings]", "real terms [6]")
 _FEATURES = ("real feature [28 * features]",)
 _MIXTURE = ("real terms [4]", "real2 arcs [11]")
 _FEATURE_RESULT = (
     "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",
 )  # fmt: skip
-# Rays of a cone and the least cosine of an angle of incidence that returns; kinds of terms, one for each bin of angles.
-_CONE = ("int cone_rays", "real critical")
-_ECHO = ("int kinds", *_CONE)
-_TERMS = ("real terms [10 * kinds]", "real edges [kinds]")
-# With SCANS: where the rays or end points of each scan begin, and its fixed terms; its particles, and those of the
-# launch that come before these.
-_SCANS = ("int start [scans + 1]", "real fixed_of [scans]")
-_OF_SCANS = ("int per_scan", "int ahead")
+_TERMS = (
+    "real terms [10 * tables.incidence_bins]", "real edges [tables.incidence_bins]",
+    "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
+)  # fmt: skip
+# With SCANS: where the rays or end points of each scan begin, and its constant term.
+_SCANS = ("int start [scans + 1]", "real constant_terms [scans]")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
+_SCORE = ("Score score", "ScanBatch batch")
 
 KERNELS: dict[str, Kernel] = {
     "distance_lines": _kernel(
@@ -222,39 +229,35 @@ KERNELS: dict[str, Kernel] = {
     "place_inputs": _kernel(
         "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
         "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
-        "out real guard [blocks]", "out real fixed [1]", *_FRAME, "int head", "int beams", "int each", "int places",
-        "int chosen", "int max_readings", "int possible", "double nearest", "double farthest", "double log_max",
-        "double top", "double guard_scale",
+        "out real guard [blocks]", "out real constant_term [1]", *_FRAME, "int head", "ReadingRules rules",
     ),
     "cast_ranges": _kernel(
-        "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", *_MAP,
-        "int particles", "int rays", *_CASTER, *_RANGE, wide=True,
+        "ranges", "ray particle", *_CAST, *_POSES, "real2 ray [rays]", "out real ranges [particles * rays]", _WINDOW,
+        "int particles", "int rays", *_CASTING, wide=True,
     ),
     "score_beams": _kernel(
         "beam", "particle", *_CAST, *_NORMALS, *_POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
-        *_TERMS, "real sensor [(cells + 1) * (cells + 1)]", *_SCANS, *_RESULT, *_MAP, "int particles", "int rays",
-        "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "real fixed", "real temperature",
-        *_OF_SCANS, wide_group=16,
+        *_TERMS, *_SCANS, *_RESULT, _WINDOW, "int particles", "int rays", "int readings", "MixtureTables tables",
+        "Cone cone", *_CASTING, *_SCORE, wide_group=16,
     ),
     "cast_tiles": _kernel(
         "ranges", "item", *_CAST, *_POSES, "int order [particles]", "real2 ray [rays]",
-        "out real ranges [particles * rays]", *_MAP, "int particles", "int rays", *_CASTER, *_RANGE, "int spread",
+        "out real ranges [particles * rays]", _WINDOW, "int particles", "int rays", *_CASTING, "int spread",
     ),
     "beam_tiles": _kernel(
         "beam", "item", *_CAST, *_NORMALS, *_POSES, "int order [particles]", _CONES, "int first [rays + 1]",
-        "real reading [readings]", *_TERMS, "real sensor [(cells + 1) * (cells + 1)]",
-        "int start [scans + 1]", "out real parts [particles * readings]", *_MAP, "int particles", "int rays",
-        "int readings", *_ECHO, *_CASTER, "int cells", "real per_metre", *_RANGE, "int across", "int along",
-        "int spread", "int per_scan",
+        "real reading [readings]", *_TERMS, "int start [scans + 1]", "out real parts [readings * particles]", _WINDOW,
+        "int particles", "int rays", "int readings", "MixtureTables tables", "Cone cone", *_CASTING, "int spread",
+        "ScanBatch batch",
     ),
     "cast_echoes": _kernel(
         "echo", "ray particle", *_CAST, *_NORMALS, *_POSES, _CONES, "out real ranges [particles * rays]",
-        "out real incidence [particles * rays]", *_MAP, "int particles", "int rays", *_CONE, *_CASTER, *_RANGE,
+        "out real incidence [particles * rays]", _WINDOW, "int particles", "int rays", "Cone cone", *_CASTING,
     ),
     "sum_parts": _kernel(
-        "sums", "particle", "real parts [particles * count]", "int order [particles]", "int counts [scans]",
-        "real fixed_of [scans]", "out real log_p [particles]", "int particles", "int count", "int block", "int across",
-        "int along", "real fixed", "real temperature", "int per_scan",
+        "sums", "place", "real parts [count * particles]", "int order [particles]", "int counts [scans]",
+        "real constant_terms [scans]", "out real log_p [particles]", "int particles", "int count", "int block",
+        *_SCORE,
     ),
     "order_bounds": _kernel(
         "order", "bin", *_POSES, "out int bounds [7]", "out int bins [32768]", "int particles",
@@ -270,7 +273,8 @@ KERNELS: dict[str, Kernel] = {
     ),
     "fill_lookup": _kernel(
         "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",
-        "out ushort lookup [rows * cols * bins]", *_MAP, "int bins", "int first_row", "int count", "real limit",
+        "out ushort lookup [window.rows * window.cols * bins]", _WINDOW, "int bins", "int first_row", "int count",
+        "real limit",
     ),
     "fill_field": _kernel(
         "field", "col row", "int squared [rows * cols]", "real density [cap + 1]",
@@ -278,10 +282,9 @@ KERNELS: dict[str, Kernel] = {
         "int width", "int height", "int begin", "int stride",
     ),
     "field_blocks": _kernel(
-        "field", "item", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "real guard [readings]",
-        "int start [scans + 1]", "out real parts [particles * readings]", *_MAP, "int particles", "int readings",
-        "int across", "int along", "int spread", "int per_scan",
+        "field", "item", _FIELD_TABLE, *_PLACED, *_POINTS, "real guard [readings]", "int start [scans + 1]",
+        "out real parts [readings * particles]", _WINDOW, "int particles", "int readings", "int spread",
+        "ScanBatch batch",
     ),
     "e_step": _kernel(
         "learning", "block", *_PAIRS, "real terms [12]", "out real sums [blocks * width]", "int blocks", "int readings",
@@ -292,34 +295,33 @@ KERNELS: dict[str, Kernel] = {
         "int readings", "int across", "int along",
     ),
     "score_field": _kernel(
-        "field", "particle", "real table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", *_SCANS, *_RESULT, *_MAP,
-        "int particles", "int readings", "real guard", "real fixed", "real temperature", *_OF_SCANS, wide=True,
+        "field", "particle", _FIELD_TABLE, *_PLACED, *_POINTS, *_SCANS, *_RESULT, _WINDOW, "int particles",
+        "int readings", "real guard", *_SCORE, wide=True,
     ),
     "score_features": _kernel(
-        "landmark_score", "particle", *_LANDMARKS, "int start [rows * cols + 1]", *_PLACED, *_FEATURES,
-        "int partner [features]", *_MIXTURE, *_FEATURE_RESULT, *_MAP, "int landmarks", "int particles", "int features",
-        "real size", "real share", "real fixed", "real temperature", wide=True,
+        "landmark_score", "particle", *_LANDMARKS, _BUCKETS, *_PLACED, *_FEATURES, "int partner [features]",
+        *_MIXTURE, *_FEATURE_RESULT, "Buckets buckets", "int landmarks", "int particles", "int features",
+        "real share", "Score score", wide=True,
     ),
     "joint_features": _kernel(
         "landmark_joint", "particle", *_LANDMARKS, *_PLACED, *_FEATURES, *_MIXTURE,
         "out real best [particles * sets]", "out int choice [particles * sets * features]",
         "out real value [particles * sets * features]", *_FEATURE_RESULT, "int landmarks", "int particles",
-        "int features", "int sets", "real size", "real fixed", "real temperature",
+        "int features", "int sets", "Buckets buckets", "Score score",
     ),
     "count_unseen": _kernel(
-        "landmark_unseen", "particle", "real4 landmark [landmarks]", "int start [rows * cols + 1]", *_PLACED,
-        "int which [particles * features]", "out real log_p [particles]", *_MAP, "int particles", "int features",
-        "real size", "real range_max", "real axis_cosine", "real axis_sine", "real least", "real log_missed",
+        "landmark_unseen", "particle", "real4 landmark [landmarks]", _BUCKETS, *_PLACED,
+        "int which [particles * features]", "out real log_p [particles]", "Buckets buckets", "int particles",
+        "int features", "SensorView view",
     ),
     "place_relative": _kernel(
         "relative", "particle", "coordinate poses [particles * 3]", "out real4 place [particles]",
-        "out int verdict [2]", "double origin_x", "double origin_y", "double mount_x", "double mount_y",
+        "out int pose_status [2]", "double origin_x", "double origin_y", "double mount_x", "double mount_y",
         "int particles",
     ),
     "wrap_headings": _kernel(
         "relative", "particle", "coordinate poses [particles * 3]", "out real2 residual [particles]",
-        "out int verdict [2]", "double target", "double target_low", "int particles",
+        "out int pose_status [2]", "double target", "double target_low", "int particles",
     ),
     "score_position": _kernel(
         "absolute", "particle", "real4 place [particles]", "real terms [9]", "out real log_p [particles]",
@@ -335,9 +337,9 @@ KERNELS: dict[str, Kernel] = {
         "real temperature",
     ),
     "score_contact": _kernel(
-        "contact", "particle", "int table [(rows + 4) * (cols + 4)]", *_POSES, "real4 pose_low [particles]",
+        "contact", "particle", "int table [(window.rows + 4) * (window.cols + 4)]", *_PLACED,
         "real2 point [points]", "real2 point_low [points]", "int start [segments + 1]", "int pressed [segments]",
-        "real terms [10]", "out real log_p [particles]", "int rows", "int cols", "int particles", "int segments",
+        "real terms [10]", "out real log_p [particles]", _WINDOW, "int particles", "int segments",
         "real guard", "real temperature",
     ),
 }  # fmt: skip

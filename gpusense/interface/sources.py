@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from gpusense.interface import casters
+from gpusense.interface import casters, structs
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
 from gpusense.interface.signatures import FLAGS
 
@@ -97,15 +97,21 @@ def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
     """Return whether a kernel file computes in float64 also where the model's precision is float32."""
     kept = (resolve(opencl_source(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
     texts = (re.sub(r"//.*", "", text) for text in kept)
-    return any(re.search(r"\bdouble[24]?\b", text) for text in texts)
+    return any(re.search(r"\bdouble[24]?\b", text + _declarations(text)) for text in texts)
+
+
+def _declarations(text: str) -> str:
+    """Return the declarations of the structs that a source names."""
+    return "".join(structs.declaration(name) for name in structs.STRUCTS if re.search(rf"\b{name}\b", text))
 
 
 def assemble(file: str, flags: frozenset[str]) -> str:
     """Return the complete OpenCL C source of a kernel file for a set of flags."""
-    parts = [prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))]
+    head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
+    body = ""
     for needed in required_files(file, flags):
-        parts += [f'#line 1 "{needed}.cl"\n', resolve(opencl_source(needed), flags, f"{needed}.cl")]
-    return "".join(parts)
+        body += f'#line 1 "{needed}.cl"\n' + resolve(opencl_source(needed), flags, f"{needed}.cl")
+    return head + _declarations(body) + body
 
 
 def with_places(log: str, source: str) -> str:
@@ -130,6 +136,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
     text = "".join(opencl_source(needed) for needed in files)
+    text += _declarations(text)
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
     if any("caster" in _requirements(needed) for needed in files):
         words |= casters.FLAGS.keys()

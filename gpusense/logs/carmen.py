@@ -44,7 +44,7 @@ _MAX_LINE = 1 << 24
 _TAIL = 3  # time of measurement, host, logger's time
 
 
-def read_carmen(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
+def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
     """Read the records of a CARMEN log; see :func:`gpusense.read_log` for arguments and errors."""
     names = _REAR if rear else _FRONT
     scanners: dict[tuple[float, ...], Scanner] = {}

@@ -2,13 +2,38 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, overload
 
 from gpusense._util import checks
 from gpusense.logs.records import Odometry, Scan
 
+
+@dataclass(frozen=True)
+class Format:
+    """A format of logs.
+
+    Attributes:
+        name: Its name in messages, with an article.
+        module: The module whose function ``read(file, *, range_max, odometry, rear)`` yields its records.
+        suffixes: The ends of its files' names; empty for the format of all files that no other claims.
+    """
+
+    name: str
+    module: str
+    suffixes: tuple[str, ...] = ()
+
+    def claims(self, file: Path) -> bool:
+        """Return whether a file has a name of this format."""
+        return not self.suffixes or file.name.lower().endswith(self.suffixes)
+
+
+# The first format that claims a file reads it.
+FORMATS = (Format("a CARMEN log", "gpusense.logs.carmen"),)
 _OTHER_FORMATS = {".bag": "a ROS 1 bag", ".db3": "a ROS 2 bag", ".mcap": "an MCAP file"}
 
 
@@ -80,9 +105,11 @@ def read_log(
     if file.is_dir():
         other = "a ROS 2 bag" if (file / "metadata.yaml").exists() else "a folder"
     if other is not None:
-        raise ValueError(f"{file}: must be a CARMEN log, which is all that this version reads, got {other}")
+        known = " or ".join(each.name for each in FORMATS)
+        raise ValueError(f"{file}: must be {known}, which is all that this version reads, got {other}")
     checks.existing_file(file)
-
-    from gpusense.logs.carmen import read_carmen
-
-    return read_carmen(file, range_max=range_max, odometry=odometry, rear=rear)
+    form = next(each for each in FORMATS if each.claims(file))
+    records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(
+        file, range_max=range_max, odometry=odometry, rear=rear
+    )
+    return records

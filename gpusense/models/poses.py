@@ -20,14 +20,13 @@ from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import ReachableMap
-from gpusense.world.frames import Cells, Mount, frame_scalars, place_poses
+from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
 
 _INT = np.dtype(np.int32)
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
 _HUGE_SINGLE = _HUGE | {"POSES_FLOAT32"}
-_FRAME = ("origin_x", "origin_y", "resolution", "mount_x", "mount_y", "yaw_cos", "yaw_sin")
 # Poses in a block whose bounds are computed together.
 _BLOCK = 8192
 
@@ -171,11 +170,9 @@ class PlacedPoses:
 
     def arguments(self) -> dict[str, object]:
         """Return the arguments of ``place_poses`` by name."""
-        window = self.frame.window
         return dict(
-            poses=self.source, pose_cell=self.cell, pose=self.pose, pose_low=self.low, verdict=self.status,
-            **dict(zip(_FRAME, frame_scalars(self.frame.cells, self.frame.mount), strict=True)),
-            first_col=window.col, first_row=window.row, rows=window.rows, cols=window.cols, particles=self.count,
+            poses=self.source, pose_cell=self.cell, pose=self.pose, pose_low=self.low, pose_status=self.status,
+            frame=frame_of(self.frame.cells, self.frame.mount), window=self.frame.window, particles=self.count,
         )  # fmt: skip
 
     def launches(self) -> Program:

@@ -37,7 +37,7 @@ def half_sine(residual: Pair) -> Pair:
     return two_sum(x, x_low + x * (z * series))
 
 
-def log_other_turns(residual: Pair, decay: np.floating) -> np.ndarray:
+def log_other_turns(residual: Pair, decay: float) -> np.ndarray:
     """Return the log of the sum over all turns over the normal of the nearest turn."""
     real = residual[0].dtype.type
     half, size = real(HALF_TURN), np.abs(residual[0])
@@ -67,7 +67,7 @@ def score_position(
     terms: np.ndarray,
     log_p: np.ndarray,
     particles: int,
-    temperature: np.floating,
+    temperature: float,
 ) -> None:
     """Score positions; ``terms`` are a, b, c and peak, each with its low part, and the log of the uniform part.
 
@@ -91,7 +91,7 @@ def score_heading(
     log_p: np.ndarray,
     particles: int,
     kind: int,
-    temperature: np.floating,
+    temperature: float,
 ) -> None:
     """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]

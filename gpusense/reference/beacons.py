@@ -88,7 +88,7 @@ def score_beacons(
     beacons: int,
     count: int,
     kind: int,
-    temperature: np.floating,
+    temperature: float,
 ) -> None:
     """Sum log p of ranges over beacons; the first ``count`` numbers of the series belong to a t."""
     sensor = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.compat import compat_density
 from gpusense.reference.echo import echoes, incidence_terms
 from gpusense.reference.error_free import add_term, strand_sums, strands_in
@@ -22,15 +23,14 @@ def reading_term(
     expected: np.ndarray,
     terms: np.ndarray,
     sensor: np.ndarray,
-    cells: int,
-    per_metre: np.floating,
-    range_max: np.floating,
+    tables: structs.MixtureTables,
+    range_max: float,
 ) -> np.ndarray:
     """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
     if "CUBES" in flags:
         term = compat_density(flags, z, expected, terms) ** 3
     elif "SENSOR_TABLE" in flags:
-        term = tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+        term = tabulated_density(z, expected, sensor, tables, range_max)
     else:
         term = log_density(flags, z, expected, terms)
     if "ALL_READINGS" in flags:
@@ -57,70 +57,61 @@ def score_beams(
     edges: np.ndarray,
     sensor: np.ndarray,
     start: np.ndarray,
-    fixed_of: np.ndarray,
+    constant_terms: np.ndarray,
     log_p: np.ndarray,
     parts: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     rays: int,
     readings: int,
-    kinds: int,
-    cone_rays: int,
-    critical: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
-    cells: int,
-    per_metre: np.floating,
-    limit: np.floating,
-    resolution: np.floating,
-    range_max: np.floating,
-    fixed: np.floating,
-    temperature: np.floating,
-    per_scan: int,
-    ahead: int,
+    tables: structs.MixtureTables,
+    cone: structs.Cone,
+    caster: structs.Caster,
+    scale: structs.RangeScale,
+    score: structs.Score,
+    batch: structs.ScanBatch,
 ) -> None:
-    """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and fixed is the constant term.
+    """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
     With SCANS, the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
     """
     if "SCANS" in flags:
-        for scan, part in particles_of_scans(particles, per_scan, ahead):
+        for scan, part in particles_of_scans(particles, batch):
             begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
             score_beams(
-                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone_rays :],
-                scan_first, scan_reading, terms, edges, sensor, start, fixed_of, log_p[part], parts, rows, cols,
-                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), kinds, cone_rays, critical, bins, slack,
-                tolerance, cells, per_metre, limit, resolution, range_max, fixed_of[scan], temperature, per_scan, 0,
+                flags - {"SCANS"}, map_table, normals, pose_cell[part], pose[part], ray[begin * cone.rays :],
+                scan_first, scan_reading, terms, edges, sensor, start, constant_terms, log_p[part], parts, window,
+                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale,
+                structs.Score(constant_terms[scan], score.temperature), batch,
             )  # fmt: skip
         return
     real = pose.dtype
-    block = max((1 << 20) // max(readings * cone_rays, 1), 1)
+    block = max((1 << 20) // max(readings * cone.rays, 1), 1)
     ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
         bin_terms = terms
         if "ECHO" in flags:
             t, cosine, _ = echoes(
-                flags, map_table, normals, rows, cols, pose_cell[begin:end], pose[begin:end], ray, rays, cone_rays,
-                critical, limit, bins, slack, tolerance,
+                flags, map_table, normals, window, pose_cell[begin:end], pose[begin:end], ray, rays, cone, scale.limit,
+                caster,
             )  # fmt: skip
-            ranges = expected_range(t, limit, resolution, range_max)
+            ranges = expected_range(t, scale)
             if "INCIDENCE" in flags:
-                bin_terms = incidence_terms(terms, edges, kinds, cosine.reshape(end - begin, rays)[:, ray_of])
+                cosine = cosine.reshape(end - begin, rays)[:, ray_of]
+                bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine)
         else:
             ranges = np.empty((end - begin) * rays, real)
             cast_ranges(
-                flags, map_table, pose_cell[begin:end], pose[begin:end], ray, ranges, rows, cols, end - begin, rays,
-                bins, slack, tolerance, limit, resolution, range_max,
+                flags, map_table, pose_cell[begin:end], pose[begin:end], ray, ranges, window, end - begin, rays, caster,
+                scale,
             )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        term = reading_term(flags, z, expected, bin_terms, sensor, cells, per_metre, range_max)
+        term = reading_term(flags, z, expected, bin_terms, sensor, tables, scale.range_max)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
-        log_p[begin:end] = sum_terms(flags, term, fixed, temperature, strand_sums)
+        log_p[begin:end] = sum_terms(flags, term, score, strand_sums)
 
 
 def beam_tiles(
@@ -138,28 +129,18 @@ def beam_tiles(
     sensor: np.ndarray,
     start: np.ndarray,
     parts: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     rays: int,
     readings: int,
-    kinds: int,
-    cone_rays: int,
-    critical: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
-    cells: int,
-    per_metre: np.floating,
-    limit: np.floating,
-    resolution: np.floating,
-    range_max: np.floating,
-    across: int,
-    along: int,
+    tables: structs.MixtureTables,
+    cone: structs.Cone,
+    caster: structs.Caster,
+    scale: structs.RangeScale,
     spread: int,
-    per_scan: int,
+    batch: structs.ScanBatch,
 ) -> None:
-    """Write the term of reading k to parts[place * across + k * along]; GPUs do so in tiles of particles and rays.
+    """Write the term of reading k to parts[place + k * particles]; GPUs do so in tiles of particles and rays.
 
     With STRANDED the number there is the sum of strand k.
     """
@@ -167,29 +148,29 @@ def beam_tiles(
     if "ORDERED" in flags:
         places[order[:particles]] = np.arange(particles)
     if "SCANS" in flags:
-        for scan, part in particles_of_scans(particles, per_scan):
+        for scan, part in particles_of_scans(particles, batch):
             begin, scan_rays, scan_first, scan_reading = readings_of_scan(flags, scan, start, first, reading)
             each = int(scan_first[scan_rays])
             each = strands_in(each) if "STRANDED" in flags else each
             scan_parts = np.empty((part.stop - part.start) * each, pose.dtype)
             beam_tiles(
                 flags - {"SCANS", "ORDERED"}, map_table, normals, pose_cell[part], pose[part], order,
-                ray[begin * cone_rays :], scan_first, scan_reading, terms, edges, sensor, start, scan_parts, rows, cols,
-                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), kinds, cone_rays, critical, bins, slack,
-                tolerance, cells, per_metre, limit, resolution, range_max, each, 1, spread, per_scan,
+                ray[begin * cone.rays :], scan_first, scan_reading, terms, edges, sensor, start, scan_parts, window,
+                part.stop - part.start, scan_rays, int(scan_first[scan_rays]), tables, cone, caster, scale, spread,
+                batch,
             )  # fmt: skip
-            at = places[part, None] * across + np.arange(each) * along
+            at = places[part] + np.arange(each)[:, None] * particles
             parts[at] = scan_parts.reshape(at.shape)
         return
     real, single = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_beams(
         flags | {"PER_BEAM"}, map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start,
-        sensor, np.empty(particles, pose.dtype), single, rows, cols, particles, rays, readings, kinds, cone_rays,
-        critical, bins, slack, tolerance, cells, per_metre, limit, resolution, range_max, real(0), real(1), 1, 0,
+        sensor, np.empty(particles, pose.dtype), single, window, particles, rays, readings, tables, cone, caster, scale,
+        structs.Score(real(0), real(1)), batch,
     )  # fmt: skip
     term = single.reshape(particles, readings)
     term = strand_sums(term) if "STRANDED" in flags else term
-    parts[places[:, None] * across + np.arange(term.shape[1]) * along] = term
+    parts[places[:, None] + np.arange(term.shape[1]) * particles] = term
 
 
 def readings_of_scan(
@@ -206,8 +187,7 @@ def readings_of_scan(
 def sum_terms(
     flags: frozenset[str],
     term: np.ndarray,
-    fixed: np.floating,
-    temperature: np.floating,
+    score: structs.Score,
     plainly: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """Sum (M, K) terms and a constant one in the order of the beams; -inf where one of them is -inf.
@@ -215,7 +195,7 @@ def sum_terms(
     ``plainly`` is block_sums or strand_sums, whose results are added to a compensated total.
     """
     finite = np.where(np.isneginf(term), 0, term).astype(term.dtype)
-    total = (np.full(len(term), fixed, term.dtype), np.zeros(len(term), term.dtype))
+    total = (np.full(len(term), score.constant_term, term.dtype), np.zeros(len(term), term.dtype))
     for part in plainly(finite).T:
         total = add_term(total, part)
-    return np.where(np.isneginf(term).any(axis=1), -np.inf, temperature * scan_log(flags, total[0] + total[1]))
+    return np.where(np.isneginf(term).any(axis=1), -np.inf, score.temperature * scan_log(flags, total[0] + total[1]))

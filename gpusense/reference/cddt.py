@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.ray import angle_bin, off_grid, ray_direction
 
 ENTRY_UNIT = 1024.0
@@ -23,41 +24,35 @@ FARTHEST = 1048576.0
 def cast_ray(
     flags: frozenset[str],
     map_table: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
-    limit: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
+    limit: float,
+    caster: structs.Caster,
 ) -> np.ndarray:
     """Return the distance in cells to the first obstacle of the line, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
         map_table: The table above.
-        rows: Rows of the grid.
-        cols: Columns of the grid.
+        window: Size of the grid.
         cell: (M, 2) integer column and row of each origin.
         pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
         ray: (M, 2) cosine and sine of each bearing.
         limit: Longest distance in cells.
-        bins: Angle bins of a full turn.
-        slack: Not used.
-        tolerance: Not used.
+        caster: Its angle bins of a full turn.
     """
     real = pose.dtype.type
     origin = cell.T.astype(np.int64)
-    lines, first = int(map_table[0]), 1 + 3 * bins
-    outside = off_grid(origin, rows, cols)
-    index = np.where(outside, 0, origin[1] * cols + origin[0])
-    bits = map_table[first + bins * lines + 1 + index // 32].astype(np.uint32)
+    lines, first = int(map_table[0]), 1 + 3 * caster.bins
+    outside = off_grid(origin, window.rows, window.cols)
+    index = np.where(outside, 0, origin[1] * window.cols + origin[0])
+    bits = map_table[first + caster.bins * lines + 1 + index // 32].astype(np.uint32)
     inside = ((bits >> (index % 32).astype(np.uint32)) & 1).astype(bool) & ~outside
     if "OUTSIDE_OCCUPIED" in flags:
         inside |= outside
-    bin = angle_bin(np.stack(ray_direction(pose, ray)), bins)
+    bin = angle_bin(np.stack(ray_direction(pose, ray)), caster.bins)
     c = map_table[1 + 3 * bin].astype(pose.dtype) * real(COSINE_UNIT)
     s = map_table[2 + 3 * bin].astype(pose.dtype) * real(COSINE_UNIT)
     x, y = origin.astype(pose.dtype) + pose[:, :2].T

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erfc
 
+from gpusense.interface import structs
 from gpusense.reference.end_point import end_point, field_cell
 from gpusense.reference.error_free import Pair, pair_product, two_product, two_sum
 from gpusense.reference.log_terms import bounded_square, either
@@ -73,12 +74,11 @@ def score_contact(
     pressed: np.ndarray,
     terms: np.ndarray,
     log_p: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     segments: int,
     guard: float,
-    temperature: np.floating,
+    temperature: float,
 ) -> None:
     """Sum log p over segments; segment s has the points start[s] to start[s + 1] - 1."""
     total = np.zeros(particles, terms.dtype)
@@ -88,6 +88,6 @@ def score_contact(
         for i in range(start[s], start[s + 1]):
             end = end_point(flags, sensor_pose, low, point[None, i : i + 1], point_low[None, i : i + 1])
             col, row = pose_cell[:particles, 0] + end.col[:, 0], pose_cell[:particles, 1] + end.row[:, 0]
-            nearest = np.minimum(nearest, table.reshape(-1)[field_cell(col, row, rows, cols)])
+            nearest = np.minimum(nearest, table.reshape(-1)[field_cell(col, row, window)])
         total = total + log_bump(nearest, pressed[s], terms)
     log_p[:particles] = temperature * total

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.ray import make_ray, start_casts
 from gpusense.reference.rectangles import padded
 
@@ -14,36 +15,30 @@ from gpusense.reference.rectangles import padded
 def cast_ray(
     flags: frozenset[str],
     map_table: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
-    limit: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
+    limit: float,
+    caster: structs.Caster,
 ) -> np.ndarray:
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
         map_table: Padded cells, flat.
-        rows: Rows of the grid.
-        cols: Columns of the grid.
+        window: Size of the grid.
         cell: (M, 2) integer column and row of each origin.
         pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
         ray: (M, 2) cosine and sine of each bearing.
         limit: Longest distance in cells.
-        bins: Not used.
-        slack: Not used.
-        tolerance: Not used.
+        caster: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        state = map_table[padded(at[1], at[0], cols)]
+        state = map_table[padded(at[1], at[0], window.cols)]
         hit = state != 0 if "OUTSIDE_OCCUPIED" in flags else state == 1
         ranges[active[hit]] = t[active[hit]]
         active = active[state == 0]

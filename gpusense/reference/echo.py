@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.ranges import BLOCK, caster_of
 from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_grid
 
@@ -19,17 +20,26 @@ def is_wall(normal: np.ndarray) -> np.ndarray:
 
 
 def normal_at(
-    flags: frozenset[str], normals: np.ndarray, rows: int, cols: int, col: np.ndarray, row: np.ndarray
+    flags: frozenset[str],
+    normals: np.ndarray,
+    window: structs.Window,
+    col: np.ndarray,
+    row: np.ndarray,
 ) -> np.ndarray:
     """Return (M, 2) normals of cells."""
-    beyond = off_grid(np.stack([col + 1, row + 1]), rows + 2, cols + 2)
-    normal = normals[np.where(beyond, 0, (row + 1) * (cols + 2) + col + 1)]
+    beyond = off_grid(np.stack([col + 1, row + 1]), window.rows + 2, window.cols + 2)
+    normal = normals[np.where(beyond, 0, (row + 1) * (window.cols + 2) + col + 1)]
     normal[beyond] = np.nan if "OUTSIDE_OCCUPIED" in flags else 0
     return normal
 
 
 def hit_normal(
-    flags: frozenset[str], normals: np.ndarray, rows: int, cols: int, cell: np.ndarray, r: Ray, t: np.ndarray
+    flags: frozenset[str],
+    normals: np.ndarray,
+    window: structs.Window,
+    cell: np.ndarray,
+    r: Ray,
+    t: np.ndarray,
 ) -> np.ndarray:
     """Return the normals of the cells in which M rays end at distances t.
 
@@ -42,32 +52,29 @@ def hit_normal(
         y + r.step[1] * crossed(t, r.speed[1], r.a[1], r.inv[1], upto).astype(np.int64) for upto in (False, True)
     )
     start_normal, first, second = (
-        normal_at(flags, normals, rows, cols, *at) for at in ((x, y), (col, before), (col, until))
+        normal_at(flags, normals, window, *at) for at in ((x, y), (col, before), (col, until))
     )
     later = np.where(is_wall(first)[:, None], first, second)
     return np.where(((t == 0) & is_wall(start_normal))[:, None], start_normal, later)
 
 
-def incidence_terms(terms: np.ndarray, edges: np.ndarray, kinds: int, cosine: np.ndarray) -> np.ndarray:
+def incidence_terms(terms: np.ndarray, edges: np.ndarray, incidence_bins: int, cosine: np.ndarray) -> np.ndarray:
     """Return (10, ...) terms of the mixture for angles of incidence; edges are cosines of the bins' upper ends."""
-    bins = (cosine[..., None] <= edges[: kinds - 1]).sum(axis=-1)
-    return np.moveaxis(terms[: 10 * kinds].reshape(kinds, 10)[bins], -1, 0)
+    bins = (cosine[..., None] <= edges[: incidence_bins - 1]).sum(axis=-1)
+    return np.moveaxis(terms[: 10 * incidence_bins].reshape(incidence_bins, 10)[bins], -1, 0)
 
 
 def nearest_echo(
     flags: frozenset[str],
     map_table: np.ndarray,
     normals: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
-    critical: np.floating,
-    limit: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
+    critical: float,
+    limit: float,
+    caster: structs.Caster,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the nearest returns of M cones.
 
@@ -77,16 +84,13 @@ def nearest_echo(
         flags: Flags of the signature table.
         map_table: The caster's table of the map.
         normals: Padded normals; see above.
-        rows: Rows of the grid.
-        cols: Columns of the grid.
+        window: Size of the grid.
         cell: (M, 2) integer column and row of each origin.
         pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
         ray: (M, C, 2) cosine and sine of each cone's rays.
         critical: Least cosine.
         limit: Longest distance in cells.
-        bins: The caster's, as ``slack`` and ``tolerance`` are.
-        slack: See ``bins``.
-        tolerance: See ``bins``.
+        caster: The knobs of the caster.
 
     Returns:
         (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence, 2 and 0
@@ -96,13 +100,11 @@ def nearest_echo(
     nearest = np.full(len(cell), limit, pose.dtype)
     cosine, sine = np.full_like(nearest, 2), np.zeros_like(nearest)
     for i in range(ray.shape[1]):
-        t = caster_of(flags).cast_ray(
-            flags, map_table, rows, cols, cell, pose, ray[:, i], limit, bins, slack, tolerance
-        )
+        t = caster_of(flags).cast_ray(flags, map_table, window, cell, pose, ray[:, i], limit, caster)
         heard = t < nearest
         if "INCIDENCE" in flags:
             r = make_ray(pose, ray[:, i])
-            normal = hit_normal(flags, normals, rows, cols, cell, r, t)
+            normal = hit_normal(flags, normals, window, cell, r, t)
             known, (dx, dy) = ~np.isnan(normal[:, 0]), r.direction
             straight = np.where(known, np.abs(dx * normal[:, 0] + dy * normal[:, 1]), real(1))
             aslant = np.where(known, np.abs(dx * normal[:, 1] - dy * normal[:, 0]), real(0))
@@ -121,18 +123,12 @@ def cast_echoes(
     ray: np.ndarray,
     ranges: np.ndarray,
     incidence: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     rays: int,
-    cone_rays: int,
-    critical: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
-    limit: np.floating,
-    resolution: np.floating,
-    range_max: np.floating,
+    cone: structs.Cone,
+    caster: structs.Caster,
+    scale: structs.RangeScale,
 ) -> None:
     """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return."""
     block = max(BLOCK // max(rays, 1), 1)
@@ -140,28 +136,27 @@ def cast_echoes(
         part = slice(first, min(first + block, particles))
         entries = slice(part.start * rays, part.stop * rays)
         t, cosine, sine = echoes(
-            flags, map_table, normals, rows, cols, pose_cell[part], pose[part], ray, rays, cone_rays, critical, limit,
-            bins, slack, tolerance,
+            flags, map_table, normals, window, pose_cell[part], pose[part], ray, rays, cone, scale.limit, caster
         )  # fmt: skip
-        ranges[entries] = expected_range(t, limit, resolution, range_max)
+        ranges[entries] = expected_range(t, scale)
         if "INCIDENCE" in flags:
-            incidence[entries] = np.where(t < limit, np.arctan2(sine, cosine), np.nan)
+            incidence[entries] = np.where(t < scale.limit, np.arctan2(sine, cosine), np.nan)
 
 
 def echoes(
     flags: frozenset[str],
     map_table: np.ndarray,
     normals: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
     rays: int,
-    cone_rays: int,
-    *rest: np.floating | int,
+    cone: structs.Cone,
+    limit: float,
+    caster: structs.Caster,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ``nearest_echo`` of all cones at all poses, (N * rays,) each."""
     lanes = (np.repeat(cell, rays, axis=0), np.repeat(pose, rays, axis=0))
-    cones = np.tile(ray[: rays * cone_rays].reshape(rays, cone_rays, 2), (len(pose), 1, 1))
-    return nearest_echo(flags, map_table, normals, rows, cols, *lanes, cones, *rest)  # type: ignore[arg-type]
+    cones = np.tile(ray[: rays * cone.rays].reshape(rays, cone.rays, 2), (len(pose), 1, 1))
+    return nearest_echo(flags, map_table, normals, window, *lanes, cones, cone.critical, limit, caster)

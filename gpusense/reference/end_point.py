@@ -10,17 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.constants import FIELD_RING
 from gpusense.reference.error_free import Pair, pair_sum, two_product, two_sum
 
 EDGE = 2.0**-33
 
 
-def field_cell(col: np.ndarray, row: np.ndarray, rows: int, cols: int) -> np.ndarray:
+def field_cell(col: np.ndarray, row: np.ndarray, window: structs.Window) -> np.ndarray:
     """Return the index of a cell of the padded table; far cells become ring cells."""
-    c = np.clip(col, -FIELD_RING, cols + FIELD_RING - 1)
-    r = np.clip(row, -FIELD_RING, rows + FIELD_RING - 1)
-    return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
+    c = np.clip(col, -FIELD_RING, window.cols + FIELD_RING - 1)
+    r = np.clip(row, -FIELD_RING, window.rows + FIELD_RING - 1)
+    return (r + FIELD_RING) * (window.cols + 2 * FIELD_RING) + c + FIELD_RING
 
 
 def careful_offset(frac: Pair, a: Pair, b: Pair, c: Pair, d: Pair, sign: int) -> Pair:

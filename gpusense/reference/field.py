@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
+from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, block_sums, pair_product, pair_sum
@@ -23,14 +25,19 @@ def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: P
 
 
 def bilinear(
-    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, rows: int, cols: int
+    flags: frozenset[str],
+    table: np.ndarray,
+    col: np.ndarray,
+    row: np.ndarray,
+    end: EndPoint,
+    window: structs.Window,
 ) -> Pair:
     """Interpolate the distance between the four cell centres around an end point, in two parts."""
     zero = np.zeros_like(end.rest_x[0])
-    a = table[field_cell(col, row, rows, cols)], zero
-    b = table[field_cell(col + 1, row, rows, cols)], zero
-    c = table[field_cell(col, row + 1, rows, cols)], zero
-    d = table[field_cell(col + 1, row + 1, rows, cols)], zero
+    a = table[field_cell(col, row, window)], zero
+    b = table[field_cell(col + 1, row, window)], zero
+    c = table[field_cell(col, row + 1, window)], zero
+    d = table[field_cell(col + 1, row + 1, window)], zero
     low = between(flags, end.to_next_x, a, end.rest_x, b)
     high = between(flags, end.to_next_x, c, end.rest_x, d)
     return between(flags, end.to_next_y, low, end.rest_y, high)
@@ -67,16 +74,15 @@ def reading_value(
     point: np.ndarray,
     point_low: np.ndarray,
     terms: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
 ) -> np.ndarray:
     """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
     end = end_point(flags, pose, pose_low, point, point_low)
     col, row = end.col + origin[..., 0], end.row + origin[..., 1]
     if "BILINEAR" in flags:
-        term = log_field(flags, bilinear(flags, table, col, row, end, rows, cols), terms)
+        term = log_field(flags, bilinear(flags, table, col, row, end, window), terms)
     else:
-        term = table[field_cell(col, row, rows, cols)]
+        term = table[field_cell(col, row, window)]
         term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
     if "ALL_READINGS" in flags:
         x = point[..., 0]
@@ -92,7 +98,7 @@ def fill_field(
     rows: int,
     cols: int,
     cap: int,
-    beyond: np.floating,
+    beyond: float,
     from_col: int,
     from_row: int,
     width: int,
@@ -124,27 +130,24 @@ def score_field(
     point_low: np.ndarray,
     terms: np.ndarray,
     start: np.ndarray,
-    fixed_of: np.ndarray,
+    constant_terms: np.ndarray,
     log_p: np.ndarray,
     parts: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     readings: int,
-    guard: np.floating,
-    fixed: np.floating,
-    temperature: np.floating,
-    per_scan: int,
-    ahead: int,
+    guard: float,
+    score: structs.Score,
+    batch: structs.ScanBatch,
 ) -> None:
     """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
-        for scan, part in particles_of_scans(particles, per_scan, ahead):
+        for scan, part in particles_of_scans(particles, batch):
             first, last = start[scan], start[scan + 1]
             score_field(
                 flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
-                point_low[first:last], terms, start, fixed_of, log_p[part], parts, rows, cols, part.stop - part.start,
-                int(last - first), guard, fixed_of[scan], temperature, per_scan, 0,
+                point_low[first:last], terms, start, constant_terms, log_p[part], parts, window, part.stop - part.start,
+                int(last - first), guard, structs.Score(constant_terms[scan], score.temperature), batch,
             )  # fmt: skip
         return
     block = max(BLOCK // max(readings, 1), 1)
@@ -153,12 +156,12 @@ def score_field(
         part = slice(begin, min(begin + block, particles))
         low = pose_low[part, None] if "CAREFUL" in flags else pose_low[None, :1]
         term = reading_value(
-            flags, table, pose_cell[part, None], pose[part, None], low, points, point_low[None, :readings], terms, rows,
-            cols,
+            flags, table, pose_cell[part, None], pose[part, None], low, points, point_low[None, :readings], terms,
+            window,
         )  # fmt: skip
         if "PER_BEAM" in flags:
             parts[begin * readings : part.stop * readings] = term.ravel()
-        log_p[part] = sum_terms(flags, term, fixed, temperature, block_sums)
+        log_p[part] = sum_terms(flags, term, score, block_sums)
 
 
 def field_blocks(
@@ -173,30 +176,31 @@ def field_blocks(
     guard: np.ndarray,
     start: np.ndarray,
     parts: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     readings: int,
-    across: int,
-    along: int,
     spread: int,
-    per_scan: int,
+    batch: structs.ScanBatch,
 ) -> None:
-    """Write the sums of blocks of readings to parts[n * across + block * along]; GPUs compute them one by one."""
+    """Write the sums of blocks of readings to parts[n + block * particles]; GPUs compute them one by one."""
     if "SCANS" in flags:
-        for scan, part in particles_of_scans(particles, per_scan):
+        for scan, part in particles_of_scans(particles, batch):
             first, last = start[scan], start[scan + 1]
+            blocks, count = -(-int(last - first) // BLOCK_TERMS), part.stop - part.start
+            scan_parts = np.empty(count * blocks, pose.dtype)
             field_blocks(
                 flags - {"SCANS"}, table, pose_cell[part], pose[part], pose_low[part], point[first:last],
-                point_low[first:last], terms, guard, start, parts[part.start * across :], rows, cols,
-                part.stop - part.start, int(last - first), across, along, spread, per_scan,
+                point_low[first:last], terms, guard, start, scan_parts, window, count, int(last - first), spread, batch,
             )  # fmt: skip
+            at = np.arange(part.start, part.stop) + np.arange(blocks)[:, None] * particles
+            parts[at] = scan_parts.reshape(at.shape)
         return
     real, each = pose.dtype.type, np.empty(particles * readings, pose.dtype)
     score_field(
         flags | {"PER_BEAM"}, table, pose_cell, pose, pose_low, point, point_low, terms, start, guard,
-        np.empty(particles, pose.dtype), each, rows, cols, particles, readings, real(0), real(0), real(1), 1, 0,
+        np.empty(particles, pose.dtype), each, window, particles, readings, real(0), structs.Score(real(0), real(1)),
+        batch,
     )  # fmt: skip
     each = each.reshape(particles, readings)
     sums = block_sums(each)
-    parts[np.arange(particles)[:, None] * across + np.arange(sums.shape[1]) * along] = sums
+    parts[np.arange(particles)[:, None] + np.arange(sums.shape[1]) * particles] = sums

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.feature_layout import AXIS, FARTHEST, HOLE, RADIUS, REACH
 from gpusense.reference.landmarks import at_places, log_detection
 from gpusense.reference.offsets import Quad, offset
@@ -17,23 +18,27 @@ from gpusense.reference.offsets import Quad, offset
 BLOCK_PAIRS = 1 << 18
 
 
-def bucket_at(position: np.ndarray, size: np.floating, count: int) -> np.ndarray:
+def bucket_at(position: np.ndarray, size: float, count: int) -> np.ndarray:
     """Return the row or column of the bucket at a position, the nearest one for positions outside."""
     return np.clip(np.floor(position / size), 0, count - 1).astype(np.int64)
 
 
 def candidates(
-    start: np.ndarray, place: Quad, turned: Quad, feature: np.ndarray, rows: int, cols: int, size: np.floating
+    start: np.ndarray,
+    place: Quad,
+    turned: Quad,
+    feature: np.ndarray,
+    buckets: structs.Buckets,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return runs of landmarks in the buckets that discs touch: (P, rows of buckets) first and last + 1."""
     reach, radius = feature[REACH], feature[RADIUS]
     x, y = place[0] + reach * turned[0], place[2] + reach * turned[2]
-    left, right = bucket_at(x - radius, size, cols), bucket_at(x + radius, size, cols)
-    low, high = bucket_at(y - radius, size, rows), bucket_at(y + radius, size, rows)
+    left, right = bucket_at(x - radius, buckets.size, buckets.cols), bucket_at(x + radius, buckets.size, buckets.cols)
+    low, high = bucket_at(y - radius, buckets.size, buckets.rows), bucket_at(y + radius, buckets.size, buckets.rows)
     row = low[:, None] + np.arange((high - low).max(initial=-1) + 1)
     inside = row <= high[:, None]
-    row = np.minimum(row, rows - 1)
-    first, last = start[row * cols + left[:, None]], start[row * cols + right[:, None] + 1]
+    row = np.minimum(row, buckets.rows - 1)
+    first, last = start[row * buckets.cols + left[:, None]], start[row * buckets.cols + right[:, None] + 1]
     return first, np.where(inside, last, first)
 
 
@@ -57,9 +62,7 @@ def search(
     feature: np.ndarray,
     terms: np.ndarray,
     arcs: np.ndarray,
-    rows: int,
-    cols: int,
-    size: np.floating,
+    buckets: structs.Buckets,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return per particle the log density, that of the likeliest landmark, and the index of that landmark.
 
@@ -70,7 +73,7 @@ def search(
     if feature[RADIUS] < 0:
         return best, best, chosen
     log_p = best.copy()
-    first, last = candidates(start, place, turned, feature, rows, cols, size)
+    first, last = candidates(start, place, turned, feature, buckets)
     counts = (last - first).sum(axis=1)
     ends = np.cumsum(counts)
     begin = 0

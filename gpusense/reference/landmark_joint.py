@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE, RADIUS
 from gpusense.reference.landmark_grid import near
 from gpusense.reference.landmarks import direction, log_detection, sensor_place
@@ -36,9 +37,8 @@ def joint_features(
     particles: int,
     features: int,
     sets: int,
-    size: np.floating,
-    fixed: np.floating,
-    temperature: np.floating,
+    buckets: structs.Buckets,
+    score: structs.Score,
 ) -> None:
     """Find the best joint association of each particle.
 
@@ -46,7 +46,7 @@ def joint_features(
     """
     real = pose.dtype
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
-    place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], size)
+    place = sensor_place(pose_cell[:particles], pose[:particles], pose_low[:particles], buckets.size)
     turned = [direction(pose[:particles], pose_low[:particles], one) for one in numbers[:features]]
     sums = best[: particles * sets].reshape(particles, sets)
     partners = choice[: particles * sets * features].reshape(particles, sets, features)
@@ -80,7 +80,7 @@ def joint_features(
                 total = total + numbers[k, FALSE_POSITIVE]
         better = total > most
         most[better], chosen[better] = total[better], s
-    log_p[:particles] = np.where(np.isneginf(most), most, temperature * (fixed + most))
+    log_p[:particles] = np.where(np.isneginf(most), most, score.temperature * (score.constant_term + most))
     if "PER_BEAM" in flags:
         n = np.arange(particles)
         detected, values = partners[n, chosen], each[n, chosen]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE
 from gpusense.reference.error_free import add_term
@@ -31,15 +32,12 @@ def score_features(
     log_p: np.ndarray,
     parts: np.ndarray,
     which: np.ndarray,
-    rows: int,
-    cols: int,
+    buckets: structs.Buckets,
     landmarks: int,
     particles: int,
     features: int,
-    size: np.floating,
-    share: np.floating,
-    fixed: np.floating,
-    temperature: np.floating,
+    share: float,
+    score: structs.Score,
 ) -> None:
     """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
 
@@ -49,9 +47,9 @@ def score_features(
     numbers = feature.reshape(-1)[: FEATURE * features].reshape(-1, FEATURE)
     for begin in range(0, particles, BLOCK):
         part = slice(begin, min(begin + BLOCK, particles))
-        place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)
+        place = sensor_place(pose_cell[part], pose[part], pose_low[part], buckets.size)
         count = len(place[0])
-        total = (np.full(count, fixed, pose.dtype), np.zeros(count, pose.dtype))
+        total = (np.full(count, score.constant_term, pose.dtype), np.zeros(count, pose.dtype))
         impossible = np.zeros(count, bool)
         for k in range(0, features, BLOCK_TERMS):
             block = np.zeros(count, pose.dtype)
@@ -63,7 +61,7 @@ def score_features(
                     best, chosen = detected, j
                 else:
                     detected, best, chosen = search(
-                        flags, landmark, signature, start, place, turned, one, terms, arcs, rows, cols, size
+                        flags, landmark, signature, start, place, turned, one, terms, arcs, buckets
                     )
                 value = either(detected + share, one[FALSE_POSITIVE])
                 impossible |= np.isneginf(value)
@@ -73,4 +71,4 @@ def score_features(
                     parts[at] = value
                     which[at] = np.where(best + share >= one[FALSE_POSITIVE], chosen, -1)
             total = add_term(total, block)
-        log_p[part] = np.where(impossible, -np.inf, temperature * (total[0] + total[1]))
+        log_p[part] = np.where(impossible, -np.inf, score.temperature * (total[0] + total[1]))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.landmark_grid import BLOCK_PAIRS, bucket_at
 from gpusense.reference.landmarks import at_places, sensor_place
 from gpusense.reference.offsets import Quad, offset
 
 
-def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: np.floating, least: np.floating) -> np.ndarray:
+def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: float, least: float) -> np.ndarray:
     """Return whether landmarks are within range, with a cosine of the angle to the sensor's axis >= ``least``."""
     d = np.sqrt(off[0] * off[0] + off[2] * off[2])
     return (d <= range_max) & (cosine * off[0] + sine * off[2] >= least * d)
@@ -24,32 +25,29 @@ def count_unseen(
     pose_low: np.ndarray,
     which: np.ndarray,
     log_p: np.ndarray,
-    rows: int,
-    cols: int,
+    buckets: structs.Buckets,
     particles: int,
     features: int,
-    size: np.floating,
-    range_max: np.floating,
-    axis_cosine: np.floating,
-    axis_sine: np.floating,
-    least: np.floating,
-    log_missed: np.floating,
+    view: structs.SensorView,
 ) -> None:
     """Add ``log_missed`` to log_p for every landmark in view that belongs to no feature."""
-    block = max(BLOCK_PAIRS // max(int(start[rows * cols]), 1), 1)
+    block = max(BLOCK_PAIRS // max(int(start[buckets.rows * buckets.cols]), 1), 1)
     for begin in range(0, particles, block):
         part = slice(begin, min(begin + block, particles))
-        place = sensor_place(pose_cell[part], pose[part], pose_low[part], size)
-        cosine = pose[part, 2] * axis_cosine - pose[part, 3] * axis_sine
-        sine = pose[part, 3] * axis_cosine + pose[part, 2] * axis_sine
-        low, high = bucket_at(place[2] - range_max, size, rows), bucket_at(place[2] + range_max, size, rows)
-        first, last = int(start[low.min() * cols]), int(start[(high.max() + 1) * cols])
+        place = sensor_place(pose_cell[part], pose[part], pose_low[part], buckets.size)
+        cosine = pose[part, 2] * view.axis_cosine - pose[part, 3] * view.axis_sine
+        sine = pose[part, 3] * view.axis_cosine + pose[part, 2] * view.axis_sine
+        low, high = (
+            bucket_at(place[2] - view.range_max, buckets.size, buckets.rows),
+            bucket_at(place[2] + view.range_max, buckets.size, buckets.rows),
+        )
+        first, last = int(start[low.min() * buckets.cols]), int(start[(high.max() + 1) * buckets.cols])
         for n in range(len(low)):
             sensor = at_places(place, slice(n, n + 1))
-            seen = in_view(offset(landmark[first:last], sensor), cosine[n], sine[n], range_max, least)
+            seen = in_view(offset(landmark[first:last], sensor), cosine[n], sine[n], view.range_max, view.least)
             at = (begin + n) * features
             taken = np.unique(which[at : at + features])
             taken = taken[(taken >= first) & (taken < last)] - first
             unseen = np.count_nonzero(seen) - np.count_nonzero(seen[taken])
             if unseen:
-                log_p[begin + n] += unseen * log_missed
+                log_p[begin + n] += unseen * view.log_missed

@@ -56,7 +56,7 @@ def at_places(quad: Quad, places: np.ndarray | slice) -> Quad:
     return quad[0][places], quad[1][places], quad[2][places], quad[3][places]
 
 
-def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, size: np.floating) -> Quad:
+def sensor_place(pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, size: float) -> Quad:
     """Return the places of sensors in metres from the origin of the buckets; ``size`` is the side of a bucket."""
     x = two_sum(pose_cell[:, 0].astype(pose.dtype), pose[:, 0])
     y = two_sum(pose_cell[:, 1].astype(pose.dtype), pose[:, 1])
@@ -123,13 +123,13 @@ def angle_pair(side: Pair, ahead: Pair, arcs: np.ndarray) -> Pair:
     return negative_where(np.signbit(side[0]), arc)
 
 
-def range_mass(d: Pair, scale: np.floating, terms: np.ndarray) -> np.ndarray:
+def range_mass(d: Pair, scale: float, terms: np.ndarray) -> np.ndarray:
     """Return the mass of the normal around d on [0, range_max]; d is clamped to range_max."""
     above = np.maximum((terms[0] - d[0]) + (terms[1] - d[1]), 0)
     return d[0].dtype.type(0.5) * (erf(np.minimum(d[0], terms[0]) * scale) + erf(above * scale))
 
 
-def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: np.floating, terms: np.ndarray,
+def field_mass(angle: Pair, upper: float, upper_low: np.floating, scale: np.floating, terms: np.ndarray,
                arcs: np.ndarray) -> np.ndarray:  # fmt: skip
     """Return the mass of the normal around a landmark's bearing on the field of view.
 
@@ -148,7 +148,7 @@ def field_mass(angle: Pair, upper: np.floating, upper_low: np.floating, scale: n
     return angle[0].dtype.type(0.5) * mass
 
 
-def add_square(total: Pair, residual: Pair, scale: np.floating, scale_low: np.floating) -> Pair:
+def add_square(total: Pair, residual: Pair, scale: float, scale_low: np.floating) -> Pair:
     """Add (residual * scale)^2 to an exponent, in two parts, since exponents and peaks may nearly cancel."""
     u = pair_product(residual, (np.asarray(scale), np.asarray(scale_low)))
     more = pair_sum(total, pair_product(u, u))

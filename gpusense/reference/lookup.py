@@ -8,41 +8,36 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.ray import angle_bin, make_ray, start_casts
 
 
 def cast_ray(
     flags: frozenset[str],
     map_table: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
-    limit: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
+    limit: float,
+    caster: structs.Caster,
 ) -> np.ndarray:
     """Return the distance in cells from the table, limit where no obstacle is nearer.
 
     Args:
         flags: Flags of the signature table.
         map_table: (rows * cols * bins) ranges.
-        rows: Rows of the grid.
-        cols: Columns of the grid.
+        window: Size of the grid.
         cell: (M, 2) integer column and row of each origin.
         pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
         ray: (M, 2) cosine and sine of each bearing.
         limit: Longest distance in cells.
-        bins: Angle bins of a full turn.
-        slack: Not used.
-        tolerance: Not used.
+        caster: Its angle bins of a full turn.
     """
     r = make_ray(pose, ray)
-    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)
     at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-    part = map_table[(at[1] * cols + at[0]) * bins + angle_bin(r.direction[:, active], bins)]
+    part = map_table[(at[1] * window.cols + at[0]) * caster.bins + angle_bin(r.direction[:, active], caster.bins)]
     far = t[active] + part.astype(pose.dtype) * (limit / pose.dtype.type(65535))
     ranges[active] = np.where(part == 65535, limit, np.minimum(far, limit))
     return ranges

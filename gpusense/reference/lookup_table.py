@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.raycast import cast_ray
 
 BLOCK = 1 << 15
@@ -14,24 +15,23 @@ def fill_lookup(
     rectangles: np.ndarray,
     ray: np.ndarray,
     lookup: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     bins: int,
     first_row: int,
     count: int,
-    limit: np.floating,
+    limit: float,
 ) -> None:
     """Fill rows of the table; a hit is at most 65 534, and 65 535 means no hit."""
     real = ray.dtype.type
     block = max(BLOCK // bins, 1)
     none = real(0)
-    for begin in range(first_row * cols, (first_row + count) * cols, block):
-        index = np.arange(begin, min(begin + block, (first_row + count) * cols))
-        cell = np.repeat(np.stack([index % cols, index // cols], axis=1), bins, axis=0)
+    for begin in range(first_row * window.cols, (first_row + count) * window.cols, block):
+        index = np.arange(begin, min(begin + block, (first_row + count) * window.cols))
+        cell = np.repeat(np.stack([index % window.cols, index // window.cols], axis=1), bins, axis=0)
         pose = np.empty((len(cell), 4), ray.dtype)
         pose[:, :2] = 0.5
         pose[:, 2:] = np.tile(ray[:bins], (len(index), 1))
         forward = np.broadcast_to(np.array([1, 0], ray.dtype), (len(cell), 2))
-        t = cast_ray(flags, rectangles, rows, cols, cell, pose, forward, limit, 0, none, none)
+        t = cast_ray(flags, rectangles, window, cell, pose, forward, limit, structs.Caster(0, none, none))
         part = np.minimum((t * (real(65535) / limit) + real(0.5)).astype(np.int64), 65534)
         lookup[begin * bins : begin * bins + len(t)] = np.where(t >= limit, 65535, part)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.ray import make_ray, off_grid, start_walk
 
 LEAST_STEP = 2.0**-22
@@ -18,54 +19,48 @@ LEAST_STEP = 2.0**-22
 def cast_ray(
     flags: frozenset[str],
     map_table: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
-    limit: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
+    limit: float,
+    caster: structs.Caster,
 ) -> np.ndarray:
     """Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
         map_table: Distances between cell centres, in cells.
-        rows: Rows of the grid.
-        cols: Columns of the grid.
+        window: Size of the grid.
         cell: (M, 2) integer column and row of each origin.
         pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
         ray: (M, 2) cosine and sine of each bearing.
         limit: Longest distance in cells.
-        bins: Not used.
-        slack: Difference between the distance and a step [cells].
-        tolerance: The least step [cells].
+        caster: The difference between the distance and a step, and the least step [cells].
     """
     real = pose.dtype.type
     r = make_ray(pose, ray)
     origin = cell.T.astype(np.int64)
     ranges = np.full(len(cell), limit, pose.dtype)
-    outside = off_grid(origin, rows, cols)
+    outside = off_grid(origin, window.rows, window.cols)
     if "OUTSIDE_OCCUPIED" in flags:
         ranges[outside] = 0
         t = np.where(outside, limit, real(0))
     else:
-        t = start_walk(flags, r, cell, rows, cols, limit)[1]
-        t = np.where(outside, t + (tolerance + t * real(LEAST_STEP)), t)
+        t = start_walk(flags, r, cell, window, limit)[1]
+        t = np.where(outside, t + (caster.tolerance + t * real(LEAST_STEP)), t)
     active = np.flatnonzero(t < limit)
     while len(active):
         place = pose[active, :2].T + t[active] * r.direction[:, active]
         at = origin[:, active] + np.floor(place).astype(np.int64)
-        off = off_grid(at, rows, cols)
+        off = off_grid(at, window.rows, window.cols)
         if "OUTSIDE_OCCUPIED" in flags:
             ranges[active[off]] = t[active[off]]
         active, at = active[~off], at[:, ~off]
-        distance = map_table[at[1] * cols + at[0]].astype(pose.dtype)
+        distance = map_table[at[1] * window.cols + at[0]].astype(pose.dtype)
         hit = distance == 0
         ranges[active[hit]] = t[active[hit]]
         active, distance = active[~hit], distance[~hit]
-        t[active] += np.maximum(distance - slack, tolerance + t[active] * real(LEAST_STEP))
+        t[active] += np.maximum(distance - caster.slack, caster.tolerance + t[active] * real(LEAST_STEP))
         active = active[t[active] < limit]
     return ranges

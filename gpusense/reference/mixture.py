@@ -16,7 +16,7 @@ TINY = 1e-30
 SMALLEST_RANGE = 1e-37
 
 
-def hit_mass(expected: np.ndarray, erf_scale: np.floating, range_max: np.floating) -> np.ndarray:
+def hit_mass(expected: np.ndarray, erf_scale: float, range_max: np.floating) -> np.ndarray:
     """Return the mass of the normal around z* on [0, range_max], a sum of positive terms, so nothing cancels."""
     half = expected.dtype.type(0.5)
     return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
@@ -60,7 +60,7 @@ def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndar
     return np.where(inside, log_p, -np.inf)
 
 
-def short_peak(decay: np.floating, expected: np.ndarray) -> np.ndarray:
+def short_peak(decay: float, expected: np.ndarray) -> np.ndarray:
     """Return ``lambda / (1 - exp(-2 h))`` as lambda (1 + t) / (2 t), h = lambda z* / 2 and t = tanh(h); 1 / z* at 0."""
     h = expected.dtype.type(0.5) * (decay * expected)
     t = np.tanh(np.where(h > TINY, h, 1))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.heading import cos_sin
 
 # Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
@@ -25,47 +26,38 @@ def place_pose(
     pose_cell: np.ndarray,
     pose: np.ndarray,
     pose_low: np.ndarray,
-    verdict: np.ndarray,
-    origin_x: float,
-    origin_y: float,
-    resolution: float,
-    mount_x: float,
-    mount_y: float,
-    yaw_cos: float,
-    yaw_sin: float,
-    first_col: int,
-    first_row: int,
-    rows: int,
-    cols: int,
+    pose_status: np.ndarray,
+    frame: structs.Frame,
+    window: structs.Window,
 ) -> None:
     """Place sensors: (M, 3) poses times the scanner's mount, without its yaw, which belongs to the bearings.
 
-    ``pose_low`` gets the rounding errors (low parts) of ``pose``. ``verdict``, which the caller clears, becomes 1 at
-    (0) if a pose is not finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the
+    ``pose_low`` gets the rounding errors (low parts) of ``pose``. ``pose_status``, which the caller clears, becomes 1
+    at (0) if a pose is not finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the
     farthest cell, fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     """
     real = pose.dtype.type
-    first, size = np.array([[first_col], [first_row]], np.int32), np.array([[cols], [rows]], np.int32)
+    first, size = np.array([[window.col], [window.row]], np.int32), np.array([[window.cols], [window.rows]], np.int32)
     x_y_theta = poses.T.astype(np.float64, order="C")
     finite = np.isfinite(x_y_theta).all(axis=0)
     cos, sin = cos_sin(x_y_theta[2])
-    position = x_y_theta[:2] - np.array([[origin_x], [origin_y]])
-    if (mount_x, mount_y) != (0.0, 0.0):
-        position[0] += cos * mount_x - sin * mount_y
-        position[1] += sin * mount_x + cos * mount_y
-    if yaw_sin != 0.0:
+    position = x_y_theta[:2] - np.array([[frame.origin_x], [frame.origin_y]])
+    if (frame.mount_x, frame.mount_y) != (0.0, 0.0):
+        position[0] += cos * frame.mount_x - sin * frame.mount_y
+        position[1] += sin * frame.mount_x + cos * frame.mount_y
+    if frame.yaw_sin != 0.0:
         x, y = position
-        position = np.stack([yaw_cos * x + yaw_sin * y, yaw_cos * y - yaw_sin * x])
-        cos, sin = cos * yaw_cos + sin * yaw_sin, sin * yaw_cos - cos * yaw_sin
-    position = within_reach(position / resolution)
+        position = np.stack([frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x])
+        cos, sin = cos * frame.yaw_cos + sin * frame.yaw_sin, sin * frame.yaw_cos - cos * frame.yaw_sin
+    position = within_reach(position / frame.resolution)
     if not finite.all():
-        verdict[0] = 1
+        pose_status[0] = 1
         position[:, ~finite] = -FARTHEST
         cos[~finite], sin[~finite] = 1.0, 0.0
     whole = np.floor(position)
     cell = whole.astype(np.int32) - first
     if ((cell < 0) | (cell >= size)).any():
-        verdict[1] = 1
+        pose_status[1] = 1
     exact = np.stack([*(position - whole), cos, sin])
     rounded = exact.astype(real)
     # A fraction just below 1 may round to 1, which would be the next cell.
@@ -85,25 +77,13 @@ def place_poses(
     pose_cell: np.ndarray,
     pose: np.ndarray,
     pose_low: np.ndarray,
-    verdict: np.ndarray,
-    origin_x: float,
-    origin_y: float,
-    resolution: float,
-    mount_x: float,
-    mount_y: float,
-    yaw_cos: float,
-    yaw_sin: float,
-    first_col: int,
-    first_row: int,
-    rows: int,
-    cols: int,
+    pose_status: np.ndarray,
+    frame: structs.Frame,
+    window: structs.Window,
     particles: int,
 ) -> None:
     """Place all poses, a block of them at a time."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3)
     for begin in range(0, particles, BLOCK):
         block = slice(begin, min(begin + BLOCK, particles))
-        place_pose(
-            flags, all_poses[block], pose_cell[block], pose[block], pose_low[block], verdict, origin_x, origin_y,
-            resolution, mount_x, mount_y, yaw_cos, yaw_sin, first_col, first_row, rows, cols,
-        )  # fmt: skip
+        place_pose(flags, all_poses[block], pose_cell[block], pose[block], pose_low[block], pose_status, frame, window)

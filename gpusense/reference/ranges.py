@@ -7,6 +7,7 @@ from types import ModuleType
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.casters import caster_file
 from gpusense.reference.ray import expected_range
 
@@ -25,16 +26,11 @@ def cast_ranges(
     pose: np.ndarray,
     ray: np.ndarray,
     ranges: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     rays: int,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
-    limit: np.floating,
-    resolution: np.floating,
-    range_max: np.floating,
+    caster: structs.Caster,
+    scale: structs.RangeScale,
 ) -> None:
     """Cast all rays of all particles."""
     cast_ray = caster_of(flags).cast_ray
@@ -44,8 +40,8 @@ def cast_ranges(
         count = part.stop - first
         lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
         beams = np.tile(ray[:rays], (count, 1))
-        t = cast_ray(flags, map_table, rows, cols, *lanes, beams, limit, bins, slack, tolerance)
-        ranges[first * rays : part.stop * rays] = expected_range(t, limit, resolution, range_max)
+        t = cast_ray(flags, map_table, window, *lanes, beams, scale.limit, caster)
+        ranges[first * rays : part.stop * rays] = expected_range(t, scale)
 
 
 def cast_tiles(
@@ -56,20 +52,12 @@ def cast_tiles(
     order: np.ndarray,
     ray: np.ndarray,
     ranges: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     particles: int,
     rays: int,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
-    limit: np.floating,
-    resolution: np.floating,
-    range_max: np.floating,
+    caster: structs.Caster,
+    scale: structs.RangeScale,
     spread: int,
 ) -> None:
     """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
-    cast_ranges(
-        flags, map_table, pose_cell, pose, ray, ranges, rows, cols, particles, rays, bins, slack, tolerance, limit,
-        resolution, range_max,
-    )  # fmt: skip
+    cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale)  # fmt: skip

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense.interface import structs
+
 TINY = 1e-30
 # Abramowitz and Stegun 4.4.49 for the arc tangent, in turns.
 _TURNS = (0.15913362, -0.05256880, 0.02867033, -0.01354934, 0.00331601)
@@ -64,7 +66,11 @@ def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, un
 
 
 def start_walk(
-    flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
+    flags: frozenset[str],
+    r: Ray,
+    cell: np.ndarray,
+    window: structs.Window,
+    limit: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
 
@@ -74,8 +80,8 @@ def start_walk(
     k, t = np.zeros(r.direction.shape, real), np.zeros(len(cell), real)
     if "ORIGINS_OUTSIDE" not in flags:
         return k, t
-    origin, size = cell.T.astype(np.int64), np.array([[cols], [rows]])
-    outside = off_grid(origin, rows, cols)
+    origin, size = cell.T.astype(np.int64), np.array([[window.cols], [window.rows]])
+    outside = off_grid(origin, window.rows, window.cols)
     ahead = np.maximum(np.where(r.step > 0, -origin, origin - (size - 1)), 0)
     entry = np.where(ahead > 0, ((ahead - 1).astype(real) + r.a) * r.inv, real.type(-1))
     when = np.maximum(entry[0], entry[1])
@@ -85,14 +91,18 @@ def start_walk(
     k_y = np.where(by_x, crossed(when, r.speed[1], r.a[1], r.inv[1], False), ahead[1])
     k[:, enters] = np.stack([k_x, k_y])[:, enters]
     at = origin[:, enters] + r.step[:, enters] * k[:, enters].astype(np.int64)
-    enters[enters] = ~off_grid(at, rows, cols)
+    enters[enters] = ~off_grid(at, window.rows, window.cols)
     t[outside] = limit
     t[enters] = when[enters]
     return k, t
 
 
 def start_casts(
-    flags: frozenset[str], r: Ray, cell: np.ndarray, rows: int, cols: int, limit: np.floating
+    flags: frozenset[str],
+    r: Ray,
+    cell: np.ndarray,
+    window: structs.Window,
+    limit: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the start of all walks, and the ranges that are known before any cell is read.
 
@@ -102,10 +112,10 @@ def start_casts(
         that are still to be walked.
     """
     origin = cell.T.astype(np.int64)
-    k, t = start_walk(flags, r, cell, rows, cols, limit)
+    k, t = start_walk(flags, r, cell, window, limit)
     ranges = np.full(len(cell), limit, t.dtype)
     if {"ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"} <= flags:
-        outside = off_grid(origin, rows, cols)
+        outside = off_grid(origin, window.rows, window.cols)
         ranges[outside] = 0
         return origin, k, t, ranges, np.flatnonzero(~outside)
     return origin, k, t, ranges, np.flatnonzero(t < limit)
@@ -131,6 +141,6 @@ def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
     return np.where(index >= bins, index - bins, index)
 
 
-def expected_range(t: np.ndarray, limit: np.floating, resolution: np.floating, range_max: np.floating) -> np.ndarray:
+def expected_range(t: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
     """Convert a distance in cells to metres, exactly range_max where nothing is nearer."""
-    return np.where(t >= limit, range_max, np.minimum(t * resolution, range_max))
+    return np.where(t >= scale.limit, scale.range_max, np.minimum(t * scale.resolution, scale.range_max))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.ray import crossed, make_ray, start_casts
 from gpusense.reference.rectangles import OCCUPIED, padded
 
@@ -29,40 +30,34 @@ def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndar
 def cast_ray(
     flags: frozenset[str],
     map_table: np.ndarray,
-    rows: int,
-    cols: int,
+    window: structs.Window,
     cell: np.ndarray,
     pose: np.ndarray,
     ray: np.ndarray,
-    limit: np.floating,
-    bins: int,
-    slack: np.floating,
-    tolerance: np.floating,
+    limit: float,
+    caster: structs.Caster,
 ) -> np.ndarray:
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:
         flags: Flags of the signature table.
         map_table: Padded planes of empty rectangles, flat.
-        rows: Rows of the grid.
-        cols: Columns of the grid.
+        window: Size of the grid.
         cell: (M, 2) integer column and row of each origin.
         pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
         ray: (M, 2) cosine and sine of each bearing.
         limit: Longest distance in cells.
-        bins: Not used.
-        slack: Not used.
-        tolerance: Not used.
+        caster: Not used.
     """
     r = make_ray(pose, ray)
-    origin, k, t, ranges, active = start_casts(flags, r, cell, rows, cols, limit)
+    origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)
     quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
     sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
     plane = quadrant * sectors + sector_of(sectors, *r.speed)
-    table = plane * ((rows + 2) * (cols + 2))
+    table = plane * ((window.rows + 2) * (window.cols + 2))
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        sides = map_table[table[active] + padded(at[1], at[0], cols)]
+        sides = map_table[table[active] + padded(at[1], at[0], window.cols)]
         stopped = sides <= OCCUPIED
         if stopped.any():
             hit = stopped if "OUTSIDE_OCCUPIED" in flags else sides == OCCUPIED

@@ -38,7 +38,7 @@ def place_relative(
     flags: frozenset[str],
     poses: np.ndarray,
     place: np.ndarray,
-    verdict: np.ndarray,
+    pose_status: np.ndarray,
     origin_x: float,
     origin_y: float,
     mount_x: float,
@@ -47,12 +47,12 @@ def place_relative(
 ) -> None:
     """Place sensors relative to an origin: x, its low part, y, its low part.
 
-    ``verdict``, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
+    ``pose_status``, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
     """
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():
-        verdict[0] = 1
+        pose_status[0] = 1
     x_y = two_sum(all_poses[:, :2], -np.array([origin_x, origin_y]))
     if (mount_x, mount_y) != (0.0, 0.0):
         cos, sin = cos_sin(np.ascontiguousarray(all_poses[:, 2]))
@@ -68,16 +68,16 @@ def wrap_headings(
     flags: frozenset[str],
     poses: np.ndarray,
     residual: np.ndarray,
-    verdict: np.ndarray,
+    pose_status: np.ndarray,
     target: float,
     target_low: float,
     particles: int,
 ) -> None:
-    """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers; verdict as for places."""
+    """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers; pose_status as for places."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))
     if not finite.all():
-        verdict[0] = 1
+        pose_status[0] = 1
     high, low = wrapped_difference(np.where(finite, all_poses[:, 2], 0.0), (target, target_low))
     residual[:particles, 0] = high
     residual[:particles, 1] = (high - residual[:particles, 0].astype(np.float64)) + low

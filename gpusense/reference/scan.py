@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.reference.placement import place_poses
 
@@ -37,37 +38,27 @@ def place_reading(
     point_low: np.ndarray,
     reading: np.ndarray,
     guard: np.ndarray,
-    fixed: np.ndarray,
+    constant_term: np.ndarray,
     resolution: float,
-    beams: int,
-    each: int,
-    places: int,
-    chosen: int,
-    max_readings: int,
-    possible: int,
-    nearest: float,
-    farthest: float,
-    log_max: float,
-    top: float,
-    guard_scale: float,
+    rules: structs.ReadingRules,
 ) -> None:
     """Put readings of some beams in their places.
 
     A place gets its reading, at most ``top``, and as points the ``each`` vectors of its beam; with END_POINTS a point
     is the reading times its vector, in cells, and its rounding error. A max reading is inf. ``guard`` is guard_scale
-    (longest + 2 cells) of a block of places. ``fixed`` is the sum of the terms of max readings without a place; -inf
-    with a range where none is ``possible``.
+    (longest + 2 cells) of a block of places. ``constant_term`` is that of max readings without a place,
+    -inf with a range where none is ``possible``.
     """
-    z = reading_of(flags, ranges, beam, beams)
-    hit, far = (z >= nearest) & (z < farthest), z >= farthest
-    informative = hit | (far & (max_readings != MAX_LEFT_OUT))
+    z = reading_of(flags, ranges, beam, rules.beams)
+    hit, far = (z >= rules.nearest) & (z < rules.farthest), z >= rules.farthest
+    informative = hit | (far & (rules.max_readings != MAX_LEFT_OUT))
     rank = np.cumsum(informative) - 1
-    used = informative & is_chosen(rank, int(np.count_nonzero(informative)), chosen)
-    value = np.where(used & hit & bool(possible), z, np.nan)
-    value[used & far & (max_readings == MAX_PLACED)] = np.inf
-    column = np.arange(beams) if "ALL_READINGS" in flags else np.flatnonzero(~np.isnan(value))
+    used = informative & is_chosen(rank, int(np.count_nonzero(informative)), rules.chosen)
+    value = np.where(used & hit & bool(rules.possible), z, np.nan)
+    value[used & far & (rules.max_readings == MAX_PLACED)] = np.inf
+    column = np.arange(rules.beams) if "ALL_READINGS" in flags else np.flatnonzero(~np.isnan(value))
     count = len(column)
-    vectors = vector[: 2 * each * beams].reshape(beams, each, 2)[column]
+    vectors = vector[: 2 * rules.each * rules.beams].reshape(rules.beams, rules.each, 2)[column]
     if "END_POINTS" in flags:
         cells = value[column] / resolution
         length = np.where(np.isfinite(cells), cells, 0.0)
@@ -75,20 +66,20 @@ def place_reading(
         point[:count] = exact
         point_low[:count] = exact - point[:count]
         point[:count][~np.isfinite(cells)] = cells[~np.isfinite(cells), None]
-        point[count:places] = np.nan
-        point_low[count:places] = 0
-        for block, first in enumerate(range(0, places, BLOCK_TERMS)):
+        point[count : rules.places] = np.nan
+        point_low[count : rules.places] = 0
+        for block, first in enumerate(range(0, rules.places, BLOCK_TERMS)):
             longest = np.max(length[first : first + BLOCK_TERMS], initial=0.0)
-            guard[block] = guard_scale * (longest + 2)
+            guard[block] = rules.guard_scale * (longest + 2)
     else:
-        point[: count * each] = vectors.reshape(-1, 2)
-        point[count * each : places * each] = (1, 0)
+        point[: count * rules.each] = vectors.reshape(-1, 2)
+        point[count * rules.each : rules.places * rules.each] = (1, 0)
         rounded = value[column].astype(reading.dtype)
-        reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, top))
-        reading[count:places] = np.nan
-    fixed[0] = np.count_nonzero(used & far) * log_max if max_readings == MAX_FIXED else 0.0
-    if not possible and (used & hit).any():
-        fixed[0] = -np.inf
+        reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, rules.top))
+        reading[count : rules.places] = np.nan
+    constant_term[0] = np.count_nonzero(used & far) * rules.log_max if rules.max_readings == MAX_FIXED else 0.0
+    if not rules.possible and (used & hit).any():
+        constant_term[0] = -np.inf
 
 
 def place_inputs(
@@ -97,7 +88,7 @@ def place_inputs(
     pose_cell: np.ndarray,
     pose: np.ndarray,
     pose_low: np.ndarray,
-    verdict: np.ndarray,
+    pose_status: np.ndarray,
     ranges: np.ndarray,
     beam: np.ndarray,
     vector: np.ndarray,
@@ -105,38 +96,13 @@ def place_inputs(
     point_low: np.ndarray,
     reading: np.ndarray,
     guard: np.ndarray,
-    fixed: np.ndarray,
-    origin_x: float,
-    origin_y: float,
-    resolution: float,
-    mount_x: float,
-    mount_y: float,
-    yaw_cos: float,
-    yaw_sin: float,
-    first_col: int,
-    first_row: int,
-    rows: int,
-    cols: int,
+    constant_term: np.ndarray,
+    frame: structs.Frame,
+    window: structs.Window,
     particles: int,
     head: int,
-    beams: int,
-    each: int,
-    places: int,
-    chosen: int,
-    max_readings: int,
-    possible: int,
-    nearest: float,
-    farthest: float,
-    log_max: float,
-    top: float,
-    guard_scale: float,
+    rules: structs.ReadingRules,
 ) -> None:
     """Put poses and readings in their places; the first ``head`` work-items of a device are for readings."""
-    place_reading(
-        flags, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each, places, chosen,
-        max_readings, possible, nearest, farthest, log_max, top, guard_scale,
-    )  # fmt: skip
-    place_poses(
-        flags, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y, yaw_cos,
-        yaw_sin, first_col, first_row, rows, cols, particles,
-    )  # fmt: skip
+    place_reading(flags, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules)
+    place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles)  # fmt: skip

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from gpusense.interface import structs
 
-def particles_of_scans(particles: int, per_scan: int, ahead: int = 0) -> Iterator[tuple[int, slice]]:
+
+def particles_of_scans(particles: int, batch: structs.ScanBatch) -> Iterator[tuple[int, slice]]:
     """Yield the index of each scan and its particles, of a launch that has a part of all particles.
 
     Args:
         particles: Particles of the launch.
-        per_scan: Particles of each scan.
-        ahead: Particles of the scans that come before those of the launch.
+        batch: Particles of each scan, and those of earlier launches.
     """
     begin = 0
     while begin < particles:
-        scan = (begin + ahead) // per_scan
-        end = min((scan + 1) * per_scan - ahead, particles)
+        scan = (begin + batch.ahead) // batch.per_scan
+        end = min((scan + 1) * batch.per_scan - batch.ahead, particles)
         yield scan, slice(begin, end)
         begin = end

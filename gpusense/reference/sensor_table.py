@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 
-def range_bin(distance: np.ndarray, per_metre: np.floating, cells: int, range_max: np.floating) -> np.ndarray:
+
+def range_bin(distance: np.ndarray, per_metre: float, cells: int, range_max: float) -> np.ndarray:
     """Return bins of ranges; the last one, after the cells, is for range_max and more."""
     inside = np.where(distance < range_max, distance, 0)
     bins = np.minimum((inside * per_metre).astype(np.int64), cells - 1)
@@ -20,10 +22,9 @@ def tabulated_density(
     z: np.ndarray,
     expected: np.ndarray,
     sensor: np.ndarray,
-    cells: int,
-    per_metre: np.floating,
-    range_max: np.floating,
+    tables: structs.MixtureTables,
+    range_max: float,
 ) -> np.ndarray:
     """Return log p of readings by the table."""
-    column = range_bin(expected, per_metre, cells, range_max)
-    return sensor[range_bin(z, per_metre, cells, range_max) * (cells + 1) + column]
+    column = range_bin(expected, tables.per_metre, tables.cells, range_max)
+    return sensor[range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference.error_free import add_term, strand_sums, strands_in
 
 
@@ -12,36 +13,33 @@ def sum_parts(
     parts: np.ndarray,
     order: np.ndarray,
     counts: np.ndarray,
-    fixed_of: np.ndarray,
+    constant_terms: np.ndarray,
     log_p: np.ndarray,
     particles: int,
     count: int,
     block: int,
-    across: int,
-    along: int,
-    fixed: np.floating,
-    temperature: np.floating,
-    per_scan: int,
+    score: structs.Score,
+    batch: structs.ScanBatch,
 ) -> None:
-    """Sum ``count`` numbers of each particle, each ``along`` farther than the last, from parts[place * across] on.
+    """Sum ``count`` numbers of each particle, number k at parts[place + k * particles].
 
     The numbers are sums of blocks or strands, and block is 1, or single terms, whose strands are added plainly first.
     All are added to a compensated total. Several scans have a count each, with STRANDED of readings, whose strands are
     added; numbers beyond it count as 0, which changes no sum.
     """
-    places, particle = np.arange(particles) * across, order[:particles] if "ORDERED" in flags else np.arange(particles)
-    counted, constant_term = np.full(particles, count), np.full(particles, fixed, parts.dtype)
+    places, particle = np.arange(particles), order[:particles] if "ORDERED" in flags else np.arange(particles)
+    counted, constant_term = np.full(particles, count), np.full(particles, score.constant_term, parts.dtype)
     if "SCANS" in flags:
-        counted, constant_term = counts[particle // per_scan], fixed_of[particle // per_scan]
+        counted, constant_term = counts[particle // batch.per_scan], constant_terms[particle // batch.per_scan]
         counted = strands_in(counted) if "STRANDED" in flags else counted
     total = (constant_term, np.zeros(particles, parts.dtype))
     k = np.arange(count)
-    term = np.where(k < counted[:, None], parts[places[:, None] + k * along], parts.dtype.type(0))
+    term = np.where(k < counted[:, None], parts[places[:, None] + k * particles], parts.dtype.type(0))
     for part in (term if block == 1 else strand_sums(term)).T:
         total = add_term(total, part)
     scan = total[0] + total[1]
     scan = np.log(scan) if "CUBES" in flags else scan
-    log_sum = temperature * scan
+    log_sum = score.temperature * scan
     if "CUBES" not in flags:
         log_sum = np.where(np.isinf(total[0]), total[0], log_sum)
     log_p[particle] = log_sum

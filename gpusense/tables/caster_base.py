@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface import structs
 from gpusense.interface.casters import ENTRIES, CasterEntry
 from gpusense.world.windows import Window
 
@@ -92,6 +93,6 @@ class Caster(ABC):
         """
         return False
 
-    def scalars(self) -> tuple[int, float, float]:
-        """Return the kernels' arguments bins, slack [cells] and tolerance [cells]."""
-        return 0, 0.0, 0.0
+    def struct(self) -> structs.Caster:
+        """Return the knobs as kernels take them."""
+        return structs.Caster(0, 0.0, 0.0)

@@ -14,6 +14,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.interface import structs
 from gpusense.tables.caster_base import Caster, CasterInput, Table
 from gpusense.tables.cells import check_size
 from gpusense.tables.directional import directional_table
@@ -119,9 +120,9 @@ class March(Caster):
         distances = np.sqrt(np.where(squares == NO_OBSTACLE, np.inf, squares)).astype(_SINGLE)
         return Table(backend.upload(distances), distances.nbytes)
 
-    def scalars(self) -> tuple[int, float, float]:
-        """See Caster.scalars."""
-        return 0, math.sqrt(2) if self.rule == "safe" else 0.0, self.tolerance
+    def struct(self) -> structs.Caster:
+        """See Caster.struct."""
+        return structs.Caster(0, math.sqrt(2) if self.rule == "safe" else 0.0, self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -159,9 +160,9 @@ class Cddt(Caster):
         table = directional_table(inputs.obstacles, self.bins, pruned=self.pruned, outside=outside)
         return Table(backend.upload(table), table.nbytes)
 
-    def scalars(self) -> tuple[int, float, float]:
-        """See Caster.scalars."""
-        return self.bins, 0.0, 0.0
+    def struct(self) -> structs.Caster:
+        """See Caster.struct."""
+        return structs.Caster(self.bins, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -208,16 +209,17 @@ class Lookup(Caster):
         turns = 2 * math.pi * np.arange(self.bins) / self.bins
         ray = backend.upload(np.stack([np.cos(turns), np.sin(turns)], axis=1).astype(_SINGLE))
         fill = backend.compile("fill_lookup", frozenset({"OUTSIDE_OCCUPIED"} if inputs.outside == "occupied" else ()))
+        window = structs.Window(0, 0, rows, cols)
         tile = max(_TILE[backend.info.kind] // (cols * self.bins), 1)
         for first in range(0, rows, tile):
             strip = min(tile, rows - first)
-            fill((self.bins, strip * cols), rectangles, ray, table, rows, cols, self.bins, first, strip, inputs.limit)
+            fill((self.bins, strip * cols), rectangles, ray, table, window, self.bins, first, strip, inputs.limit)
             backend.synchronize()
         return table
 
-    def scalars(self) -> tuple[int, float, float]:
-        """See Caster.scalars."""
-        return self.bins, 0.0, 0.0
+    def struct(self) -> structs.Caster:
+        """See Caster.struct."""
+        return structs.Caster(self.bins, 0.0, 0.0)
 
 
 def _padded_cells(backend: Backend, inputs: CasterInput) -> Table:

@@ -13,12 +13,12 @@ from typing import Protocol
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.reference import placement
 from gpusense.reference.heading import cos_sin
 from gpusense.world.grid import OccupancyGrid
 
 Mount = tuple[float, float, float]
-Frame = tuple[float, float, float, float, float, float, float]
 
 
 class Cells(Protocol):
@@ -79,10 +79,10 @@ def _cos_sin(angle: float) -> tuple[float, float]:
     return float(cos[0]), float(sin[0])
 
 
-def frame_scalars(grid: Cells, mount: Mount) -> Frame:
-    """Return the frame arguments of the kernel ``place_poses``, from ``origin_x`` to ``yaw_sin``."""
+def frame_of(grid: Cells, mount: Mount) -> structs.Frame:
+    """Return the frame of a grid and a scanner as kernels take it."""
     x, y, yaw = grid.origin
-    return x, y, grid.resolution, mount[0], mount[1], *_cos_sin(yaw)
+    return structs.Frame(x, y, grid.resolution, mount[0], mount[1], *_cos_sin(yaw))
 
 
 def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) -> PlacedPoses:
@@ -100,7 +100,7 @@ def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) ->
     with np.errstate(all="ignore"):
         placement.place_poses(
             _CAREFUL, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, pose_status,
-            *frame_scalars(grid, mount), 0, 0, *grid.shape, count,
+            frame_of(grid, mount), structs.Window(0, 0, *grid.shape), count,
         )  # fmt: skip
     return placed
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense.interface import structs
 from gpusense.world.frames import Cells, Mount
 from gpusense.world.grid import OccupancyGrid
 
@@ -23,8 +23,7 @@ LARGEST_SHARE = 0.6
 SLACK = 0.5
 
 
-@dataclass(frozen=True)
-class Window:
+class Window(structs.Window):
     """Half-open window of a grid's rows and columns.
 
     Attributes:
@@ -34,10 +33,7 @@ class Window:
         cols: Number of columns.
     """
 
-    row: int
-    col: int
-    rows: int
-    cols: int
+    __slots__ = ()
 
     @property
     def cells(self) -> int:

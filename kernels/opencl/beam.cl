@@ -1,10 +1,10 @@
 // Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
-// Readings whose density does not depend on the pose are not passed in: their sum is the constant term fixed.
+// Readings whose density does not depend on the pose are not passed in: their sum is the constant term.
 // requires: error_free caster echo tiles mixture sensor_table compat
 
 // Return the term of one reading in the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
-                  const int cells, const real per_metre, const real range_max) {
+                  const MixtureTables tables, const real range_max) {
 #if ALL_READINGS
     if (isnan(z)) return 0;
 #if !SENSOR_TABLE
@@ -16,7 +16,7 @@ real reading_term(const real z, const real expected, global const real *terms, g
     return p * p * p;
 #else
 #if SENSOR_TABLE
-    return tabulated_density(z, expected, sensor, cells, per_metre, range_max);
+    return tabulated_density(z, expected, sensor, tables, range_max);
 #else
     return log_density(z, expected, terms);
 #endif
@@ -37,18 +37,16 @@ real scan_log(const real sum) {
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global const int *start, global const real *fixed_of,
-                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
-                        const int rays, const int readings, const int kinds, const int cone_rays, const real critical,
-                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
-                        const real limit, const real resolution, const real range_max, const real fixed,
-                        const real temperature, const int per_scan, const int ahead) {
+                        global const real *sensor, global const int *start, global const real *constant_terms,
+                        global real *log_p, global real *parts, const Window window, const int particles,
+                        const int rays, const int readings, const MixtureTables tables, const Cone cone,
+                        const Caster caster, const RangeScale scale, const Score score, const ScanBatch batch) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS
-    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real constant_term = fixed_of[scan];
-    ray += start[scan] * cone_rays;
+    const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
+    const real constant_term = constant_terms[scan];
+    ray += start[scan] * cone.rays;
 #if SHARED_RAYS
     first += start[scan];
     const int begin = first[0];
@@ -58,7 +56,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     reading += begin;
 #else
     const int size = rays, begin = 0;
-    const real constant_term = fixed;
+    const real constant_term = score.constant_term;
 #endif
     real2 total = (real2)(constant_term, 0);
     real strands[STRANDS] = {0, 0, 0, 0};
@@ -67,15 +65,15 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #endif
     for (int r = 0; r < size; ++r) {
 #if ECHO
-        const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + r * cone_rays,
-                                       cone_rays, critical, limit, bins, slack, tolerance);
+        const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + r * cone.rays, cone,
+                                       scale.limit, caster);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[r], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[r], scale.limit, caster);
 #endif
-        const real expected = expected_range(t, limit, resolution, range_max);
+        const real expected = expected_range(t, scale);
 #if INCIDENCE
-        global const real *bin_terms = incidence_terms(terms, edges, kinds, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, echo.cosine);
 #else
         global const real *bin_terms = terms;
 #endif
@@ -85,7 +83,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, bin_terms, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, bin_terms, sensor, tables, scale.range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -105,13 +103,13 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     }
     total = add_strands(total, vload4(0, strands));
 #if LINEAR
-    log_p[n] = temperature * scan_log(total.x + total.y);
+    log_p[n] = score.temperature * scan_log(total.x + total.y);
 #else
-    log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
+    log_p[n] = impossible ? -INFINITY : score.temperature * (total.x + total.y);
 #endif
 }
 
-// Write the term of reading k to parts[place * across + k * along], in tiles of particles and rays, for GPUs. With
+// Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. With
 // STRANDED the number there is the sum of strand k, and a work-item takes whole strands. There are fewer than 2^31
 // numbers. With restrict the compiler need not read arguments again after a write.
 kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
@@ -120,11 +118,10 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
                        global const int *restrict first, global const real *restrict reading,
                        global const real *restrict terms, global const real *restrict edges,
                        global const real *restrict sensor, global const int *restrict start,
-                       global real *restrict parts, const int rows, const int cols, const int particles, const int rays,
-                       const int readings, const int kinds, const int cone_rays, const real critical, const int bins,
-                       const real slack, const real tolerance, const int cells, const real per_metre,
-                       const real limit, const real resolution, const real range_max, const int across,
-                       const int along, const int spread, const int per_scan) {
+                       global real *restrict parts, const Window window, const int particles, const int rays,
+                       const int readings, const MixtureTables tables, const Cone cone, const Caster caster,
+                       const RangeScale scale, const int spread,
+                       const ScanBatch batch) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;
 #if ORDERED
@@ -135,8 +132,8 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     const int2 cell = pose_cell[n];
     const real4 sensor_pose = pose[n];
 #if SCANS
-    const int scan = n / per_scan, size = start[scan + 1] - start[scan];
-    ray += start[scan] * cone_rays;
+    const int scan = n / batch.per_scan, size = start[scan + 1] - start[scan];
+    ray += start[scan] * cone.rays;
 #if SHARED_RAYS
     first += start[scan];
     const int begin = first[0];
@@ -154,15 +151,15 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
 #if ECHO
-        const Echo echo = nearest_echo(map_table, normals, rows, cols, cell, sensor_pose, ray + r * cone_rays,
-                                       cone_rays, critical, limit, bins, slack, tolerance);
+        const Echo echo = nearest_echo(map_table, normals, window, cell, sensor_pose, ray + r * cone.rays, cone,
+                                       scale.limit, caster);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray[r], limit, bins, slack, tolerance);
+        const real t = cast_ray(map_table, window, cell, sensor_pose, ray[r], scale.limit, caster);
 #endif
-        const real expected = expected_range(t, limit, resolution, range_max);
+        const real expected = expected_range(t, scale);
 #if INCIDENCE
-        global const real *bin_terms = incidence_terms(terms, edges, kinds, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, echo.cosine);
 #else
         global const real *bin_terms = terms;
 #endif
@@ -172,19 +169,19 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, bin_terms, sensor, cells, per_metre, range_max);
+            const real term = reading_term(reading[k], expected, bin_terms, sensor, tables, scale.range_max);
 #if STRANDED
             sum += term;
             r += STRANDS;
             if (r >= size || (r & (BLOCK_TERMS - STRANDS)) == 0) {
                 // The end of a block or of the scan.
                 const int block = (r - STRANDS) / BLOCK_TERMS;
-                parts[place * across + (block * STRANDS + (r & (STRANDS - 1))) * along] = sum;
+                parts[place + (block * STRANDS + (r & (STRANDS - 1))) * particles] = sum;
                 sum = 0;
                 r += ((1 << spread) - 1) * BLOCK_TERMS;
             }
 #else
-            parts[place * across + k * along] = term;
+            parts[place + k * particles] = term;
 #endif
         }
     }

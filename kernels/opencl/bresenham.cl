@@ -6,15 +6,15 @@
 typedef uchar entry;
 
 // Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
-real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+real cast_ray(global const entry *map_table, const Window window, const int2 cell, const real4 pose, const real2 ray,
+              const real limit, const Caster caster) {
     const Ray r = make_ray(pose, ray);
 #if OUTSIDE_OCCUPIED
 #if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) return 0;
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) return 0;
 #endif
 #endif
-    const Walk start = start_walk(r, cell, rows, cols, limit);
+    const Walk start = start_walk(r, cell, window, limit);
     if (start.t >= limit) return limit;
     const int col = cell.x + r.step_x * start.k_x, row = cell.y + r.step_y * start.k_y;
     const int end_col = cell.x + floor_int(pose.x + limit * r.direction.x);
@@ -25,7 +25,7 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
     int aside = 0, error = 0;
     for (int along = 0; along <= longer; ++along) {
         const int x = far_x >= far_y ? along : aside, y = far_x >= far_y ? aside : along;
-        const int state = map_table[padded(row + up * y, col + right * x, cols)];
+        const int state = map_table[padded(row + up * y, col + right * x, window.cols)];
 #if OUTSIDE_OCCUPIED
         if (state != 0) return start.t + sqrt((real)x * (real)x + (real)y * (real)y);
 #else

@@ -13,19 +13,19 @@ typedef int entry;
 #define FARTHEST ((real)1048576)
 
 // Return the distance in cells to the first obstacle of the line, limit where none is nearer.
-real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+real cast_ray(global const entry *map_table, const Window window, const int2 cell, const real4 pose, const real2 ray,
+              const real limit, const Caster caster) {
     const int lines = map_table[0];
-    global const entry *first = map_table + 1 + 3 * bins, *bits = first + bins * lines + 1;
-    if (off_grid(cell.x, cell.y, rows, cols)) {
+    global const entry *first = map_table + 1 + 3 * caster.bins, *bits = first + caster.bins * lines + 1;
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) {
 #if OUTSIDE_OCCUPIED
         return 0;
 #endif
     } else {
-        const int index = cell.y * cols + cell.x;
+        const int index = cell.y * window.cols + cell.x;
         if ((uint)bits[index / 32] >> (index % 32) & 1u) return 0;
     }
-    const int bin = angle_bin(ray_direction(pose, ray), bins);
+    const int bin = angle_bin(ray_direction(pose, ray), caster.bins);
     const real c = (real)map_table[1 + 3 * bin] * (real)9.31322574615478515625e-10;
     const real s = (real)map_table[2 + 3 * bin] * (real)9.31322574615478515625e-10;
     const real x = (real)cell.x + pose.x, y = (real)cell.y + pose.y;

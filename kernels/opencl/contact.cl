@@ -59,7 +59,7 @@ real log_bump(const int squared, const int pressed, global const real *terms) {
 kernel void score_contact(global const int *table, global const int2 *pose_cell, global const real4 *pose,
                           global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                           global const int *start, global const int *pressed, global const real *terms,
-                          global real *log_p, const int rows, const int cols, const int particles, const int segments,
+                          global real *log_p, const Window window, const int particles, const int segments,
                           const real guard, const real temperature) {
     const int n = get_global_id(0);
     if (n >= particles) return;
@@ -75,7 +75,7 @@ kernel void score_contact(global const int *table, global const int2 *pose_cell,
         int nearest = NO_OBSTACLE;
         for (int i = start[s]; i < start[s + 1]; ++i) {
             const int2 at = cell + end_point(sensor_pose, low, point[i], point_low[i], (real)0, guard).cell;
-            nearest = min(nearest, table[field_cell(at.x, at.y, rows, cols)]);
+            nearest = min(nearest, table[field_cell(at.x, at.y, window)]);
         }
         total += log_bump(nearest, pressed[s], terms);
     }

@@ -5,20 +5,20 @@
 typedef uchar entry;
 
 // Return the distance in cells to the first occupied cell, limit where none is nearer.
-real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+real cast_ray(global const entry *map_table, const Window window, const int2 cell, const real4 pose, const real2 ray,
+              const real limit, const Caster caster) {
     const Ray r = make_ray(pose, ray);
 #if OUTSIDE_OCCUPIED
 #if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) return 0;
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) return 0;
 #endif
 #endif
-    const Walk start = start_walk(r, cell, rows, cols, limit);
+    const Walk start = start_walk(r, cell, window, limit);
     int k_x = start.k_x, k_y = start.k_y;
     real t = start.t;
     if (t >= limit) return limit;
     for (;;) {
-        const int state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, cols)];
+        const int state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)];
 #if OUTSIDE_OCCUPIED
         if (state != 0) return t;
 #else

@@ -16,49 +16,47 @@ typedef struct {
 int is_wall(const real2 normal) { return normal.x != 0 || normal.y != 0; }
 
 // Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
-real2 normal_at(global const real2 *normals, const int rows, const int cols, const int col, const int row) {
-    if (off_grid(col + 1, row + 1, rows + 2, cols + 2)) {
+real2 normal_at(global const real2 *normals, const Window window, const int col, const int row) {
+    if (off_grid(col + 1, row + 1, window.rows + 2, window.cols + 2)) {
 #if OUTSIDE_OCCUPIED
         return (real2)(NAN, NAN);
 #else
         return (real2)(0, 0);
 #endif
     }
-    return normals[padded(row, col, cols)];
+    return normals[padded(row, col, window.cols)];
 }
 
 // Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
 // walk: it has crossed all boundaries in x up to t, and those in y before t or, after a step in y, up to t as well. At
 // a corner it steps in x first.
-real2 hit_normal(global const real2 *normals, const int rows, const int cols, const int2 cell, const Ray r,
-                 const real t) {
+real2 hit_normal(global const real2 *normals, const Window window, const int2 cell, const Ray r, const real t) {
     if (t == 0) {
-        const real2 start_normal = normal_at(normals, rows, cols, cell.x, cell.y);
+        const real2 start_normal = normal_at(normals, window, cell.x, cell.y);
         if (is_wall(start_normal)) return start_normal;
     }
     const int col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
     const int before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 0));
-    const real2 normal = normal_at(normals, rows, cols, col, before);
+    const real2 normal = normal_at(normals, window, col, before);
     if (is_wall(normal)) return normal;
-    return normal_at(normals, rows, cols, col, cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 1)));
+    return normal_at(normals, window, col, cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, 1)));
 }
 
 // Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
-global const real *incidence_terms(global const real *terms, global const real *edges, const int kinds,
+global const real *incidence_terms(global const real *terms, global const real *edges, const int incidence_bins,
                                    const real cosine) {
     int bin = 0;
-    while (bin + 1 < kinds && cosine <= edges[bin]) ++bin;
+    while (bin + 1 < incidence_bins && cosine <= edges[bin]) ++bin;
     return terms + 10 * bin;
 }
 #endif
 
 // Return the nearest return of a cone's rays. A ray whose angle of incidence has a cosine below critical has none: the
 // surface reflects it like a mirror.
-Echo nearest_echo(global const entry *map_table, global const real2 *normals, const int rows, const int cols,
-                  const int2 cell, const real4 pose, global const real2 *ray, const int cone_rays, const real critical,
-                  const real limit, const int bins, const real slack, const real tolerance) {
+Echo nearest_echo(global const entry *map_table, global const real2 *normals, const Window window, const int2 cell,
+                  const real4 pose, global const real2 *ray, const Cone cone, const real limit, const Caster caster) {
     Echo echo = {limit, 2, 0};
-    for (int i = 0; i < cone_rays; ++i) {
+    for (int i = 0; i < cone.rays; ++i) {
         // Most casters may stop at the nearest return so far; those of tables and lines may not.
         real farthest = echo.t;
 #if LOOKUP
@@ -67,14 +65,14 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
 #if BRESENHAM
         farthest = limit;
 #endif
-        const real t = cast_ray(map_table, rows, cols, cell, pose, ray[i], farthest, bins, slack, tolerance);
+        const real t = cast_ray(map_table, window, cell, pose, ray[i], farthest, caster);
         if (!(t < echo.t)) continue;
 #if INCIDENCE
         const Ray r = make_ray(pose, ray[i]);
-        const real2 normal = hit_normal(normals, rows, cols, cell, r, t);
+        const real2 normal = hit_normal(normals, window, cell, r, t);
         const int known = !isnan(normal.x);
         const real cosine = known ? fabs(r.direction.x * normal.x + r.direction.y * normal.y) : (real)1;
-        if (cosine < critical) continue;
+        if (cosine < cone.critical) continue;
         echo.cosine = cosine;
         echo.sine = known ? fabs(r.direction.x * normal.y - r.direction.y * normal.x) : (real)0;
 #endif
@@ -86,16 +84,15 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
 // Cast cones to expected ranges and angles of incidence, NaN without a return. One work-item takes a particle and cone.
 kernel void cast_echoes(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global real *ranges, global real *incidence,
-                        const int rows, const int cols, const int particles, const int rays, const int cone_rays,
-                        const real critical, const int bins, const real slack, const real tolerance, const real limit,
-                        const real resolution, const real range_max) {
+                        const Window window, const int particles, const int rays, const Cone cone, const Caster caster,
+                        const RangeScale scale) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
-    const Echo echo = nearest_echo(map_table, normals, rows, cols, pose_cell[n], pose[n], ray + k * cone_rays,
-                                   cone_rays, critical, limit, bins, slack, tolerance);
-    ranges[(long)n * rays + k] = expected_range(echo.t, limit, resolution, range_max);
+    const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + k * cone.rays, cone,
+                                   scale.limit, caster);
+    ranges[(long)n * rays + k] = expected_range(echo.t, scale);
 #if INCIDENCE
-    incidence[(long)n * rays + k] = echo.t < limit ? atan2(echo.sine, echo.cosine) : NAN;
+    incidence[(long)n * rays + k] = echo.t < scale.limit ? atan2(echo.sine, echo.cosine) : NAN;
 #endif
 }
 #endif

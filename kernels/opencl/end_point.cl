@@ -9,10 +9,10 @@
 int within(const int i, const int last) { return i < 0 ? 0 : i > last ? last : i; }
 
 // Return the index of a cell of the padded table; far cells become ring cells.
-int field_cell(const int col, const int row, const int rows, const int cols) {
-    const int c = within(col + FIELD_RING, cols + 2 * FIELD_RING - 1);
-    const int r = within(row + FIELD_RING, rows + 2 * FIELD_RING - 1);
-    return r * (cols + 2 * FIELD_RING) + c;
+int field_cell(const int col, const int row, const Window window) {
+    const int c = within(col + FIELD_RING, window.cols + 2 * FIELD_RING - 1);
+    const int r = within(row + FIELD_RING, window.rows + 2 * FIELD_RING - 1);
+    return r * (window.cols + 2 * FIELD_RING) + c;
 }
 
 #if CAREFUL
@@ -111,11 +111,11 @@ int2 table_origin(const int2 origin, const int cols) {
 }
 
 // Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
-int table_cell(const int2 near, const int2 from, const int rows, const int cols) {
+int table_cell(const int2 near, const int2 from, const Window window) {
 #if INSIDE
     return (uint)near.y * (uint)from.y + ((uint)near.x + (uint)from.x);
 #else
-    return field_cell(from.x + near.x, from.y + near.y, rows, cols);
+    return field_cell(from.x + near.x, from.y + near.y, window);
 #endif
 }
 #endif

@@ -16,11 +16,11 @@ real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const r
 }
 
 // Interpolate the distance between the four cell centres around an end point, in two parts.
-real2 bilinear(global const real *table, const int2 cell, const EndPoint end, const int rows, const int cols) {
-    const real2 a = (real2)(table[field_cell(cell.x, cell.y, rows, cols)], 0);
-    const real2 b = (real2)(table[field_cell(cell.x + 1, cell.y, rows, cols)], 0);
-    const real2 c = (real2)(table[field_cell(cell.x, cell.y + 1, rows, cols)], 0);
-    const real2 d = (real2)(table[field_cell(cell.x + 1, cell.y + 1, rows, cols)], 0);
+real2 bilinear(global const real *table, const int2 cell, const EndPoint end, const Window window) {
+    const real2 a = (real2)(table[field_cell(cell.x, cell.y, window)], 0);
+    const real2 b = (real2)(table[field_cell(cell.x + 1, cell.y, window)], 0);
+    const real2 c = (real2)(table[field_cell(cell.x, cell.y + 1, window)], 0);
+    const real2 d = (real2)(table[field_cell(cell.x + 1, cell.y + 1, window)], 0);
     const real2 low = between(end.to_next_x, a, end.rest_x, b), high = between(end.to_next_x, c, end.rest_x, d);
     return between(end.to_next_y, low, end.rest_y, high);
 }
@@ -58,17 +58,17 @@ real log_field(const real2 distance, global const real *terms) {
 // Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
 // interpolated, capped distances in metres.
 real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
-                   const real2 point_low, global const real *terms, const int rows, const int cols, const real guard) {
+                   const real2 point_low, global const real *terms, const Window window, const real guard) {
 #if ALL_READINGS
     if (isnan(point.x)) return 0;
     if (isinf(point.x)) return terms[3];
 #endif
 #if BILINEAR
     const EndPoint end = end_point(pose, low, point, point_low, (real)0.5, guard);
-    return log_field(bilinear(table, origin + end.cell, end, rows, cols), terms);
+    return log_field(bilinear(table, origin + end.cell, end, window), terms);
 #else
     const EndPoint end = end_point(pose, low, point, point_low, 0, guard);
-    const real value = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, rows, cols)];
+    const real value = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, window)];
 #if LOG_TABLE
     return value;
 #else
@@ -82,25 +82,25 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 // if that is larger. A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max
 // reading is far.
 real quick_value(global const real *table, const int2 from, const real4 lowered, const real2 point, const real far,
-                 const int rows, const int cols, real *worst) {
+                 const Window window, real *worst) {
     real off;
 #if ALL_READINGS
     const int is_range = isfinite(point.x);
     const int2 near = rounded_cell(lowered, is_range ? point : (real2)(0), &off);
-    const real value = table[table_cell(near, from, rows, cols)];
+    const real value = table[table_cell(near, from, window)];
     *worst = is_range ? fmax(*worst, off) : *worst;
     return is_range ? value : isinf(point.x) ? far : 0;
 #else
     const int2 near = rounded_cell(lowered, point, &off);
     *worst = fmax(*worst, off);
-    return table[table_cell(near, from, rows, cols)];
+    return table[table_cell(near, from, window)];
 #endif
 }
 
 // Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
 real careful_value(global const real *table, const int2 origin, const real4 lowered, const real4 pose, const real4 low,
-                   const real2 point, const real2 point_low, const real far, const int rows, const int cols,
-                   const real guard, const real sure) {
+                   const real2 point, const real2 point_low, const real far, const Window window, const real guard,
+                   const real sure) {
 #if ALL_READINGS
     if (isnan(point.x)) return 0;
     if (isinf(point.x)) return far;
@@ -108,7 +108,7 @@ real careful_value(global const real *table, const int2 origin, const real4 lowe
     real off;
     int2 cell = rounded_cell(lowered, point, &off) - ROUNDING_BITS;
     if (off > sure) cell = end_point(pose, low, point, point_low, 0, guard).cell;
-    return table[field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols)];
+    return table[field_cell(origin.x + cell.x, origin.y + cell.y, window)];
 }
 #endif
 
@@ -128,20 +128,19 @@ kernel void fill_field(global const int *squared, global const real *density, gl
 // makes vector code of loops.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                        global const real *terms, global const int *start, global const real *fixed_of,
-                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
-                        const int readings, const real guard, const real fixed, const real temperature,
-                        const int per_scan, const int ahead) {
+                        global const real *terms, global const int *start, global const real *constant_terms,
+                        global real *log_p, global real *parts, const Window window, const int particles,
+                        const int readings, const real guard, const Score score, const ScanBatch batch) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS
-    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real constant_term = fixed_of[scan];
+    const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
+    const real constant_term = constant_terms[scan];
     point += start[scan];
     point_low += start[scan];
 #else
     const int size = readings;
-    const real constant_term = fixed;
+    const real constant_term = score.constant_term;
 #endif
     const int2 origin = pose_cell[n];
 #if CAREFUL
@@ -153,7 +152,7 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     real block = 0;
     for (int k = 0; k < size; ++k) {
         const real term =
-            reading_value(table, origin, pose[n], low, point[k], point_low[k], terms, rows, cols, guard);
+            reading_value(table, origin, pose[n], low, point[k], point_low[k], terms, window, guard);
 #if PER_BEAM
         parts[(long)n * readings + k] = term;
 #endif
@@ -165,24 +164,24 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     }
     total = add_term(total, block);
 #if CUBES
-    log_p[n] = temperature * log(total.x + total.y);
+    log_p[n] = score.temperature * log(total.x + total.y);
 #else
-    log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
+    log_p[n] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
 #endif
 }
 
-// Write the sums of blocks of readings to parts[n * across + block * along], for GPUs. One work-item takes a particle
+// Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a particle
 // and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards as the
 // longest one.
 kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
                          global const real *terms, global const real *guard, global const int *start,
-                         global real *parts, const int rows, const int cols, const int particles, const int readings,
-                         const int across, const int along, const int spread, const int per_scan) {
+                         global real *parts, const Window window, const int particles, const int readings,
+                         const int spread, const ScanBatch batch) {
     const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
     if (n >= particles) return;
 #if SCANS
-    const int scan = n / per_scan, size = start[scan + 1] - start[scan];
+    const int scan = n / batch.per_scan, size = start[scan + 1] - start[scan];
     point += start[scan];
     point_low += start[scan];
     guard += scan * ((readings + BLOCK_TERMS - 1) / BLOCK_TERMS);
@@ -197,7 +196,7 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
     const real4 low = (real4)(0);
 #endif
 #if QUICK
-    const int2 from = table_origin(origin, cols);
+    const int2 from = table_origin(origin, window.cols);
     const real4 lowered = sensor_pose - (real4)(0.5f, 0.5f, 0, 0);
     const real far = terms[3];
 #endif
@@ -211,32 +210,31 @@ kernel void field_blocks(global const real *table, global const int2 *pose_cell,
 #if SCANS
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i)
-                sum += quick_value(table, from, lowered, point[begin + i], far, rows, cols, &worst);
+                sum += quick_value(table, from, lowered, point[begin + i], far, window, &worst);
 #else
             // The points of one scan are aligned, so that two of them can be read at once.
             global const real4 *two = (global const real4 *)(point + begin);
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS / 2; ++i) {
                 const real4 pair = two[i];
-                sum += quick_value(table, from, lowered, pair.xy, far, rows, cols, &worst);
-                sum += quick_value(table, from, lowered, pair.zw, far, rows, cols, &worst);
+                sum += quick_value(table, from, lowered, pair.xy, far, window, &worst);
+                sum += quick_value(table, from, lowered, pair.zw, far, window, &worst);
             }
 #endif
         } else {
             for (int k = begin; k < end; ++k)
-                sum += quick_value(table, from, lowered, point[k], far, rows, cols, &worst);
+                sum += quick_value(table, from, lowered, point[k], far, window, &worst);
         }
         if (worst > sure) {
             sum = 0;
             for (int k = begin; k < end; ++k)
-                sum += careful_value(table, origin, lowered, sensor_pose, low, point[k], point_low[k], far, rows, cols,
+                sum += careful_value(table, origin, lowered, sensor_pose, low, point[k], point_low[k], far, window,
                                      guard[block], sure);
         }
 #else
         for (int k = begin; k < end; ++k)
-            sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, rows, cols,
-                                 guard[block]);
+            sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, window, guard[block]);
 #endif
-        parts[(long)n * across + (long)block * along] = sum;
+        parts[n + (long)block * particles] = sum;
     }
 }

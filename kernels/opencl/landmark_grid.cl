@@ -64,7 +64,7 @@ Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
 // Return the match of a feature among the landmarks within its disc.
 Match search(global const real4 *landmark, global const real4 *signature, global const int *start, const real4 place,
              const real4 turned, global const real *feature, global const real *terms, global const real2 *arcs,
-             const int rows, const int cols, const real size) {
+             const Buckets buckets) {
     Match match = {-INFINITY, -INFINITY, -1};
     real2 sum = 0;
     const real reach = feature[REACH], radius = feature[RADIUS];
@@ -72,11 +72,12 @@ Match search(global const real4 *landmark, global const real4 *signature, global
     // Landmarks that cannot be likelier than the best so far are not evaluated.
     real most = INFINITY;
     const real x = place.x + reach * turned.x, y = place.z + reach * turned.z;
-    const int left = bucket_at(x - radius, size, cols), right = bucket_at(x + radius, size, cols);
-    const int high = bucket_at(y + radius, size, rows);
-    for (int row = bucket_at(y - radius, size, rows); row <= high; ++row) {
-        const int last = start[row * cols + right + 1];
-        for (int j = start[row * cols + left]; j < last; ++j) {
+    const int left = bucket_at(x - radius, buckets.size, buckets.cols);
+    const int right = bucket_at(x + radius, buckets.size, buckets.cols);
+    const int high = bucket_at(y + radius, buckets.size, buckets.rows);
+    for (int row = bucket_at(y - radius, buckets.size, buckets.rows); row <= high; ++row) {
+        const int last = start[row * buckets.cols + right + 1];
+        for (int j = start[row * buckets.cols + left]; j < last; ++j) {
             const real4 off = offset(landmark[j], place);
             if (!near(off, turned, feature, most)) continue;
             match = with_landmark(match, &sum, log_detection(off, turned, feature, signature[j], terms, arcs), j);

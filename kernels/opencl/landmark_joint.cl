@@ -14,10 +14,10 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
                            global const real *terms, global const real2 *arcs, global real *best, global int *choice,
                            global real *value, global real *log_p, global real *parts, global int *which,
                            const int landmarks, const int particles, const int features, const int sets,
-                           const real size, const real fixed, const real temperature) {
+                           const Buckets buckets, const Score score) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
+    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);
     global real *sums = best + (long)n * sets, *each = value + (long)n * sets * features;
     global int *who = choice + (long)n * sets * features;
     for (int s = 0; s < sets; ++s) sums[s] = s == 0 ? (real)0 : -INFINITY;
@@ -56,7 +56,7 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
             if (!(s >> k & 1)) total += feature[FEATURE * k + FALSE_POSITIVE];
         if (total > most) most = total, chosen = s;
     }
-    log_p[n] = isinf(most) ? most : temperature * (fixed + most);
+    log_p[n] = isinf(most) ? most : score.temperature * (score.constant_term + most);
 #if PER_BEAM
     for (int k = 0; k < features; ++k) {
         const int j = who[chosen * features + k];

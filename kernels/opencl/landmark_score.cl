@@ -8,13 +8,12 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
                            global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
                            global const real *feature, global const int *partner, global const real *terms,
                            global const real2 *arcs, global real *log_p, global real *parts, global int *which,
-                           const int rows, const int cols, const int landmarks, const int particles,
-                           const int features, const real size, const real share, const real fixed,
-                           const real temperature) {
+                           const Buckets buckets, const int landmarks, const int particles, const int features,
+                           const real share, const Score score) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
-    real2 total = (real2)(fixed, 0);
+    const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);
+    real2 total = (real2)(score.constant_term, 0);
     int impossible = 0;
     for (int first = 0; first < features; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, features);
@@ -27,8 +26,7 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
             const real detected = log_detection(offset(landmark[j], place), turned, numbers, signature[j], terms, arcs);
             const Match match = {detected, detected, j};
 #else
-            const Match match = search(landmark, signature, start, place, turned, numbers, terms, arcs, rows, cols,
-                                       size);
+            const Match match = search(landmark, signature, start, place, turned, numbers, terms, arcs, buckets);
 #endif
             const real value = either(match.log_p + share, numbers[FALSE_POSITIVE]);
             impossible |= isinf(value);
@@ -44,5 +42,5 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
         }
         total = add_term(total, block);
     }
-    log_p[n] = impossible ? -INFINITY : temperature * (total.x + total.y);
+    log_p[n] = impossible ? -INFINITY : score.temperature * (total.x + total.y);
 }

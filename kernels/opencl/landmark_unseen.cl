@@ -10,25 +10,25 @@ int in_view(const real4 off, const real cosine, const real sine, const real rang
 // Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
 kernel void count_unseen(global const real4 *landmark, global const int *start, global const int2 *pose_cell,
                          global const real4 *pose, global const real4 *pose_low, global const int *which,
-                         global real *log_p, const int rows, const int cols, const int particles, const int features,
-                         const real size, const real range_max, const real axis_cosine, const real axis_sine,
-                         const real least, const real log_missed) {
+                         global real *log_p, const Buckets buckets, const int particles, const int features,
+                         const SensorView view) {
     const int n = get_global_id(0);
     if (n >= particles) return;
-    const real4 sensor_pose = pose[n], place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], size);
-    const real cosine = sensor_pose.z * axis_cosine - sensor_pose.w * axis_sine;
-    const real sine = sensor_pose.w * axis_cosine + sensor_pose.z * axis_sine;
-    const int left = bucket_at(place.x - range_max, size, cols), right = bucket_at(place.x + range_max, size, cols);
-    const int high = bucket_at(place.z + range_max, size, rows);
+    const real4 sensor_pose = pose[n], place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], buckets.size);
+    const real cosine = sensor_pose.z * view.axis_cosine - sensor_pose.w * view.axis_sine;
+    const real sine = sensor_pose.w * view.axis_cosine + sensor_pose.z * view.axis_sine;
+    const int left = bucket_at(place.x - view.range_max, buckets.size, buckets.cols);
+    const int right = bucket_at(place.x + view.range_max, buckets.size, buckets.cols);
+    const int high = bucket_at(place.z + view.range_max, buckets.size, buckets.rows);
     int unseen = 0;
-    for (int row = bucket_at(place.z - range_max, size, rows); row <= high; ++row) {
-        const int last = start[row * cols + right + 1];
-        for (int j = start[row * cols + left]; j < last; ++j) {
-            if (!in_view(offset(landmark[j], place), cosine, sine, range_max, least)) continue;
+    for (int row = bucket_at(place.z - view.range_max, buckets.size, buckets.rows); row <= high; ++row) {
+        const int last = start[row * buckets.cols + right + 1];
+        for (int j = start[row * buckets.cols + left]; j < last; ++j) {
+            if (!in_view(offset(landmark[j], place), cosine, sine, view.range_max, view.least)) continue;
             int taken = 0;
             for (int k = 0; k < features; ++k) taken |= which[(long)n * features + k] == j;
             unseen += !taken;
         }
     }
-    if (unseen > 0) log_p[n] += unseen * log_missed;
+    if (unseen > 0) log_p[n] += unseen * view.log_missed;
 }

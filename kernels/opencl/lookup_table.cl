@@ -2,13 +2,13 @@
 // requires: raycast
 
 // Fill rows of the table: one work-item takes a bin and cell. A hit is at most 65 534; 65 535 means no hit.
-kernel void fill_lookup(global const ushort *rectangles, global const real2 *ray, global ushort *lookup, const int rows,
-                        const int cols, const int bins, const int first_row, const int count, const real limit) {
+kernel void fill_lookup(global const ushort *rectangles, global const real2 *ray, global ushort *lookup,
+                        const Window window, const int bins, const int first_row, const int count, const real limit) {
     const int bin = get_global_id(0), index = get_global_id(1);
-    if (bin >= bins || index >= count * cols) return;
-    const int row = first_row + index / cols, col = index % cols;
+    if (bin >= bins || index >= count * window.cols) return;
+    const int row = first_row + index / window.cols, col = index % window.cols;
     const real4 pose = (real4)((real)0.5, (real)0.5, ray[bin].x, ray[bin].y);
-    const real t = cast_ray(rectangles, rows, cols, (int2)(col, row), pose, (real2)(1, 0), limit, 0, 0, 0);
+    const real t = cast_ray(rectangles, window, (int2)(col, row), pose, (real2)(1, 0), limit, (Caster){0, 0, 0});
     const int part = (int)(t * ((real)65535 / limit) + (real)0.5);
-    lookup[((long)row * cols + col) * bins + bin] = (ushort)(t >= limit ? 65535 : part > 65534 ? 65534 : part);
+    lookup[((long)row * window.cols + col) * bins + bin] = (ushort)(t >= limit ? 65535 : part > 65534 ? 65534 : part);
 }

@@ -10,17 +10,17 @@ typedef float entry;
 #define LEAST_STEP ((real)2.384185791015625e-7)
 
 // Return the distance in cells to a point in an occupied cell, limit where none is nearer.
-real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+real cast_ray(global const entry *map_table, const Window window, const int2 cell, const real4 pose, const real2 ray,
+              const real limit, const Caster caster) {
     const Ray r = make_ray(pose, ray);
     real t = 0;
 #if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) {
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) {
 #if OUTSIDE_OCCUPIED
         return 0;
 #else
-        t = start_walk(r, cell, rows, cols, limit).t;
-        t += tolerance + t * LEAST_STEP;
+        t = start_walk(r, cell, window, limit).t;
+        t += caster.tolerance + t * LEAST_STEP;
 #endif
     }
 #endif
@@ -28,13 +28,13 @@ real cast_ray(global const entry *map_table, const int rows, const int cols, con
         const int col = cell.x + floor_int(pose.x + t * r.direction.x);
         const int row = cell.y + floor_int(pose.y + t * r.direction.y);
 #if OUTSIDE_OCCUPIED
-        if (off_grid(col, row, rows, cols)) return t;
+        if (off_grid(col, row, window.rows, window.cols)) return t;
 #else
-        if (off_grid(col, row, rows, cols)) return limit;
+        if (off_grid(col, row, window.rows, window.cols)) return limit;
 #endif
-        const real distance = map_table[row * cols + col];
+        const real distance = map_table[row * window.cols + col];
         if (distance == 0) return t;
-        const real least = tolerance + t * LEAST_STEP, step = distance - slack;
+        const real least = caster.tolerance + t * LEAST_STEP, step = distance - caster.slack;
         t += step > least ? step : least;
     }
     return limit;

@@ -1,5 +1,5 @@
-// Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading. Only +, -, *,
-// /, floor and comparisons are used, so that every device gives the same bits.
+// Placement of poses in a window of the grid, in float64: an integer cell, the fraction of it, and the heading. Only +,
+// -, *, /, floor and comparisons are used, so that every device gives the same bits.
 // requires: heading
 
 #if POSES_FLOAT32
@@ -29,42 +29,40 @@ double floor_cells(const double position) {
 }
 
 // Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets the
-// rounding errors (low parts) of pose. verdict, which the caller clears, becomes 1 at (0) if a pose is not finite, and
-// at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading
+// rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at (0) if a pose is not finite,
+// and at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading
 // (1, 0): it sees nothing, and its indices stay in bounds.
 void place_pose(const int particle, global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
-                const double resolution, const double mount_x, const double mount_y, const double yaw_cos,
-                const double yaw_sin, const int first_col, const int first_row, const int rows, const int cols) {
+                global real4 *pose_low, global int *pose_status, const Frame frame, const Window window) {
     const long first = 3 * (long)particle;
     double x = poses[first], y = poses[first + 1];
     const double theta = poses[first + 2];
     const int finite = (x - x) + (y - y) + (theta - theta) == 0;
     const double2 heading = cos_sin(theta);
     double cosine = heading.x, sine = heading.y;
-    x -= origin_x;
-    y -= origin_y;
-    if (mount_x != 0 || mount_y != 0) {
-        x += cosine * mount_x - sine * mount_y;
-        y += sine * mount_x + cosine * mount_y;
+    x -= frame.origin_x;
+    y -= frame.origin_y;
+    if (frame.mount_x != 0 || frame.mount_y != 0) {
+        x += cosine * frame.mount_x - sine * frame.mount_y;
+        y += sine * frame.mount_x + cosine * frame.mount_y;
     }
-    if (yaw_sin != 0) {
+    if (frame.yaw_sin != 0) {
         const double x_before = x, cosine_before = cosine;
-        x = yaw_cos * x + yaw_sin * y;
-        y = yaw_cos * y - yaw_sin * x_before;
-        cosine = cosine * yaw_cos + sine * yaw_sin;
-        sine = sine * yaw_cos - cosine_before * yaw_sin;
+        x = frame.yaw_cos * x + frame.yaw_sin * y;
+        y = frame.yaw_cos * y - frame.yaw_sin * x_before;
+        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin;
+        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin;
     }
-    x = within_reach(x / resolution);
-    y = within_reach(y / resolution);
+    x = within_reach(x / frame.resolution);
+    y = within_reach(y / frame.resolution);
     if (!finite) {
-        atomic_or(&verdict[0], 1);
+        atomic_or(&pose_status[0], 1);
         x = y = -FARTHEST;
         cosine = 1, sine = 0;
     }
     const double whole_x = floor_cells(x), whole_y = floor_cells(y);
-    const int2 cell = (int2)((int)whole_x - first_col, (int)whole_y - first_row);
-    if (cell.x < 0 || cell.y < 0 || cell.x >= cols || cell.y >= rows) atomic_or(&verdict[1], 1);
+    const int2 cell = (int2)((int)whole_x - window.col, (int)whole_y - window.row);
+    if (cell.x < 0 || cell.y < 0 || cell.x >= window.cols || cell.y >= window.rows) atomic_or(&pose_status[1], 1);
     pose_cell[particle] = cell;
     // Adding 0 turns -0 into 0.
     x = (x - whole_x) + 0.0;
@@ -83,12 +81,9 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
 
 // Place poses: one work-item takes a particle.
 kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                        global real4 *pose_low, global int *verdict, const double origin_x, const double origin_y,
-                        const double resolution, const double mount_x, const double mount_y, const double yaw_cos,
-                        const double yaw_sin, const int first_col, const int first_row, const int rows, const int cols,
+                        global real4 *pose_low, global int *pose_status, const Frame frame, const Window window,
                         const int particles) {
     const int particle = get_global_id(0);
     if (particle >= particles) return;
-    place_pose(particle, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
-               yaw_cos, yaw_sin, first_col, first_row, rows, cols);
+    place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window);
 }

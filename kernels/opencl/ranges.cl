@@ -3,22 +3,20 @@
 
 // Cast rays: one work-item takes a particle and ray.
 kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real2 *ray, global real *ranges, const int rows, const int cols,
-                        const int particles, const int rays, const int bins, const real slack, const real tolerance,
-                        const real limit, const real resolution, const real range_max) {
+                        global const real2 *ray, global real *ranges, const Window window, const int particles,
+                        const int rays, const Caster caster, const RangeScale scale) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
-    const real t = cast_ray(map_table, rows, cols, pose_cell[n], pose[n], ray[k], limit, bins, slack, tolerance);
-    ranges[(long)n * rays + k] = expected_range(t, limit, resolution, range_max);
+    const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[k], scale.limit, caster);
+    ranges[(long)n * rays + k] = expected_range(t, scale);
 }
 
 // Cast rays in tiles of particles and rays, for GPUs. There are fewer than 2^31 ranges. With restrict the compiler need
 // not read arguments again after a write.
 kernel void cast_tiles(global const entry *restrict map_table, global const int2 *restrict pose_cell,
                        global const real4 *restrict pose, global const int *restrict order,
-                       global const real2 *restrict ray, global real *restrict ranges, const int rows,
-                       const int cols, const int particles, const int rays, const int bins, const real slack,
-                       const real tolerance, const real limit, const real resolution, const real range_max,
+                       global const real2 *restrict ray, global real *restrict ranges, const Window window,
+                       const int particles, const int rays, const Caster caster, const RangeScale scale,
                        const int spread) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;
@@ -30,7 +28,7 @@ kernel void cast_tiles(global const entry *restrict map_table, global const int2
     const int2 cell = pose_cell[n];
     const real4 sensor_pose = pose[n];
     for (int k = tile_ray(item, spread); k < rays; k += tile_step(spread)) {
-        const real t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray[k], limit, bins, slack, tolerance);
-        ranges[n * rays + k] = expected_range(t, limit, resolution, range_max);
+        const real t = cast_ray(map_table, window, cell, sensor_pose, ray[k], scale.limit, caster);
+        ranges[n * rays + k] = expected_range(t, scale);
     }
 }

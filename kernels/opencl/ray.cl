@@ -71,12 +71,12 @@ real crossed(const real t, const real speed, const real a, const real inv, const
 
 // Return the walk at the ray's origin or, where that lies outside the grid, at the first cell inside; t is limit where
 // a ray from outside does not meet the grid before limit.
-Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, const real limit) {
+Walk start_walk(const Ray r, const int2 cell, const Window window, const real limit) {
     Walk walk = {0, 0, 0};
 #if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) {
-        const int enter_x = max(r.right ? -cell.x : cell.x - (cols - 1), 0);
-        const int enter_y = max(r.up ? -cell.y : cell.y - (rows - 1), 0);
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) {
+        const int enter_x = max(r.right ? -cell.x : cell.x - (window.cols - 1), 0);
+        const int enter_y = max(r.up ? -cell.y : cell.y - (window.rows - 1), 0);
         const real enter_t_x = enter_x > 0 ? ((real)(enter_x - 1) + r.a_x) * r.inv_x : (real)-1;
         const real enter_t_y = enter_y > 0 ? ((real)(enter_y - 1) + r.a_y) * r.inv_y : (real)-1;
         const real t = enter_t_x > enter_t_y ? enter_t_x : enter_t_y;
@@ -89,7 +89,7 @@ Walk start_walk(const Ray r, const int2 cell, const int rows, const int cols, co
             walk.k_y = enter_y;
             walk.k_x = whole(crossed(t, r.speed_x, r.a_x, r.inv_x, 1));
         }
-        if (!off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols)) walk.t = t;
+        if (!off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, window.rows, window.cols)) walk.t = t;
     }
 #endif
     return walk;
@@ -113,7 +113,7 @@ int angle_bin(const real2 direction, const int bins) {
 }
 
 // Convert a distance in cells to metres, exactly range_max where nothing is nearer.
-real expected_range(const real t, const real limit, const real resolution, const real range_max) {
-    const real range = t * resolution;
-    return t >= limit || range > range_max ? range_max : range;
+real expected_range(const real t, const RangeScale scale) {
+    const real range = t * scale.resolution;
+    return t >= scale.limit || range > scale.range_max ? scale.range_max : range;
 }

@@ -31,21 +31,22 @@ int sector_of(const real speed_x, const real speed_y) {
 }
 
 // Return the distance in cells to the first occupied cell, limit where none is nearer.
-real cast_ray(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
-              const real2 ray, const real limit, const int bins, const real slack, const real tolerance) {
+real cast_ray(global const entry *map_table, const Window window, const int2 cell, const real4 pose, const real2 ray,
+              const real limit, const Caster caster) {
     const Ray r = make_ray(pose, ray);
 #if OUTSIDE_OCCUPIED
 #if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) return 0;
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) return 0;
 #endif
 #endif
-    const Walk start = start_walk(r, cell, rows, cols, limit);
+    const Walk start = start_walk(r, cell, window, limit);
 #if ORIGINS_OUTSIDE
     if (start.t >= limit) return limit;
 #endif
     const int plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
-    const uint step_x = r.step_x, step_y = r.step_y * (cols + 2);
-    const uint origin = plane * ((rows + 2) * (cols + 2)) + padded(cell.y, cell.x, cols) - (step_x + step_y) * FIRST;
+    const uint step_x = r.step_x, step_y = r.step_y * (window.cols + 2);
+    const uint size = (window.rows + 2) * (window.cols + 2);
+    const uint origin = plane * size + padded(cell.y, cell.x, window.cols) - (step_x + step_y) * FIRST;
     real k_x = COUNT + (real)start.k_x, k_y = COUNT + (real)start.k_y, t = start.t;
     uint sides = map_table[(int)(origin + step_x * (uint)as_bits(k_x) + step_y * (uint)as_bits(k_y))];
     // A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.

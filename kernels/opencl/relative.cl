@@ -41,9 +41,9 @@ real2 rounded_place(const double2 at) {
     return (real2)(rounded, (real)((high - (double)rounded) + low));
 }
 
-// Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. verdict, which
-// the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
-kernel void place_relative(global const coordinate *poses, global real4 *place, global int *verdict,
+// Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. pose_status,
+// which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
+kernel void place_relative(global const coordinate *poses, global real4 *place, global int *pose_status,
                            const double origin_x, const double origin_y, const double mount_x, const double mount_y,
                            const int particles) {
     const int n = get_global_id(0);
@@ -51,7 +51,7 @@ kernel void place_relative(global const coordinate *poses, global real4 *place, 
     const long first = 3 * (long)n;
     const double pose_x = poses[first], pose_y = poses[first + 1], theta = poses[first + 2];
     if (!((pose_x - pose_x) + (pose_y - pose_y) + (theta - theta) == 0)) {
-        atomic_or(&verdict[0], 1);
+        atomic_or(&pose_status[0], 1);
         place[n] = (real4)(0, 0, 0, 0);
         return;
     }
@@ -68,8 +68,8 @@ kernel void place_relative(global const coordinate *poses, global real4 *place, 
 }
 
 // Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
-// verdict is as for place_relative.
-kernel void wrap_headings(global const coordinate *poses, global real2 *residual, global int *verdict,
+// pose_status is as for place_relative.
+kernel void wrap_headings(global const coordinate *poses, global real2 *residual, global int *pose_status,
                           const double target, const double target_low, const int particles) {
     const int n = get_global_id(0);
     if (n >= particles) return;
@@ -77,7 +77,7 @@ kernel void wrap_headings(global const coordinate *poses, global real2 *residual
     const double x = poses[first], y = poses[first + 1];
     double theta = poses[first + 2];
     if (!((x - x) + (y - y) + (theta - theta) == 0)) {
-        atomic_or(&verdict[0], 1);
+        atomic_or(&pose_status[0], 1);
         theta = 0;
     }
     const double2 angle = wrapped_difference(theta, (double2)(target, target_low));

@@ -1,6 +1,7 @@
 // Placement of poses and readings that lie on the device. Readings are selected and placed as
-// gpusense.models.scan.classed does it on the host. Uninformative readings are left out and the others move up, so that sums over blocks of readings have the same
-// bits. The places that remain at the end get missing readings (nan), which add nothing.
+// gpusense.models.scan.classed does it on the host. Uninformative readings are left out and the others move up, so that
+// sums over blocks of readings have the same bits. The places that remain at the end get missing readings (nan), which
+// add nothing.
 // requires: error_free placement
 
 #if RANGES_FLOAT32
@@ -36,50 +37,50 @@ double reading_of(const int k, global const measured *ranges, global const int *
 // Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a place
 // at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points the vectors
 // of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and point_low its
-// rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2 cells). fixed is the
-// constant term of max readings that have no place, -inf if there is a range where none is possible.
+// rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2 cells). constant_term is
+// that of max readings without a place, -inf if there is a range where none is possible.
 void place_reading(const int item, global const measured *ranges, global const int *beam, global const double *vector,
                    global real2 *point, global real2 *point_low, global real *reading, global real *guard,
-                   global real *fixed, const double resolution, const int beams, const int each, const int places,
-                   const int chosen, const int max_readings, const int possible, const double nearest,
-                   const double farthest, const double log_max, const double top, const double guard_scale) {
+                   global real *constant_term, const double resolution, const ReadingRules rules) {
     // Values that are needed last are read first, so that nothing waits for them.
-    const long from = 2 * (long)min(item, beams - 1) * each;
-    const double item_reading = reading_of(item, ranges, beam, beams);
-    const double vector_x = item < beams ? vector[from] : 1, vector_y = item < beams ? vector[from + 1] : 0;
-    int informative = beams;
-    if (chosen < beams) {
+    const long from = 2 * (long)min(item, rules.beams - 1) * rules.each;
+    const double item_reading = reading_of(item, ranges, beam, rules.beams);
+    const double vector_x = item < rules.beams ? vector[from] : 1, vector_y = item < rules.beams ? vector[from + 1] : 0;
+    int informative = rules.beams;
+    if (rules.chosen < rules.beams) {
         informative = 0;
-        for (int k = 0; k < beams; ++k) {
-            const double z = reading_of(k, ranges, beam, beams);
-            informative += z >= nearest && (z < farthest || max_readings != MAX_LEFT_OUT);
+        for (int k = 0; k < rules.beams; ++k) {
+            const double z = reading_of(k, ranges, beam, rules.beams);
+            informative += z >= rules.nearest && (z < rules.farthest || rules.max_readings != MAX_LEFT_OUT);
         }
     }
-    int rank = 0, place = 0, item_place = places, far_count = 0, impossible = 0;
+    int rank = 0, place = 0, item_place = rules.places, far_count = 0, impossible = 0;
     // The longest reading in the block of places that begins with this item's place, if a block begins there.
     double item_value = NAN, longest = 0;
-    for (int first = 0; first < beams; first += BLOCK_TERMS) {
+    for (int first = 0; first < rules.beams; first += BLOCK_TERMS) {
         double several[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) several[i] = reading_of(first + i, ranges, beam, beams);
+        for (int i = 0; i < BLOCK_TERMS; ++i) several[i] = reading_of(first + i, ranges, beam, rules.beams);
         // Sets of readings: bit i is reading first + i.
         uint hits = 0, fars = 0;
 #pragma unroll
         for (int i = 0; i < BLOCK_TERMS; ++i) {
-            hits |= (uint)(several[i] >= nearest && several[i] < farthest) << i;
-            fars |= (uint)(several[i] >= farthest) << i;
+            hits |= (uint)(several[i] >= rules.nearest && several[i] < rules.farthest) << i;
+            fars |= (uint)(several[i] >= rules.farthest) << i;
         }
-        const uint telling = max_readings == MAX_LEFT_OUT ? hits : hits | fars;
+        const uint telling = rules.max_readings == MAX_LEFT_OUT ? hits : hits | fars;
         uint used = telling;
-        if (chosen < informative) {
+        if (rules.chosen < informative) {
             for (int i = 0; i < BLOCK_TERMS; ++i) {
                 const int rank_of_i = rank + popcount(telling & ((1u << i) - 1));
-                if (!is_chosen(rank_of_i, informative, chosen)) used &= ~(1u << i);
+                if (!is_chosen(rank_of_i, informative, rules.chosen)) used &= ~(1u << i);
             }
         }
-        const uint as_range = possible ? used & hits : 0, as_far = max_readings == MAX_PLACED ? used & fars : 0;
+        const uint as_range = rules.possible ? used & hits : 0;
+        const uint as_far = rules.max_readings == MAX_PLACED ? used & fars : 0;
 #if ALL_READINGS
-        const uint placed = first + BLOCK_TERMS <= beams ? (1u << BLOCK_TERMS) - 1 : (1u << (beams - first)) - 1;
+        const int left = rules.beams - first;
+        const uint placed = left >= BLOCK_TERMS ? (1u << BLOCK_TERMS) - 1 : (1u << left) - 1;
 #else
         const uint placed = as_range | as_far;
 #endif
@@ -89,7 +90,7 @@ void place_reading(const int item, global const measured *ranges, global const i
             item_value = as_range >> item_bit & 1 ? item_reading : as_far >> item_bit & 1 ? INFINITY : NAN;
         }
 #if END_POINTS
-        if (item_place < places && item_place % BLOCK_TERMS == 0 && place < item_place + BLOCK_TERMS) {
+        if (item_place < rules.places && item_place % BLOCK_TERMS == 0 && place < item_place + BLOCK_TERMS) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) {
                 const int other = place + popcount(placed & ((1u << i) - 1));
@@ -100,64 +101,60 @@ void place_reading(const int item, global const measured *ranges, global const i
 #endif
         rank += popcount(telling);
         far_count += popcount(used & fars);
-        impossible |= !possible && (used & hits);
+        impossible |= !rules.possible && (used & hits);
         place += popcount(placed);
     }
 #if END_POINTS
-    if (item_place < places) {
+    if (item_place < rules.places) {
         const double cells = item_value / resolution, length = isfinite(cells) ? cells : 0;
         const double x = vector_x * length, y = vector_y * length;
         const real2 high = (real2)((real)x, (real)y);
         point[item_place] = isfinite(cells) ? high : (real2)((real)cells);
         point_low[item_place] = (real2)((real)(x - high.x), (real)(y - high.y));
         if (item_place % BLOCK_TERMS == 0)
-            guard[item_place / BLOCK_TERMS] = (real)(guard_scale * (longest / resolution + 2));
+            guard[item_place / BLOCK_TERMS] = (real)(rules.guard_scale * (longest / resolution + 2));
     }
-    if (item >= place && item < places) {
+    if (item >= place && item < rules.places) {
         point[item] = (real2)((real)NAN);
         point_low[item] = (real2)(0);
-        if (item % BLOCK_TERMS == 0) guard[item / BLOCK_TERMS] = (real)(guard_scale * 2);
+        if (item % BLOCK_TERMS == 0) guard[item / BLOCK_TERMS] = (real)(rules.guard_scale * 2);
     }
 #else
-    if (item_place < places) {
-        point[(long)item_place * each] = (real2)((real)vector_x, (real)vector_y);
-        for (int j = 1; j < each; ++j) {
-            point[(long)item_place * each + j] = (real2)((real)vector[from + 2 * j], (real)vector[from + 2 * j + 1]);
+    if (item_place < rules.places) {
+        point[(long)item_place * rules.each] = (real2)((real)vector_x, (real)vector_y);
+        for (int j = 1; j < rules.each; ++j) {
+            const double2 one = (double2)(vector[from + 2 * j], vector[from + 2 * j + 1]);
+            point[(long)item_place * rules.each + j] = (real2)((real)one.x, (real)one.y);
         }
         const real rounded = (real)item_value;
-        reading[item_place] = rounded > (real)top && !isinf(rounded) ? (real)top : rounded;
+        reading[item_place] = rounded > (real)rules.top && !isinf(rounded) ? (real)rules.top : rounded;
     }
-    if (item >= place && item < places) {
-        for (int j = 0; j < each; ++j) point[(long)item * each + j] = (real2)(1, 0);
+    if (item >= place && item < rules.places) {
+        for (int j = 0; j < rules.each; ++j) point[(long)item * rules.each + j] = (real2)(1, 0);
         reading[item] = (real)NAN;
     }
 #endif
     if (item == 0) {
-        fixed[0] = max_readings == MAX_FIXED ? (real)(far_count * log_max) : 0;
-        if (impossible > 0) fixed[0] = -INFINITY;
+        constant_term[0] = rules.max_readings == MAX_FIXED ? (real)(far_count * rules.log_max) : 0;
+        if (impossible > 0) constant_term[0] = -INFINITY;
     }
 }
 
 // Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a particle.
 kernel void place_inputs(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                         global real4 *pose_low, global int *verdict, global const measured *ranges,
+                         global real4 *pose_low, global int *pose_status, global const measured *ranges,
                          global const int *beam, global const double *vector, global real2 *point,
-                         global real2 *point_low, global real *reading, global real *guard, global real *fixed,
-                         const double origin_x, const double origin_y, const double resolution, const double mount_x,
-                         const double mount_y, const double yaw_cos, const double yaw_sin, const int first_col,
-                         const int first_row, const int rows, const int cols, const int particles, const int head,
-                         const int beams, const int each, const int places, const int chosen, const int max_readings,
-                         const int possible, const double nearest, const double farthest, const double log_max,
-                         const double top, const double guard_scale) {
+                         global real2 *point_low, global real *reading, global real *guard, global real *constant_term,
+                         const Frame frame, const Window window, const int particles, const int head,
+                         const ReadingRules rules) {
     const int item = get_global_id(0);
     if (item < head) {
-        if (item < max(max(beams, places), 1)) {
-            place_reading(item, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each,
-                          places, chosen, max_readings, possible, nearest, farthest, log_max, top, guard_scale);
+        if (item < max(max(rules.beams, rules.places), 1)) {
+            place_reading(item, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution,
+                          rules);
         }
         return;
     }
     if (item - head >= particles) return;
-    place_pose(item - head, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
-               yaw_cos, yaw_sin, first_col, first_row, rows, cols);
+    place_pose(item - head, poses, pose_cell, pose, pose_low, pose_status, frame, window);
 }

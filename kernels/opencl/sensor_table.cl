@@ -11,8 +11,8 @@ int range_bin(const real range, const real per_metre, const int cells, const rea
 }
 
 // Return log p of a reading for an expected range.
-real tabulated_density(const real z, const real expected, global const real *sensor, const int cells,
-                       const real per_metre, const real range_max) {
-    const int column = range_bin(expected, per_metre, cells, range_max);
-    return sensor[(long)range_bin(z, per_metre, cells, range_max) * (cells + 1) + column];
+real tabulated_density(const real z, const real expected, global const real *sensor, const MixtureTables tables,
+                       const real range_max) {
+    const int column = range_bin(expected, tables.per_metre, tables.cells, range_max);
+    return sensor[(long)range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column];
 }

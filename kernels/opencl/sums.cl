@@ -1,16 +1,15 @@
 // Sums of the terms of readings, or of blocks of readings, in the order of the readings.
 // requires: error_free
 
-// Sum count numbers, number k at parts[place * across + k * along]: one work-item takes a particle. They are sums of
+// Sum count numbers, number k at parts[place + k * particles]: one work-item takes a particle. They are sums of
 // blocks or strands (block is 1), or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first. All
 // are added to a compensated total. With SCANS each scan has a count of its own; with STRANDED it is a count of
 // readings, and the numbers are sums of their strands. BLOCK_TERMS numbers are read before any is added, so that a
 // work-item waits once for all of them; numbers beyond the last count as 0, which changes no sum. There are fewer than
 // 2^31 numbers.
 kernel void sum_parts(global const real *parts, global const int *order, global const int *counts,
-                      global const real *fixed_of, global real *log_p, const int particles, const int count,
-                      const int block, const int across, const int along, const real fixed, const real temperature,
-                      const int per_scan) {
+                      global const real *constant_terms, global real *log_p, const int particles, const int count,
+                      const int block, const Score score, const ScanBatch batch) {
     const int place = get_global_id(0);
     if (place >= particles) return;
 #if ORDERED
@@ -20,21 +19,21 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
 #endif
 #if SCANS
 #if STRANDED
-    const int terms = counts[n / per_scan], size = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
+    const int terms = counts[n / batch.per_scan];
+    const int size = terms / BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS);
 #else
-    const int size = counts[n / per_scan];
+    const int size = counts[n / batch.per_scan];
 #endif
-    const real constant_term = fixed_of[n / per_scan];
+    const real constant_term = constant_terms[n / batch.per_scan];
 #else
     const int size = count;
-    const real constant_term = fixed;
+    const real constant_term = score.constant_term;
 #endif
-    const int begin = place * across;
     real2 total = (real2)(constant_term, 0);
     for (int first = 0; first < size; first += BLOCK_TERMS) {
         real term[BLOCK_TERMS];
 #pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[begin + min(first + i, size - 1) * along];
+        for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = parts[place + min(first + i, size - 1) * particles];
         if (first + BLOCK_TERMS > size) {
 #pragma unroll
             for (int i = 0; i < BLOCK_TERMS; ++i) term[i] = first + i < size ? term[i] : 0;
@@ -51,8 +50,8 @@ kernel void sum_parts(global const real *parts, global const int *order, global 
         }
     }
 #if CUBES
-    log_p[n] = temperature * log(total.x + total.y);
+    log_p[n] = score.temperature * log(total.x + total.y);
 #else
-    log_p[n] = isinf(total.x) ? total.x : temperature * (total.x + total.y);
+    log_p[n] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
 #endif
 }

@@ -21,9 +21,9 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    caster = caster_of(flags)
-    ENTRY = caster.ENTRY
-    cast_ray = caster.functions(flags).cast_ray
+    casting = caster_of(flags)
+    ENTRY = casting.ENTRY
+    cast_ray = casting.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
     tabulated_density = sensor_table.functions(flags).tabulated_density
     compat_density = compat.functions(flags).compat_density
@@ -54,8 +54,7 @@ def make(name, flags):
         expected: real,
         terms: wp.array(dtype=real),
         sensor: wp.array(dtype=real),
-        cells: wp.int32,
-        per_metre: real,
+        tables: types.MixtureTables,
         range_max: real,
     ):
         if ALL_READINGS:
@@ -68,7 +67,7 @@ def make(name, flags):
             p = compat_density(z, expected, terms)
             return p * p * p
         elif SENSOR_TABLE:
-            return tabulated_density(z, expected, sensor, cells, per_metre, range_max)
+            return tabulated_density(z, expected, sensor, tables, range_max)
         else:
             return log_density(z, expected, terms)
 
@@ -96,29 +95,19 @@ def make(name, flags):
         edges: wp.array(dtype=real),
         sensor: wp.array(dtype=real),
         start: wp.array(dtype=wp.int32),
-        fixed_of: wp.array(dtype=real),
+        constant_terms: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         rays: wp.int32,
         readings: wp.int32,
-        kinds: wp.int32,
-        cone_rays: wp.int32,
-        critical: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
-        cells: wp.int32,
-        per_metre: real,
-        limit: real,
-        resolution: real,
-        range_max: real,
-        fixed: real,
-        temperature: real,
-        per_scan: wp.int32,
-        ahead: wp.int32,
+        tables: types.MixtureTables,
+        cone: types.Cone,
+        caster: types.Caster,
+        scale: types.RangeScale,
+        score: types.Score,
+        batch: types.ScanBatch,
     ):
         n = wp.tid()
         if n >= particles:
@@ -128,15 +117,15 @@ def make(name, flags):
         before = int(0)
         size = rays
         readings_before = int(0)
-        constant_term = fixed
+        constant_term = score.constant_term
         if SCANS:
-            scan = (n + ahead) // per_scan
+            scan = (n + batch.ahead) // batch.per_scan
             before = start[scan]
             size = start[scan + 1] - before
             readings_before = before
             if SHARED_RAYS:
                 readings_before = first[before]
-            constant_term = fixed_of[scan]
+            constant_term = constant_terms[scan]
         total = vec2(constant_term, ZERO)
         strands = vec4()
         impossible = bool(False)
@@ -144,17 +133,15 @@ def make(name, flags):
             bin_terms = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, sensor_pose, ray, (before + r) * cone_rays, cone_rays,
-                    critical, limit, bins, slack, tolerance,
+                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, scale.limit,
+                    caster,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
-                    bin_terms = incidence_terms(terms, edges, kinds, heard.cosine)
+                    bin_terms = incidence_terms(terms, edges, tables.incidence_bins, heard.cosine)
             else:
-                t = cast_ray(
-                    map_table, rows, cols, cell, sensor_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
-                )
-            expected = expected_range(t, limit, resolution, range_max)
+                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), scale.limit, caster)
+            expected = expected_range(t, scale)
             begin = r
             end = r + 1
             if SHARED_RAYS:
@@ -162,7 +149,7 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             for k in range(begin, end):
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, bin_terms, sensor, cells, per_metre, range_max)
+                term = reading_term(z, expected, bin_terms, sensor, tables, scale.range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -179,9 +166,9 @@ def make(name, flags):
         if impossible:
             log_p[n] = NEVER
         else:
-            log_p[n] = temperature * scan_log(total.x + total.y)
+            log_p[n] = score.temperature * scan_log(total.x + total.y)
 
-    # Write the term of reading k to parts[place * across + k * along], in tiles of particles and rays, for GPUs. With
+    # Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. With
     # STRANDED the number there is the sum of strand k, and a work-item takes whole strands.
     @kernel
     def beam_tiles(
@@ -198,26 +185,16 @@ def make(name, flags):
         sensor: wp.array(dtype=real),
         start: wp.array(dtype=wp.int32),
         parts: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         rays: wp.int32,
         readings: wp.int32,
-        kinds: wp.int32,
-        cone_rays: wp.int32,
-        critical: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
-        cells: wp.int32,
-        per_metre: real,
-        limit: real,
-        resolution: real,
-        range_max: real,
-        across: wp.int32,
-        along: wp.int32,
+        tables: types.MixtureTables,
+        cone: types.Cone,
+        caster: types.Caster,
+        scale: types.RangeScale,
         spread: wp.int32,
-        per_scan: wp.int32,
+        batch: types.ScanBatch,
     ):
         item = work_item(wp.tid())
         place = tile_place(item, spread)
@@ -232,7 +209,7 @@ def make(name, flags):
         size = rays
         readings_before = int(0)
         if SCANS:
-            scan = n // per_scan
+            scan = n // batch.per_scan
             before = start[scan]
             size = start[scan + 1] - before
             readings_before = before
@@ -247,17 +224,15 @@ def make(name, flags):
             bin_terms = terms
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, rows, cols, cell, sensor_pose, ray, (before + r) * cone_rays, cone_rays,
-                    critical, limit, bins, slack, tolerance,
+                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, scale.limit,
+                    caster,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
-                    bin_terms = incidence_terms(terms, edges, kinds, heard.cosine)
+                    bin_terms = incidence_terms(terms, edges, tables.incidence_bins, heard.cosine)
             else:
-                t = cast_ray(
-                    map_table, rows, cols, cell, sensor_pose, ray_at(ray, before + r), limit, bins, slack, tolerance
-                )
-            expected = expected_range(t, limit, resolution, range_max)
+                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), scale.limit, caster)
+            expected = expected_range(t, scale)
             k = r
             end = r + 1
             if SHARED_RAYS:
@@ -265,18 +240,18 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             while k < end:
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, bin_terms, sensor, cells, per_metre, range_max)
+                term = reading_term(z, expected, bin_terms, sensor, tables, scale.range_max)
                 if STRANDED:
                     strand_sum += term
                 else:
-                    put(parts, place * across + k * along, term)
+                    put(parts, place + k * particles, term)
                 k += 1
             if STRANDED:
                 r += STRANDS
                 # The end of a block or of the scan.
                 if r >= size or (r & (BLOCK_TERMS - STRANDS)) == 0:
                     q = (r - STRANDS) // BLOCK_TERMS * STRANDS + (r & (STRANDS - 1))
-                    put(parts, place * across + q * along, strand_sum)
+                    put(parts, place + q * particles, strand_sum)
                     strand_sum = ZERO
                     r += ((1 << spread) - 1) * BLOCK_TERMS
             else:

@@ -32,21 +32,18 @@ def functions(flags):
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: vec2,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
-            if off_grid(cell.x, cell.y, rows, cols):
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
                 return ZERO
-        start = start_walk(r, cell, rows, cols, limit)
+        start = start_walk(r, cell, window, limit)
         if start.t >= limit:
             return limit
         col = cell.x + r.step_x * start.k_x
@@ -65,7 +62,7 @@ def functions(flags):
         while along <= longer:
             x = wp.where(far_x >= far_y, along, aside)
             y = wp.where(far_x >= far_y, aside, along)
-            state = int(map_table[padded(row + up * y, col + right * x, cols)])
+            state = int(map_table[padded(row + up * y, col + right * x, window.cols)])
             if state != 0:
                 if OUTSIDE_OCCUPIED:
                     state = 1

@@ -36,27 +36,24 @@ def functions(flags):
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: vec2,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         lines = map_table[0]
-        first = 1 + 3 * bins
-        if off_grid(cell.x, cell.y, rows, cols):
+        first = 1 + 3 * caster.bins
+        if off_grid(cell.x, cell.y, window.rows, window.cols):
             if OUTSIDE_OCCUPIED:
                 return ZERO
         else:
-            index = cell.y * cols + cell.x
-            bits = wp.uint32(map_table[first + bins * lines + 1 + index / 32])
+            index = cell.y * window.cols + cell.x
+            bits = wp.uint32(map_table[first + caster.bins * lines + 1 + index / 32])
             if (bits >> wp.uint32(index % 32)) & wp.uint32(1) != wp.uint32(0):
                 return ZERO
-        bin = angle_bin(ray_direction(pose, ray), bins)
+        bin = angle_bin(ray_direction(pose, ray), caster.bins)
         c = real(map_table[1 + 3 * bin]) * COSINE_UNIT
         s = real(map_table[2 + 3 * bin]) * COSINE_UNIT
         x = real(cell.x) + pose.x

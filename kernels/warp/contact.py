@@ -97,8 +97,7 @@ def make(name, flags):
         pressed: wp.array(dtype=wp.int32),
         terms: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         segments: wp.int32,
         guard: real,
@@ -119,7 +118,7 @@ def make(name, flags):
             while i < start[s + 1]:
                 end = find_end_point(sensor_pose, low, point[i], point_low[i], ZERO, guard)
                 at = pose_cell[n] + end.cell
-                nearest = wp.min(nearest, table[field_cell(at.x, at.y, rows, cols)])
+                nearest = wp.min(nearest, table[field_cell(at.x, at.y, window)])
                 i += 1
             total += log_bump(nearest, pressed[s], terms)
             s += 1

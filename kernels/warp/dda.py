@@ -30,28 +30,25 @@ def functions(flags):
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: vec2,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
-            if off_grid(cell.x, cell.y, rows, cols):
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
                 return ZERO
-        start = start_walk(r, cell, rows, cols, limit)
+        start = start_walk(r, cell, window, limit)
         k_x = int(start.k_x)
         k_y = int(start.k_y)
         t = real(start.t)
         if t >= limit:
             return limit
         while True:
-            state = int(map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, cols)])
+            state = int(map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)])
             if state != 0:
                 if OUTSIDE_OCCUPIED:
                     return t

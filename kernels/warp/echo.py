@@ -22,9 +22,9 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    caster = caster_of(flags)
-    ENTRY = caster.ENTRY
-    cast_ray = caster.functions(flags).cast_ray
+    casting = caster_of(flags)
+    ENTRY = casting.ENTRY
+    cast_ray = casting.functions(flags).cast_ray
     geometry = ray_file.functions(flags)
     Ray, make_ray, off_grid = geometry.Ray, geometry.make_ray, geometry.off_grid
     crossed, whole = geometry.crossed, geometry.whole
@@ -50,36 +50,38 @@ def functions(flags):
 
     # Return the normal of a cell; beyond the ring cells are free, or with OUTSIDE_OCCUPIED occupied without a normal.
     @wp.func
-    def normal_at(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, col: wp.int32, row: wp.int32):
-        if off_grid(col + 1, row + 1, rows + 2, cols + 2):
+    def normal_at(normals: wp.array(dtype=vec2), window: types.Window, col: wp.int32, row: wp.int32):
+        if off_grid(col + 1, row + 1, window.rows + 2, window.cols + 2):
             if OUTSIDE_OCCUPIED:
                 return vec2(NOWHERE, NOWHERE)
             else:
                 return vec2(ZERO, ZERO)
-        return normals[padded(row, col, cols)]
+        return normals[padded(row, col, window.cols)]
 
     # Return the normal of the cell in which a ray ends at a distance t. The distance determines the cell of the exact
     # walk: it has crossed all boundaries in x up to t, and those in y before t or, after a step in y, up to t as well.
     # At a corner it steps in x first.
     @wp.func
-    def hit_normal(normals: wp.array(dtype=vec2), rows: wp.int32, cols: wp.int32, cell: wp.vec2i, r: Ray, t: real):
+    def hit_normal(normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i, r: Ray, t: real):
         if t == ZERO:
-            start_normal = normal_at(normals, rows, cols, cell.x, cell.y)
+            start_normal = normal_at(normals, window, cell.x, cell.y)
             if is_wall(start_normal):
                 return start_normal
         col = cell.x + r.step_x * whole(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
         before = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, False))
-        normal = normal_at(normals, rows, cols, col, before)
+        normal = normal_at(normals, window, col, before)
         if is_wall(normal):
             return normal
         until = cell.y + r.step_y * whole(crossed(t, r.speed_y, r.a_y, r.inv_y, True))
-        return normal_at(normals, rows, cols, col, until)
+        return normal_at(normals, window, col, until)
 
     # Return the terms of the mixture for the bin of an angle of incidence; edges are cosines of the bins' upper ends.
     @wp.func
-    def incidence_terms(terms: wp.array(dtype=real), edges: wp.array(dtype=real), kinds: wp.int32, cosine: real):
+    def incidence_terms(
+        terms: wp.array(dtype=real), edges: wp.array(dtype=real), incidence_bins: wp.int32, cosine: real
+    ):
         bin = int(0)
-        while bin + 1 < kinds and cosine <= edges[bin]:
+        while bin + 1 < incidence_bins and cosine <= edges[bin]:
             bin += 1
         return terms[10 * bin :]
 
@@ -89,35 +91,31 @@ def functions(flags):
     def nearest_echo(
         map_table: wp.array(dtype=ENTRY),
         normals: wp.array(dtype=vec2),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: wp.array(dtype=vec2),
         first: wp.int32,
-        cone_rays: wp.int32,
-        critical: real,
+        cone: types.Cone,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         echo = Echo()
         echo.t = limit
         echo.cosine = TWO
-        for i in range(first, first + cone_rays):
+        for i in range(first, first + cone.rays):
             # Most casters may stop at the nearest return so far; those of tables and lines may not.
             farthest = real(echo.t)
             if TO_THE_LIMIT:
                 farthest = limit
-            t = cast_ray(map_table, rows, cols, cell, pose, ray[i], farthest, bins, slack, tolerance)
+            t = cast_ray(map_table, window, cell, pose, ray[i], farthest, caster)
             if t < echo.t:
                 if INCIDENCE:
                     r = make_ray(pose, ray[i])
-                    normal = hit_normal(normals, rows, cols, cell, r, t)
+                    normal = hit_normal(normals, window, cell, r, t)
                     known = not wp.isnan(normal.x)
                     cosine = wp.where(known, wp.abs(r.direction.x * normal.x + r.direction.y * normal.y), ONE)
-                    if cosine >= critical:
+                    if cosine >= cone.critical:
                         echo.t = t
                         echo.cosine = cosine
                         aslant = wp.abs(r.direction.x * normal.y - r.direction.y * normal.x)
@@ -151,28 +149,21 @@ def make(name, flags):
         ray: wp.array(dtype=vec2),
         ranges: wp.array(dtype=real),
         incidence: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         rays: wp.int32,
-        cone_rays: wp.int32,
-        critical: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
-        limit: real,
-        resolution: real,
-        range_max: real,
+        cone: types.Cone,
+        caster: types.Caster,
+        scale: types.RangeScale,
     ):
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
         echo = nearest_echo(
-            map_table, normals, rows, cols, pose_cell[n], pose[n], ray, k * cone_rays, cone_rays, critical, limit, bins,
-            slack, tolerance,
-        )  # fmt: skip
-        ranges[n * rays + k] = expected_range(echo.t, limit, resolution, range_max)
+            map_table, normals, window, pose_cell[n], pose[n], ray, k * cone.rays, cone, scale.limit, caster
+        )
+        ranges[n * rays + k] = expected_range(echo.t, scale)
         if INCIDENCE:
-            incidence[n * rays + k] = wp.where(echo.t < limit, wp.atan2(echo.sine, echo.cosine), NOWHERE)
+            incidence[n * rays + k] = wp.where(echo.t < scale.limit, wp.atan2(echo.sine, echo.cosine), NOWHERE)
 
     return {"cast_echoes": cast_echoes}[name]

@@ -10,17 +10,17 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import error_free
-from .prelude import fused, precision
+from .prelude import Window, fused, precision
 
 FIELD_RING = wp.constant(2)
 
 
 # Return the index of a cell of the padded table; far cells become ring cells.
 @wp.func
-def field_cell(col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
-    c = wp.clamp(col, -FIELD_RING, cols + FIELD_RING - 1)
-    r = wp.clamp(row, -FIELD_RING, rows + FIELD_RING - 1)
-    return (r + FIELD_RING) * (cols + 2 * FIELD_RING) + c + FIELD_RING
+def field_cell(col: wp.int32, row: wp.int32, window: Window):
+    c = wp.clamp(col, -FIELD_RING, window.cols + FIELD_RING - 1)
+    r = wp.clamp(row, -FIELD_RING, window.rows + FIELD_RING - 1)
+    return (r + FIELD_RING) * (window.cols + 2 * FIELD_RING) + c + FIELD_RING
 
 
 @functools.cache
@@ -156,20 +156,14 @@ def functions(flags):
 
     # Return the index of the cell of rounded_cell in the padded table, from the origin of table_origin.
     @wp.func
-    def table_cell(near: wp.vec2i, start: wp.vec2i, rows: wp.int32, cols: wp.int32):
+    def table_cell(near: wp.vec2i, start: wp.vec2i, window: Window):
         if INSIDE:
             return wp.int32(wp.uint32(near.y) * wp.uint32(start.y) + (wp.uint32(near.x) + wp.uint32(start.x)))
         else:
-            return field_cell(start.x + near.x, start.y + near.y, rows, cols)
+            return field_cell(start.x + near.x, start.y + near.y, window)
 
     return SimpleNamespace(
-        ROUNDING_BITS=ROUNDING_BITS,
-        careful_offset=careful_offset,
-        whole_cells=whole_cells,
-        EndPoint=EndPoint,
-        end_point=end_point,
-        rounding_margin=rounding_margin,
-        rounded_cell=rounded_cell,
-        table_origin=table_origin,
+        ROUNDING_BITS=ROUNDING_BITS, careful_offset=careful_offset, whole_cells=whole_cells, EndPoint=EndPoint,
+        end_point=end_point, rounding_margin=rounding_margin, rounded_cell=rounded_cell, table_origin=table_origin,
         table_cell=table_cell,
-    )
+    )  # fmt: skip

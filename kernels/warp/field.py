@@ -48,11 +48,11 @@ def functions(flags):
 
     # Interpolate the distance between the four cell centres around an end point, in two parts.
     @wp.func
-    def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, rows: wp.int32, cols: wp.int32):
-        a = vec2(number_at(table, field_cell(cell.x, cell.y, rows, cols)), ZERO)
-        b = vec2(number_at(table, field_cell(cell.x + 1, cell.y, rows, cols)), ZERO)
-        c = vec2(number_at(table, field_cell(cell.x, cell.y + 1, rows, cols)), ZERO)
-        d = vec2(number_at(table, field_cell(cell.x + 1, cell.y + 1, rows, cols)), ZERO)
+    def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
+        a = vec2(number_at(table, field_cell(cell.x, cell.y, window)), ZERO)
+        b = vec2(number_at(table, field_cell(cell.x + 1, cell.y, window)), ZERO)
+        c = vec2(number_at(table, field_cell(cell.x, cell.y + 1, window)), ZERO)
+        d = vec2(number_at(table, field_cell(cell.x + 1, cell.y + 1, window)), ZERO)
         low = between(end.to_next_x, a, end.rest_x, b)
         high = between(end.to_next_x, c, end.rest_x, d)
         return between(end.to_next_y, low, end.rest_y, high)
@@ -98,8 +98,7 @@ def functions(flags):
         point: vec2,
         point_low: vec2,
         terms: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         guard: real,
     ):
         if ALL_READINGS:
@@ -110,9 +109,9 @@ def functions(flags):
         end = end_point(pose, low, point, point_low, SHIFT, guard)
         cell = origin + end.cell
         if BILINEAR:
-            return log_field(bilinear(table, cell, end, rows, cols), terms)
+            return log_field(bilinear(table, cell, end, window), terms)
         else:
-            value = number_at(table, field_cell(cell.x, cell.y, rows, cols))
+            value = number_at(table, field_cell(cell.x, cell.y, window))
             if LOG_TABLE:
                 return value
             else:
@@ -153,19 +152,18 @@ def make(name, flags):
         lowered: vec4,
         to: vec2,
         far: real,
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
     ):
         if ALL_READINGS:
             is_range = wp.isfinite(to.x)
             near, off = rounded_cell(lowered, wp.where(is_range, to, vec2(ZERO, ZERO)))
-            value = number_at(table, table_cell(near, start_cell, rows, cols))
+            value = number_at(table, table_cell(near, start_cell, window))
             if not is_range:
                 off = ZERO
                 value = wp.where(wp.isinf(to.x), far, ZERO)
         else:
             near, off = rounded_cell(lowered, to)
-            value = number_at(table, table_cell(near, start_cell, rows, cols))
+            value = number_at(table, table_cell(near, start_cell, window))
         return value, off
 
     # Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
@@ -179,8 +177,7 @@ def make(name, flags):
         to: vec2,
         to_low: vec2,
         far: real,
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         guard: real,
         sure: real,
     ):
@@ -194,7 +191,7 @@ def make(name, flags):
         if off > sure:
             exact = end_point(sensor_pose, sensor_low, to, to_low, ZERO, guard)
             cell = exact.cell
-        return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, rows, cols))
+        return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, window))
 
     # Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value
     # for each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the
@@ -236,18 +233,15 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2),
         terms: wp.array(dtype=real),
         start: wp.array(dtype=wp.int32),
-        fixed_of: wp.array(dtype=real),
+        constant_terms: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         readings: wp.int32,
         guard: real,
-        fixed: real,
-        temperature: real,
-        per_scan: wp.int32,
-        ahead: wp.int32,
+        score: types.Score,
+        batch: types.ScanBatch,
     ):
         n = wp.tid()
         if n >= particles:
@@ -259,12 +253,12 @@ def make(name, flags):
             sensor_low = pose_low[n]
         begin = int(0)
         size = readings
-        constant_term = fixed
+        constant_term = score.constant_term
         if SCANS:
-            scan = (n + ahead) // per_scan
+            scan = (n + batch.ahead) // batch.per_scan
             begin = start[scan]
             size = start[scan + 1] - begin
-            constant_term = fixed_of[scan]
+            constant_term = constant_terms[scan]
         total = vec2(constant_term, ZERO)
         block = real(0.0)
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
@@ -273,7 +267,7 @@ def make(name, flags):
             # First all cells of a block, then all look-ups. On processors the first loop becomes vector code and takes
             # a third of the time; with points read as vec2, or a maximum in place of a count, it would not.
             lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
-            start_cell = table_origin(origin, cols)
+            start_cell = table_origin(origin, window.cols)
             sure = rounding_margin(guard)
             cells = block_cells()
             while k < size:
@@ -284,13 +278,13 @@ def make(name, flags):
                 while i < width:
                     near, off = rounded_cell(lowered, point_at(point, first + i))
                     doubtful += int(off > sure)
-                    cells[i] = table_cell(near, start_cell, rows, cols)
+                    cells[i] = table_cell(near, start_cell, window)
                     i += 1
                 if doubtful > 0:
                     i = int(0)
                     while i < width:
                         exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
-                        cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, rows, cols)
+                        cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, window)
                         i += 1
                 block = ZERO
                 i = int(0)
@@ -308,7 +302,7 @@ def make(name, flags):
                 to_low = vec2()
                 if CAREFUL:
                     to_low = point_low[begin + k]
-                term = reading_value(table, origin, sensor_pose, sensor_low, to, to_low, terms, rows, cols, guard)
+                term = reading_value(table, origin, sensor_pose, sensor_low, to, to_low, terms, window, guard)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 block += term
@@ -319,13 +313,13 @@ def make(name, flags):
             total = add_term(total, block)
         # An impossible reading keeps total.x at -inf and turns total.y into nan.
         if CUBES:
-            log_p[n] = temperature * wp.log(total.x + total.y)
+            log_p[n] = score.temperature * wp.log(total.x + total.y)
         elif wp.isinf(total.x):
             log_p[n] = total.x
         else:
-            log_p[n] = temperature * (total.x + total.y)
+            log_p[n] = score.temperature * (total.x + total.y)
 
-    # Write the sums of blocks of readings to parts[n * across + block * along], for GPUs. One work-item takes a
+    # Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a
     # particle and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards
     # as the longest one.
     @kernel
@@ -340,14 +334,11 @@ def make(name, flags):
         guard: wp.array(dtype=real),
         start: wp.array(dtype=wp.int32),
         parts: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         readings: wp.int32,
-        across: wp.int32,
-        along: wp.int32,
         spread: wp.int32,
-        per_scan: wp.int32,
+        batch: types.ScanBatch,
     ):
         item = work_item(wp.tid())
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
@@ -360,13 +351,13 @@ def make(name, flags):
             sensor_low = pose_at(pose_low, n)
         if QUICK:
             lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
-            start_cell = table_origin(origin, cols)
+            start_cell = table_origin(origin, window.cols)
             far = number_at(terms, 3)
         before = int(0)
         size = readings
         guards = int(0)
         if SCANS:
-            scan = n // per_scan
+            scan = n // batch.per_scan
             before = start[scan]
             size = start[scan + 1] - before
             guards = scan * ((readings + BLOCK_TERMS - 1) // BLOCK_TERMS)
@@ -383,24 +374,24 @@ def make(name, flags):
                     if SCANS:
                         for i in range(WHOLE_BLOCK):
                             to = point_at(point, begin + i)
-                            value, off = quick_value(table, start_cell, lowered, to, far, rows, cols)
+                            value, off = quick_value(table, start_cell, lowered, to, far, window)
                             worst = wp.max(worst, off)
                             total += value
                     else:
                         # The points of one scan are aligned, so that two of them can be read at once.
                         for i in range(HALF_BLOCK):
                             pair = two_at(point, begin + 2 * i)
-                            value, off = quick_value(table, start_cell, lowered, vec2(pair.x, pair.y), far, rows, cols)
+                            value, off = quick_value(table, start_cell, lowered, vec2(pair.x, pair.y), far, window)
                             worst = wp.max(worst, off)
                             total += value
-                            value, off = quick_value(table, start_cell, lowered, vec2(pair.z, pair.w), far, rows, cols)
+                            value, off = quick_value(table, start_cell, lowered, vec2(pair.z, pair.w), far, window)
                             worst = wp.max(worst, off)
                             total += value
                 else:
                     k = begin
                     while k < end:
                         to = point_at(point, k)
-                        value, off = quick_value(table, start_cell, lowered, to, far, rows, cols)
+                        value, off = quick_value(table, start_cell, lowered, to, far, window)
                         worst = wp.max(worst, off)
                         total += value
                         k += 1
@@ -410,9 +401,8 @@ def make(name, flags):
                     while k < end:
                         to, to_low = point_at(point, k), point_at(point_low, k)
                         total += careful_value(
-                            table, origin, lowered, sensor_pose, sensor_low, to, to_low, far, rows, cols, block_guard,
-                            sure,
-                        )  # fmt: skip
+                            table, origin, lowered, sensor_pose, sensor_low, to, to_low, far, window, block_guard, sure
+                        )
                         k += 1
             else:
                 k = begin
@@ -422,10 +412,10 @@ def make(name, flags):
                         to_low = point_at(point_low, k)
                     to = point_at(point, k)
                     total += reading_value(
-                        table, origin, sensor_pose, sensor_low, to, to_low, terms, rows, cols, block_guard
+                        table, origin, sensor_pose, sensor_low, to, to_low, terms, window, block_guard
                     )
                     k += 1
-            parts[n * across + block * along] = total
+            parts[n + block * particles] = total
             block += 1 << spread
 
     return {"fill_field": fill_field, "score_field": score_field, "field_blocks": field_blocks}[name]

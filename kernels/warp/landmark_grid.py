@@ -117,9 +117,7 @@ def functions(flags):
         base: wp.int32,
         terms: wp.array(dtype=real),
         arcs: wp.array(dtype=vec2),
-        rows: wp.int32,
-        cols: wp.int32,
-        size: real,
+        buckets: types.Buckets,
     ):
         match = Match()
         match.log_p = NEVER
@@ -134,13 +132,13 @@ def functions(flags):
         most = real(math.inf)
         x = place[0] + reach * turned[0]
         y = place[2] + reach * turned[2]
-        left = bucket_at(x - radius, size, cols)
-        right = bucket_at(x + radius, size, cols)
-        high = bucket_at(y + radius, size, rows)
-        row = bucket_at(y - radius, size, rows)
+        left = bucket_at(x - radius, buckets.size, buckets.cols)
+        right = bucket_at(x + radius, buckets.size, buckets.cols)
+        high = bucket_at(y + radius, buckets.size, buckets.rows)
+        row = bucket_at(y - radius, buckets.size, buckets.rows)
         while row <= high:
-            j = start[row * cols + left]
-            last = start[row * cols + right + 1]
+            j = start[row * buckets.cols + left]
+            last = start[row * buckets.cols + right + 1]
             while j < last:
                 off = offset(landmark[j], place)
                 if near(off, turned, feature, base, most):

@@ -52,16 +52,15 @@ def make(name, flags):
         particles: wp.int32,
         features: wp.int32,
         sets: wp.int32,
-        size: real,
-        fixed: real,
-        temperature: real,
+        buckets: types.Buckets,
+        score: types.Score,
     ):
         n = wp.tid()
         if n >= particles:
             return
         high = pose[n]
         low = pose_low[n]
-        place = sensor_place(pose_cell[n], high, low, size)
+        place = sensor_place(pose_cell[n], high, low, buckets.size)
         sums = n * sets
         begin = n * sets * features
         i = int(0)
@@ -123,7 +122,7 @@ def make(name, flags):
                 most = total
                 chosen = s
             s += 1
-        log_p[n] = wp.where(wp.isinf(most), most, temperature * (fixed + most))
+        log_p[n] = wp.where(wp.isinf(most), most, score.temperature * (score.constant_term + most))
         if PER_BEAM:
             k = int(0)
             while k < features:

@@ -43,23 +43,20 @@ def make(name, flags):
         log_p: wp.array(dtype=real),
         parts: wp.array(dtype=real),
         which: wp.array(dtype=wp.int32),
-        rows: wp.int32,
-        cols: wp.int32,
+        buckets: types.Buckets,
         landmarks: wp.int32,
         particles: wp.int32,
         features: wp.int32,
-        size: real,
         share: real,
-        fixed: real,
-        temperature: real,
+        score: types.Score,
     ):
         n = wp.tid()
         if n >= particles:
             return
         high = pose[n]
         low = pose_low[n]
-        place = sensor_place(pose_cell[n], high, low, size)
-        total = vec2(fixed, ZERO)
+        place = sensor_place(pose_cell[n], high, low, buckets.size)
+        total = vec2(score.constant_term, ZERO)
         impossible = bool(False)
         first = int(0)
         while first < features:
@@ -78,9 +75,7 @@ def make(name, flags):
                         offset(landmark[chosen], place), turned, feature, base, signature[chosen], terms, arcs
                     )
                 else:
-                    match = search(
-                        landmark, signature, start, place, turned, feature, base, terms, arcs, rows, cols, size
-                    )
+                    match = search(landmark, signature, start, place, turned, feature, base, terms, arcs, buckets)
                     detected = match.log_p
                     best = match.best
                     chosen = match.chosen
@@ -98,6 +93,6 @@ def make(name, flags):
                 k += 1
             total = add_term(total, block)
             first = last
-        log_p[n] = wp.where(impossible, NEVER, temperature * (total[0] + total[1]))
+        log_p[n] = wp.where(impossible, NEVER, score.temperature * (total[0] + total[1]))
 
     return {"score_features": score_features}[name]

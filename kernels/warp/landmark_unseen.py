@@ -33,34 +33,28 @@ def make(name, flags):
         pose_low: wp.array(dtype=vec4),
         which: wp.array(dtype=wp.int32),
         log_p: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        buckets: types.Buckets,
         particles: wp.int32,
         features: wp.int32,
-        size: real,
-        range_max: real,
-        axis_cosine: real,
-        axis_sine: real,
-        least: real,
-        log_missed: real,
+        view: types.SensorView,
     ):
         n = wp.tid()
         if n >= particles:
             return
         sensor_pose = pose[n]
-        place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], size)
-        cosine = sensor_pose[2] * axis_cosine - sensor_pose[3] * axis_sine
-        sine = sensor_pose[3] * axis_cosine + sensor_pose[2] * axis_sine
-        left = bucket_at(place[0] - range_max, size, cols)
-        right = bucket_at(place[0] + range_max, size, cols)
-        high = bucket_at(place[2] + range_max, size, rows)
+        place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], buckets.size)
+        cosine = sensor_pose[2] * view.axis_cosine - sensor_pose[3] * view.axis_sine
+        sine = sensor_pose[3] * view.axis_cosine + sensor_pose[2] * view.axis_sine
+        left = bucket_at(place[0] - view.range_max, buckets.size, buckets.cols)
+        right = bucket_at(place[0] + view.range_max, buckets.size, buckets.cols)
+        high = bucket_at(place[2] + view.range_max, buckets.size, buckets.rows)
         unseen = int(0)
-        row = bucket_at(place[2] - range_max, size, rows)
+        row = bucket_at(place[2] - view.range_max, buckets.size, buckets.rows)
         while row <= high:
-            j = start[row * cols + left]
-            last = start[row * cols + right + 1]
+            j = start[row * buckets.cols + left]
+            last = start[row * buckets.cols + right + 1]
             while j < last:
-                if in_view(offset(landmark[j], place), cosine, sine, range_max, least):
+                if in_view(offset(landmark[j], place), cosine, sine, view.range_max, view.least):
                     taken = int(0)
                     k = int(0)
                     while k < features:
@@ -71,6 +65,6 @@ def make(name, flags):
                 j += 1
             row += 1
         if unseen > 0:
-            log_p[n] = log_p[n] + real(unseen) * log_missed
+            log_p[n] = log_p[n] + real(unseen) * view.log_missed
 
     return {"count_unseen": count_unseen}[name]

@@ -30,32 +30,29 @@ def functions(flags):
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: vec2,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         col = int(cell.x)
         row = int(cell.y)
         r = make_ray(pose, ray)
         t = real(0.0)
         if ORIGINS_OUTSIDE:
-            if off_grid(cell.x, cell.y, rows, cols):
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
                 if OUTSIDE_OCCUPIED:
                     return ZERO
                 else:
-                    start = start_walk(r, cell, rows, cols, limit)
+                    start = start_walk(r, cell, window, limit)
                     if start.t >= limit:
                         return limit
                     t = start.t
                     col += r.step_x * start.k_x
                     row += r.step_y * start.k_y
-        part = int(map_table[(row * cols + col) * bins + angle_bin(r.direction, bins)])
+        part = int(map_table[(row * window.cols + col) * caster.bins + angle_bin(r.direction, caster.bins)])
         if part == 65535:
             return limit
         t += real(part) * (limit / PARTS)

@@ -16,6 +16,7 @@ def make(name, flags):
     cast_ray = raycast.functions(flags).cast_ray
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     PARTS = real(65535.0)
+    Caster = types.Caster
 
     # Fill rows of the table: one work-item takes a bin and cell. A hit is at most 65 534; 65 535 means no hit. The
     # table has fewer than 2^31 entries.
@@ -24,21 +25,20 @@ def make(name, flags):
         rectangles: wp.array(dtype=wp.uint16),
         ray: wp.array(dtype=vec2),
         lookup: wp.array(dtype=wp.uint16),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         bins: wp.int32,
         first_row: wp.int32,
         count: wp.int32,
         limit: real,
     ):
         index, bin = wp.tid()
-        if bin >= bins or index >= count * cols:
+        if bin >= bins or index >= count * window.cols:
             return
-        row = first_row + index / cols
-        col = index % cols
+        row = first_row + index / window.cols
+        col = index % window.cols
         pose = vec4(HALF, HALF, ray[bin].x, ray[bin].y)
-        t = cast_ray(rectangles, rows, cols, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, 0, ZERO, ZERO)
+        t = cast_ray(rectangles, window, wp.vec2i(col, row), pose, vec2(ONE, ZERO), limit, Caster())
         part = int(t * (PARTS / limit) + HALF)
-        lookup[(row * cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))
+        lookup[(row * window.cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))
 
     return {"fill_lookup": fill_lookup}[name]

@@ -34,38 +34,35 @@ def functions(flags):
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: vec2,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         r = make_ray(pose, ray)
         t = real(0.0)
         if ORIGINS_OUTSIDE:
-            if off_grid(cell.x, cell.y, rows, cols):
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
                 if OUTSIDE_OCCUPIED:
                     return ZERO
                 else:
-                    start = start_walk(r, cell, rows, cols, limit)
+                    start = start_walk(r, cell, window, limit)
                     t = start.t
-                    t += tolerance + t * LEAST_STEP
+                    t += caster.tolerance + t * LEAST_STEP
         while t < limit:
             col = cell.x + int(wp.floor(pose.x + t * r.direction.x))
             row = cell.y + int(wp.floor(pose.y + t * r.direction.y))
-            if off_grid(col, row, rows, cols):
+            if off_grid(col, row, window.rows, window.cols):
                 if OUTSIDE_OCCUPIED:
                     return t
                 else:
                     return limit
-            distance = real(map_table[row * cols + col])
+            distance = real(map_table[row * window.cols + col])
             if distance == ZERO:
                 return t
-            t += wp.max(distance - slack, tolerance + t * LEAST_STEP)
+            t += wp.max(distance - caster.slack, caster.tolerance + t * LEAST_STEP)
         return limit
 
     return SimpleNamespace(cast_ray=cast_ray)

@@ -34,7 +34,7 @@ def functions(flags):
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
 
     # Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets
-    # the rounding errors (low parts) of pose. verdict, which the caller clears, becomes 1 at (0) if a pose is not
+    # the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at (0) if a pose is not
     # finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell,
     # fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     @wp.func
@@ -44,18 +44,9 @@ def functions(flags):
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
         pose_low: wp.array(dtype=vec4),
-        verdict: wp.array(dtype=wp.int32),
-        origin_x: wp.float64,
-        origin_y: wp.float64,
-        resolution: wp.float64,
-        mount_x: wp.float64,
-        mount_y: wp.float64,
-        yaw_cos: wp.float64,
-        yaw_sin: wp.float64,
-        first_col: wp.int32,
-        first_row: wp.int32,
-        rows: wp.int32,
-        cols: wp.int32,
+        pose_status: wp.array(dtype=wp.int32),
+        frame: types.Frame,
+        window: types.Window,
     ):
         x = wp.float64(poses[3 * particle])
         y = wp.float64(poses[3 * particle + 1])
@@ -64,31 +55,31 @@ def functions(flags):
         turned = cos_sin(theta)
         cosine = turned.x
         sine = turned.y
-        x = x - origin_x
-        y = y - origin_y
-        if mount_x != ZERO or mount_y != ZERO:
-            x = x + (cosine * mount_x - sine * mount_y)
-            y = y + (sine * mount_x + cosine * mount_y)
-        if yaw_sin != ZERO:
+        x = x - frame.origin_x
+        y = y - frame.origin_y
+        if frame.mount_x != ZERO or frame.mount_y != ZERO:
+            x = x + (cosine * frame.mount_x - sine * frame.mount_y)
+            y = y + (sine * frame.mount_x + cosine * frame.mount_y)
+        if frame.yaw_sin != ZERO:
             x_before = x
             cosine_before = cosine
-            x = yaw_cos * x + yaw_sin * y
-            y = yaw_cos * y - yaw_sin * x_before
-            cosine = cosine * yaw_cos + sine * yaw_sin
-            sine = sine * yaw_cos - cosine_before * yaw_sin
-        x = within_reach(x / resolution)
-        y = within_reach(y / resolution)
+            x = frame.yaw_cos * x + frame.yaw_sin * y
+            y = frame.yaw_cos * y - frame.yaw_sin * x_before
+            cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin
+            sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin
+        x = within_reach(x / frame.resolution)
+        y = within_reach(y / frame.resolution)
         if not finite:
-            wp.atomic_max(verdict, 0, 1)
+            wp.atomic_max(pose_status, 0, 1)
             x = MINUS_FARTHEST
             y = MINUS_FARTHEST
             cosine = ONE
             sine = ZERO
         whole_x = wp.floor(x)
         whole_y = wp.floor(y)
-        cell = wp.vec2i(int(whole_x) - first_col, int(whole_y) - first_row)
-        if cell.x < 0 or cell.y < 0 or cell.x >= cols or cell.y >= rows:
-            wp.atomic_max(verdict, 1, 1)
+        cell = wp.vec2i(int(whole_x) - window.col, int(whole_y) - window.row)
+        if cell.x < 0 or cell.y < 0 or cell.x >= window.cols or cell.y >= window.rows:
+            wp.atomic_max(pose_status, 1, 1)
         pose_cell[particle] = cell
         x = x - whole_x
         y = y - whole_y
@@ -109,7 +100,8 @@ def functions(flags):
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    vec4, placing = precision(flags).vec4, functions(flags)
+    types, placing = precision(flags), functions(flags)
+    vec4 = types.vec4
     place_pose, coordinate = placing.place_pose, placing.coordinate
 
     # Place poses: one work-item takes a particle.
@@ -119,26 +111,14 @@ def make(name, flags):
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
         pose_low: wp.array(dtype=vec4),
-        verdict: wp.array(dtype=wp.int32),
-        origin_x: wp.float64,
-        origin_y: wp.float64,
-        resolution: wp.float64,
-        mount_x: wp.float64,
-        mount_y: wp.float64,
-        yaw_cos: wp.float64,
-        yaw_sin: wp.float64,
-        first_col: wp.int32,
-        first_row: wp.int32,
-        rows: wp.int32,
-        cols: wp.int32,
+        pose_status: wp.array(dtype=wp.int32),
+        frame: types.Frame,
+        window: types.Window,
         particles: wp.int32,
     ):
         particle = work_item(wp.tid())
         if particle >= particles:
             return
-        place_pose(
-            particle, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
-            yaw_cos, yaw_sin, first_col, first_row, rows, cols,
-        )  # fmt: skip
+        place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window)  # fmt: skip
 
     return {"place_poses": place_poses}[name]

@@ -12,6 +12,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from gpusense.interface import structs
+
 # Ranges have the same bits on every device only if each product and sum is rounded by itself and division is correctly
 # rounded. fuse_fp=False bans fused multiply-add; CUDA divides correctly unless fast_math is on.
 OPTIONS = {"fuse_fp": False, "fast_math": False, "enable_backward": False}
@@ -26,10 +28,26 @@ kernel = wp.kernel(module="unique", enable_backward=False, module_options=OPTION
 
 @functools.cache
 def precision(flags):
-    """Return the scalar and vector types of a set of flags: real, vec2, vec4."""
+    """Return the types of a set of flags: real, vec2, vec4, and the structs by name."""
     if "FLOAT64" in flags:
-        return SimpleNamespace(real=wp.float64, vec2=wp.vec2d, vec4=wp.vec4d)
-    return SimpleNamespace(real=wp.float32, vec2=wp.vec2f, vec4=wp.vec4f)
+        return SimpleNamespace(real=wp.float64, vec2=wp.vec2d, vec4=wp.vec4d, **_structs(wp.float64))
+    return SimpleNamespace(real=wp.float32, vec2=wp.vec2f, vec4=wp.vec4f, **_structs(wp.float32))
+
+
+def _structs(real):
+    """Return the structs of the signature table in a precision, by name."""
+    return {name: _struct(name, real if "real" in structs.fields(name).values() else None) for name in structs.STRUCTS}
+
+
+@functools.cache
+def _struct(name, real):
+    """Make a struct; those without real numbers are the same in both precisions."""
+    kinds = {"int": wp.int32, "real": real, "double": wp.float64}
+    fields = {field: kinds[kind] for field, kind in structs.fields(name).items()}
+    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": __name__}))
+
+
+Window = _struct("Window", None)
 
 
 # Return the work-item of a launch of one dimension, given wp.tid(), which divides a number of 64 bits by 1.

@@ -22,9 +22,9 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    caster = caster_of(flags)
-    ENTRY = caster.ENTRY
-    cast_ray = caster.functions(flags).cast_ray
+    casting = caster_of(flags)
+    ENTRY = casting.ENTRY
+    cast_ray = casting.functions(flags).cast_ray
     expected_range = ray_file.functions(flags).expected_range
     ORDERED = "ORDERED" in flags
     cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
@@ -37,33 +37,17 @@ def make(name, flags):
         pose: wp.array(dtype=vec4),
         ray: wp.array(dtype=vec2),
         ranges: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         rays: wp.int32,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
-        limit: real,
-        resolution: real,
-        range_max: real,
+        caster: types.Caster,
+        scale: types.RangeScale,
     ):
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
-        t = cast_ray(
-            map_table,
-            rows,
-            cols,
-            cell_at(pose_cell, n),
-            pose_at(pose, n),
-            ray_at(ray, k),
-            limit,
-            bins,
-            slack,
-            tolerance,
-        )
-        put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
+        t = cast_ray(map_table, window, cell_at(pose_cell, n), pose_at(pose, n), ray_at(ray, k), scale.limit, caster)
+        put(ranges, n * rays + k, expected_range(t, scale))
 
     # Cast rays in tiles of particles and rays, for GPUs.
     @kernel
@@ -74,16 +58,11 @@ def make(name, flags):
         order: wp.array(dtype=wp.int32),
         ray: wp.array(dtype=vec2),
         ranges: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         particles: wp.int32,
         rays: wp.int32,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
-        limit: real,
-        resolution: real,
-        range_max: real,
+        caster: types.Caster,
+        scale: types.RangeScale,
         spread: wp.int32,
     ):
         item = work_item(wp.tid())
@@ -97,8 +76,8 @@ def make(name, flags):
         sensor_pose = pose_at(pose, n)
         k = tile_ray(item, spread)
         while k < rays:
-            t = cast_ray(map_table, rows, cols, cell, sensor_pose, ray_at(ray, k), limit, bins, slack, tolerance)
-            put(ranges, n * rays + k, expected_range(t, limit, resolution, range_max))
+            t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, k), scale.limit, caster)
+            put(ranges, n * rays + k, expected_range(t, scale))
             k += tile_step(spread)
 
     return {"cast_ranges": cast_ranges, "cast_tiles": cast_tiles}[name]

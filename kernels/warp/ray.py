@@ -109,12 +109,12 @@ def functions(flags):
     # Return the walk at the ray's origin or, where that lies outside the grid, at the first cell inside; t is limit
     # where a ray from outside does not meet the grid before limit.
     @wp.func
-    def start_walk(r: Ray, cell: wp.vec2i, rows: wp.int32, cols: wp.int32, limit: real):
+    def start_walk(r: Ray, cell: wp.vec2i, window: types.Window, limit: real):
         walk = Walk()
         if ORIGINS_OUTSIDE:
-            if off_grid(cell.x, cell.y, rows, cols):
-                enter_x = wp.max(wp.where(r.right, -cell.x, cell.x - (cols - 1)), 0)
-                enter_y = wp.max(wp.where(r.up, -cell.y, cell.y - (rows - 1)), 0)
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
+                enter_x = wp.max(wp.where(r.right, -cell.x, cell.x - (window.cols - 1)), 0)
+                enter_y = wp.max(wp.where(r.up, -cell.y, cell.y - (window.rows - 1)), 0)
                 enter_t_x = wp.where(enter_x > 0, (real(enter_x - 1) + r.a_x) * r.inv_x, MINUS_ONE)
                 enter_t_y = wp.where(enter_y > 0, (real(enter_y - 1) + r.a_y) * r.inv_y, MINUS_ONE)
                 t = wp.max(enter_t_x, enter_t_y)
@@ -126,7 +126,9 @@ def functions(flags):
                     else:
                         walk.k_y = enter_y
                         walk.k_x = whole(crossed(t, r.speed_x, r.a_x, r.inv_x, True))
-                    if not off_grid(cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, rows, cols):
+                    if not off_grid(
+                        cell.x + r.step_x * walk.k_x, cell.y + r.step_y * walk.k_y, window.rows, window.cols
+                    ):
                         walk.t = t
         return walk
 
@@ -151,23 +153,11 @@ def functions(flags):
 
     # Convert a distance in cells to metres, exactly range_max where nothing is nearer.
     @wp.func
-    def expected_range(t: real, limit: real, resolution: real, range_max: real):
-        return wp.where(t >= limit, range_max, wp.min(t * resolution, range_max))
+    def expected_range(t: real, scale: types.RangeScale):
+        return wp.where(t >= scale.limit, scale.range_max, wp.min(t * scale.resolution, scale.range_max))
 
     return SimpleNamespace(
-        Ray=Ray,
-        Walk=Walk,
-        off_grid=off_grid,
-        ray_direction=ray_direction,
-        make_ray=make_ray,
-        COUNT=COUNT,
-        FIRST=FIRST,
-        as_bits=as_bits,
-        farther=farther,
-        whole=whole,
-        crossed=crossed,
-        start_walk=start_walk,
-        turn_of=turn_of,
-        angle_bin=angle_bin,
-        expected_range=expected_range,
-    )
+        Ray=Ray, Walk=Walk, off_grid=off_grid, ray_direction=ray_direction, make_ray=make_ray, COUNT=COUNT, FIRST=FIRST,
+        as_bits=as_bits, farther=farther, whole=whole, crossed=crossed, start_walk=start_walk, turn_of=turn_of,
+        angle_bin=angle_bin, expected_range=expected_range,
+    )  # fmt: skip

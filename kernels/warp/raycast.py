@@ -53,28 +53,28 @@ def functions(flags):
     @wp.func
     def cast_ray(
         map_table: wp.array(dtype=ENTRY),
-        rows: wp.int32,
-        cols: wp.int32,
+        window: types.Window,
         cell: wp.vec2i,
         pose: vec4,
         ray: vec2,
         limit: real,
-        bins: wp.int32,
-        slack: real,
-        tolerance: real,
+        caster: types.Caster,
     ):
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
-            if off_grid(cell.x, cell.y, rows, cols):
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
                 return ZERO
-        start = start_walk(r, cell, rows, cols, limit)
+        start = start_walk(r, cell, window, limit)
         if ORIGINS_OUTSIDE:
             if start.t >= limit:
                 return limit
         plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
         step_x = wp.uint32(r.step_x)
-        step_y = wp.uint32(r.step_y * (cols + 2))
-        origin = wp.uint32(plane * (rows + 2) * (cols + 2) + padded(cell.y, cell.x, cols)) - (step_x + step_y) * FIRST
+        step_y = wp.uint32(r.step_y * (window.cols + 2))
+        origin = (
+            wp.uint32(plane * (window.rows + 2) * (window.cols + 2) + padded(cell.y, cell.x, window.cols))
+            - (step_x + step_y) * FIRST
+        )
         k_x = COUNT + real(start.k_x)
         k_y = COUNT + real(start.k_y)
         t = real(start.t)

@@ -58,13 +58,13 @@ def make(name, flags):
         rounded = real(high)
         return vec2(rounded, real((high - wp.float64(rounded)) + low))
 
-    # Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. verdict,
-    # which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
+    # Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle.
+    # pose_status, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
     @kernel
     def place_relative(
         poses: wp.array(dtype=coordinate),
         place: wp.array(dtype=vec4),
-        verdict: wp.array(dtype=wp.int32),
+        pose_status: wp.array(dtype=wp.int32),
         origin_x: wp.float64,
         origin_y: wp.float64,
         mount_x: wp.float64,
@@ -78,7 +78,7 @@ def make(name, flags):
         pose_y = wp.float64(poses[3 * n + 1])
         theta = wp.float64(poses[3 * n + 2])
         if not ((pose_x - pose_x) + (pose_y - pose_y) + (theta - theta) == ZERO):
-            wp.atomic_max(verdict, 0, 1)
+            wp.atomic_max(pose_status, 0, 1)
             place[n] = vec4()
             return
         x = two_sum(pose_x, -origin_x)
@@ -95,12 +95,12 @@ def make(name, flags):
         place[n] = vec4(at_x.x, at_x.y, at_y.x, at_y.y)
 
     # Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
-    # verdict is as for place_relative.
+    # pose_status is as for place_relative.
     @kernel
     def wrap_headings(
         poses: wp.array(dtype=coordinate),
         residual: wp.array(dtype=vec2),
-        verdict: wp.array(dtype=wp.int32),
+        pose_status: wp.array(dtype=wp.int32),
         target: wp.float64,
         target_low: wp.float64,
         particles: wp.int32,
@@ -112,7 +112,7 @@ def make(name, flags):
         y = wp.float64(poses[3 * n + 1])
         theta = wp.float64(poses[3 * n + 2])
         if not ((x - x) + (y - y) + (theta - theta) == ZERO):
-            wp.atomic_max(verdict, 0, 1)
+            wp.atomic_max(pose_status, 0, 1)
             theta = wp.float64(0.0)
         angle = wrapped_difference(theta, wp.vec2d(target, target_low))
         rounded = real(angle.x)

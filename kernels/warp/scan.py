@@ -63,8 +63,7 @@ def make(name, flags):
     # place at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points
     # the vectors of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and
     # point_low its rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2
-    # cells). fixed is the constant term of max readings that have no place, -inf if there is a range where none is
-    # possible.
+    # cells). constant_term is that of max readings without a place, -inf if there is a range where none is possible.
     @wp.func
     def place_reading(
         item: wp.int32,
@@ -75,72 +74,62 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2),
         reading: wp.array(dtype=real),
         guard: wp.array(dtype=real),
-        fixed: wp.array(dtype=real),
+        constant_term: wp.array(dtype=real),
         resolution: wp.float64,
-        beams: wp.int32,
-        each: wp.int32,
-        places: wp.int32,
-        chosen: wp.int32,
-        max_readings: wp.int32,
-        possible: wp.int32,
-        nearest: wp.float64,
-        farthest: wp.float64,
-        log_max: wp.float64,
-        top: wp.float64,
-        guard_scale: wp.float64,
+        rules: types.ReadingRules,
     ):
         # Values that are needed last are read first, so that nothing waits for them.
-        source = 2 * item * each
-        item_reading = reading_of(item, ranges, beam, beams)
+        source = 2 * item * rules.each
+        item_reading = reading_of(item, ranges, beam, rules.beams)
         vector_x = wp.float64(1.0)
         vector_y = wp.float64(0.0)
-        if item < beams:
+        if item < rules.beams:
             vector_x = vector[source]
             vector_y = vector[source + 1]
-        informative = int(beams)
-        if chosen < beams:
+        informative = int(rules.beams)
+        if rules.chosen < rules.beams:
             informative = int(0)
-            for k in range(beams):
-                z = reading_of(k, ranges, beam, beams)
-                if z >= nearest and (z < farthest or max_readings != MAX_LEFT_OUT):
+            for k in range(rules.beams):
+                z = reading_of(k, ranges, beam, rules.beams)
+                if z >= rules.nearest and (z < rules.farthest or rules.max_readings != MAX_LEFT_OUT):
                     informative += 1
         rank = int(0)
         place = int(0)
-        item_place = int(places)
+        item_place = int(rules.places)
         far_count = int(0)
         impossible = bool(False)
         item_value = wp.float64(MISSING)
         # The longest reading in the block of places that begins with this item's place, if a block begins there.
         longest = wp.float64(0.0)
         first = int(0)
-        while first < beams:
+        while first < rules.beams:
             several = block_terms()
             for i in range(BLOCK_TERMS):
-                several[i] = reading_of(first + i, ranges, beam, beams)
+                several[i] = reading_of(first + i, ranges, beam, rules.beams)
             # Sets of readings: bit i is reading first + i.
             hits = int(0)
             fars = int(0)
             for i in range(BLOCK_TERMS):
-                hits = hits | (int(several[i] >= nearest and several[i] < farthest) << i)
-                fars = fars | (int(several[i] >= farthest) << i)
+                hits = hits | (int(several[i] >= rules.nearest and several[i] < rules.farthest) << i)
+                fars = fars | (int(several[i] >= rules.farthest) << i)
             telling = int(hits)
-            if max_readings != MAX_LEFT_OUT:
+            if rules.max_readings != MAX_LEFT_OUT:
                 telling = hits | fars
             used = int(telling)
-            if chosen < informative:
+            if rules.chosen < informative:
                 for i in range(BLOCK_TERMS):
                     rank_of_i = rank + popcount(telling & ((1 << i) - 1))
-                    if not is_chosen(rank_of_i, informative, chosen):
+                    if not is_chosen(rank_of_i, informative, rules.chosen):
                         used = used & ~(1 << i)
             as_range = int(0)
-            if possible != 0:
+            if rules.possible != 0:
                 as_range = used & hits
             as_far = int(0)
-            if max_readings == MAX_PLACED:
+            if rules.max_readings == MAX_PLACED:
                 as_far = used & fars
             placed = as_range | as_far
             if ALL_READINGS:
-                placed = (1 << wp.min(beams - first, BLOCK_TERMS)) - 1
+                placed = (1 << wp.min(rules.beams - first, BLOCK_TERMS)) - 1
             item_bit = item - first
             if item_bit >= 0 and item_bit < BLOCK_TERMS:
                 if (placed >> item_bit) & 1 != 0:
@@ -150,7 +139,7 @@ def make(name, flags):
                     if (as_far >> item_bit) & 1 != 0:
                         item_value = wp.float64(FAR)
             if END_POINTS:
-                begins = item_place < places and item_place % BLOCK_TERMS == 0
+                begins = item_place < rules.places and item_place % BLOCK_TERMS == 0
                 if begins and place < item_place + BLOCK_TERMS:
                     for i in range(BLOCK_TERMS):
                         other = place + popcount(placed & ((1 << i) - 1))
@@ -159,13 +148,13 @@ def make(name, flags):
                             longest = wp.max(longest, several[i])
             rank += popcount(telling)
             far_count += popcount(used & fars)
-            if possible == 0 and (used & hits) != 0:
+            if rules.possible == 0 and (used & hits) != 0:
                 impossible = True
             place += popcount(placed)
             first += BLOCK_TERMS
-        left_over = item >= place and item < places
+        left_over = item >= place and item < rules.places
         if END_POINTS:
-            if item_place < places:
+            if item_place < rules.places:
                 cells = item_value / resolution
                 length = wp.where(wp.isfinite(cells), cells, ZERO)
                 x = vector_x * length
@@ -176,32 +165,36 @@ def make(name, flags):
                     high = vec2(real(cells), real(cells))
                 point[item_place] = high
                 if item_place % BLOCK_TERMS == 0:
-                    guard[item_place // BLOCK_TERMS] = real(guard_scale * (longest / resolution + wp.float64(2.0)))
+                    guard[item_place // BLOCK_TERMS] = real(
+                        rules.guard_scale * (longest / resolution + wp.float64(2.0))
+                    )
             if left_over:
                 point[item] = vec2(NO_READING, NO_READING)
                 point_low[item] = vec2(NOTHING, NOTHING)
                 if item % BLOCK_TERMS == 0:
-                    guard[item // BLOCK_TERMS] = real(guard_scale * wp.float64(2.0))
+                    guard[item // BLOCK_TERMS] = real(rules.guard_scale * wp.float64(2.0))
         else:
-            if item_place < places:
-                point[item_place * each] = vec2(real(vector_x), real(vector_y))
-                for j in range(1, each):
-                    point[item_place * each + j] = vec2(real(vector[source + 2 * j]), real(vector[source + 2 * j + 1]))
+            if item_place < rules.places:
+                point[item_place * rules.each] = vec2(real(vector_x), real(vector_y))
+                for j in range(1, rules.each):
+                    point[item_place * rules.each + j] = vec2(
+                        real(vector[source + 2 * j]), real(vector[source + 2 * j + 1])
+                    )
                 rounded = real(item_value)
-                if rounded > real(top) and not wp.isinf(rounded):
-                    rounded = real(top)
+                if rounded > real(rules.top) and not wp.isinf(rounded):
+                    rounded = real(rules.top)
                 reading[item_place] = rounded
             if left_over:
-                for j in range(each):
-                    point[item * each + j] = AHEAD
+                for j in range(rules.each):
+                    point[item * rules.each + j] = AHEAD
                 reading[item] = NO_READING
         if item == 0:
             constant = NOTHING
-            if max_readings == MAX_FIXED:
-                constant = real(wp.float64(far_count) * log_max)
+            if rules.max_readings == MAX_FIXED:
+                constant = real(wp.float64(far_count) * rules.log_max)
             if impossible:
                 constant = NEVER
-            fixed[0] = constant
+            constant_term[0] = constant
 
     # Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a
     # particle.
@@ -211,7 +204,7 @@ def make(name, flags):
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
         pose_low: wp.array(dtype=vec4),
-        verdict: wp.array(dtype=wp.int32),
+        pose_status: wp.array(dtype=wp.int32),
         ranges: wp.array(dtype=measured),
         beam: wp.array(dtype=wp.int32),
         vector: wp.array(dtype=wp.float64),
@@ -219,43 +212,20 @@ def make(name, flags):
         point_low: wp.array(dtype=vec2),
         reading: wp.array(dtype=real),
         guard: wp.array(dtype=real),
-        fixed: wp.array(dtype=real),
-        origin_x: wp.float64,
-        origin_y: wp.float64,
-        resolution: wp.float64,
-        mount_x: wp.float64,
-        mount_y: wp.float64,
-        yaw_cos: wp.float64,
-        yaw_sin: wp.float64,
-        first_col: wp.int32,
-        first_row: wp.int32,
-        rows: wp.int32,
-        cols: wp.int32,
+        constant_term: wp.array(dtype=real),
+        frame: types.Frame,
+        window: types.Window,
         particles: wp.int32,
         head: wp.int32,
-        beams: wp.int32,
-        each: wp.int32,
-        places: wp.int32,
-        chosen: wp.int32,
-        max_readings: wp.int32,
-        possible: wp.int32,
-        nearest: wp.float64,
-        farthest: wp.float64,
-        log_max: wp.float64,
-        top: wp.float64,
-        guard_scale: wp.float64,
+        rules: types.ReadingRules,
     ):
         item = work_item(wp.tid())
         particle = item - head
         if particle >= 0 and particle < particles:
-            place_pose(
-                particle, poses, pose_cell, pose, pose_low, verdict, origin_x, origin_y, resolution, mount_x, mount_y,
-                yaw_cos, yaw_sin, first_col, first_row, rows, cols,
-            )  # fmt: skip
-        if item < head and item < wp.max(wp.max(beams, places), 1):
+            place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window)  # fmt: skip
+        if item < head and item < wp.max(wp.max(rules.beams, rules.places), 1):
             place_reading(
-                item, ranges, beam, vector, point, point_low, reading, guard, fixed, resolution, beams, each, places,
-                chosen, max_readings, possible, nearest, farthest, log_max, top, guard_scale,
-            )  # fmt: skip
+                item, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules
+            )
 
     return {"place_inputs": place_inputs}[name]

@@ -15,7 +15,8 @@ from .prelude import precision
 @functools.cache
 def functions(flags):
     """Make the functions of the file for a set of flags."""
-    real = precision(flags).real
+    types = precision(flags)
+    real = types.real
 
     # Return the bin of a range; the last one, after the cells, is for range_max and more.
     @wp.func
@@ -27,9 +28,13 @@ def functions(flags):
     # Return log p of a reading for an expected range.
     @wp.func
     def tabulated_density(
-        z: real, expected: real, sensor: wp.array(dtype=real), cells: wp.int32, per_metre: real, range_max: real
+        z: real,
+        expected: real,
+        sensor: wp.array(dtype=real),
+        tables: types.MixtureTables,
+        range_max: real,
     ):
-        column = range_bin(expected, per_metre, cells, range_max)
-        return sensor[range_bin(z, per_metre, cells, range_max) * (cells + 1) + column]
+        column = range_bin(expected, tables.per_metre, tables.cells, range_max)
+        return sensor[range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column]
 
     return SimpleNamespace(range_bin=range_bin, tabulated_density=tabulated_density)

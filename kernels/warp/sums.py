@@ -24,7 +24,7 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     ZERO = real(0.0)
 
-    # Sum count numbers, number k at parts[place * across + k * along]: one work-item takes a particle. They are sums of
+    # Sum count numbers, number k at parts[place + k * particles]: one work-item takes a particle. They are sums of
     # blocks or strands (block is 1), or single terms in blocks of BLOCK_TERMS, whose strands are added plainly first.
     # All are added to a compensated total. BLOCK_TERMS numbers are read before any is added, so that a work-item waits
     # once for all of them; numbers beyond the last count as 0, which changes no sum. With SCANS each scan has a count
@@ -34,16 +34,13 @@ def make(name, flags):
         parts: wp.array(dtype=real),
         order: wp.array(dtype=wp.int32),
         counts: wp.array(dtype=wp.int32),
-        fixed_of: wp.array(dtype=real),
+        constant_terms: wp.array(dtype=real),
         log_p: wp.array(dtype=real),
         particles: wp.int32,
         count: wp.int32,
         block: wp.int32,
-        across: wp.int32,
-        along: wp.int32,
-        fixed: real,
-        temperature: real,
-        per_scan: wp.int32,
+        score: types.Score,
+        batch: types.ScanBatch,
     ):
         place = work_item(wp.tid())
         if place >= particles:
@@ -51,21 +48,20 @@ def make(name, flags):
         n = place
         if ORDERED:
             n = order[place]
-        part = place * across
         size = count
-        constant_term = fixed
+        constant_term = score.constant_term
         if SCANS:
-            size = counts[n // per_scan]
+            size = counts[n // batch.per_scan]
             if STRANDED:
                 size = size // BLOCK_TERMS * STRANDS + wp.min(size % BLOCK_TERMS, STRANDS)
-            constant_term = fixed_of[n // per_scan]
+            constant_term = constant_terms[n // batch.per_scan]
         total = vec2(constant_term, ZERO)
         first = int(0)
         while first < size:
             term = block_terms()
             for i in range(BLOCK_TERMS):
                 if first + i < size:
-                    term[i] = number_at(parts, part + (first + i) * along)
+                    term[i] = number_at(parts, place + (first + i) * particles)
             if block == 1:
                 for i in range(BLOCK_TERMS):
                     total = add_term(total, term[i])
@@ -75,10 +71,10 @@ def make(name, flags):
                 total = add_strands(total, vec4(term[0], term[1], term[2], term[3]))
             first += BLOCK_TERMS
         if CUBES:
-            log_p[n] = temperature * wp.log(total.x + total.y)
+            log_p[n] = score.temperature * wp.log(total.x + total.y)
         elif wp.isinf(total.x):
             log_p[n] = total.x
         else:
-            log_p[n] = temperature * (total.x + total.y)
+            log_p[n] = score.temperature * (total.x + total.y)
 
     return {"sum_parts": sum_parts}[name]

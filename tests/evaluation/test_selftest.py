@@ -16,6 +16,7 @@ from gpusense.commands.cli import main
 from gpusense.evaluation import selftest, stiff
 from gpusense.evaluation.replay import Recorder, replay
 from gpusense.evaluation.tolerances import TOLERANCES, beam_tolerance, differing, per_beam, per_scan, scan_tolerance
+from gpusense.interface.structs import Score
 from gpusense.models.scan import tiles
 from gpusense.reference import beam, distance, echo, mixture, order, ranges, sums
 from gpusense.reference.error_free import block_sums, strand_sums
@@ -77,7 +78,7 @@ def test_per_scan_bound_holds_for_perturbed_beams(plainly, scale, count):
     truth = random.normal(-2, 3, (20, count)) * scale
     for sign in (1, -1, random.choice([-1, 1], truth.shape)):
         wrong = truth + 0.9 * sign * per_beam(truth, np.float32)
-        found = beam.sum_terms(frozenset(), wrong.astype(np.float32), np.float32(-7), np.float32(0.5), plainly)
+        found = beam.sum_terms(frozenset(), wrong.astype(np.float32), Score(np.float32(-7), np.float32(0.5)), plainly)
         exact = 0.5 * (np.array([math.fsum(row) for row in truth]) - 7)
         bound = per_scan(truth, np.float32, fixed=-7, temperature=0.5)
         assert (np.abs(found - exact) <= bound).all()
@@ -151,7 +152,7 @@ def test_replay_agrees_with_numpy(scene, make, parameters, precision, temperatur
     assert (launch.values["log_p"] == log_p).all()
     np.testing.assert_array_equal(np.sort(launch.parts, axis=1)[:, :5], np.sort(parts, axis=1)[:, :5])
     assert beam_tolerance(precision).difference(launch.parts, true_parts) <= beam_tolerance(precision).value
-    bound = per_scan(true_parts, precision, fixed=float(launch.values["fixed"]), temperature=temperature)
+    bound = per_scan(true_parts, precision, fixed=float(launch.values["score"].constant_term), temperature=temperature)
     same = log_p == true_log_p
     assert (np.abs(np.where(same, 0, log_p) - np.where(same, 0, true_log_p)) <= bound).all()
 

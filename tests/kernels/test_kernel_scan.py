@@ -13,10 +13,11 @@ import gpusense as gs
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
+from gpusense.interface.structs import Frame, ReadingRules, Window
 from gpusense.models.scan.classed import class_scans
 from gpusense.models.scan.rules import Rules, choose_beams
 from gpusense.reference.scan import is_chosen
-from gpusense.world.frames import frame_scalars, ray_vectors, split
+from gpusense.world.frames import frame_of, ray_vectors, split
 from gpusense.world.scanner import Reading
 
 RANGE, NEAREST, RESOLUTION, GUARD = 5.0, 0.2, 0.05, 3.25 * 2.0**-23
@@ -50,10 +51,10 @@ def placed(
         flags, beam = flags | {"SOME_BEAMS"}, 1 + 2 * beam
         ranges = np.insert(ranges, np.arange(beams), ranges.dtype.type(1.5))
     poses = [np.zeros(3), np.zeros(2, np.int32), np.zeros(4, real), np.zeros(4, real), np.zeros(2, np.int32)]
-    frame = (0.0, 0.0, RESOLUTION, 0.0, 0.0, 1.0, 0.0, 0, 0, 10, 10, 0)
+    frame = Frame(0.0, 0.0, RESOLUTION, 0.0, 0.0, 1.0, 0.0), Window(0, 0, 10, 10), 0
     call = (
-        "place_inputs", flags, (head,), *poses, ranges, beam, vectors, *room, *frame, head, beams, each, places,
-        chosen, kind, possible, nearest, RANGE, log_max, top, GUARD,
+        "place_inputs", flags, (head,), *poses, ranges, beam, vectors, *room, *frame, head,
+        ReadingRules(nearest, RANGE, log_max, top, GUARD, beams, each, places, chosen, kind, possible),
     )  # fmt: skip
     reference, found = on_both(device, *call)
     for name in reference:
@@ -82,7 +83,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
             numbers = (chosen, chosen, kind, 1, nearest, np.log(z_max) if z_max else 0.0, np.inf)
             found = placed(device, flags, ranges, vectors[:, None], *numbers, some=chosen == 7)
             some = len(scan.readings)
-            assert found["fixed"][0] == real.type(scan.constants[0])
+            assert found["constant_term"][0] == real.type(scan.constants[0])
             point = found["point"][: 2 * chosen].reshape(chosen, 2)
             if not end_points:
                 assert differing(found["reading"][:some], scan.readings.astype(real)) == 0
@@ -112,7 +113,7 @@ def test_readings_that_keep_their_places(device: Backend) -> None:
     found = placed(device, frozenset({"ALL_READINGS"}), ranges, vectors, *numbers)
     expected = scan.readings.astype(np.float32)
     expected = np.where(np.isfinite(expected), np.minimum(expected, top), expected)
-    assert differing(found["reading"], expected) == 0 and found["fixed"][0] == 0
+    assert differing(found["reading"], expected) == 0 and found["constant_term"][0] == 0
     assert differing(found["point"], vectors.astype(np.float32).ravel()) == 0
 
 
@@ -122,7 +123,7 @@ def test_a_range_where_none_is_possible_is_reported(device: Backend) -> None:
     for flags in (frozenset({"END_POINTS"}), frozenset()):
         for z, fixed in ((ranges, -np.inf), (ranges[[1, 1, 2, 3]], np.float32(3 * np.log(0.1)))):
             found = placed(device, flags, z, vectors, 4, 4, MAX_FIXED, 0, NEAREST, np.log(0.1), np.inf)
-            assert found["fixed"][0] == fixed
+            assert found["constant_term"][0] == fixed
             values = found["point" if flags else "reading"]
             assert np.isnan(values).all()
 
@@ -140,16 +141,17 @@ def test_poses_are_placed_along_with_readings(precision: type, device: Backend) 
     rng, count, beams, grid = np.random.default_rng(5), 150, 53, gs.OccupancyGrid(np.zeros((9, 12), np.int8), 0.5)
     poses = np.stack([rng.uniform(-1, 7, count), rng.uniform(-1, 5, count), rng.uniform(-4, 4, count)], axis=-1)
     poses[7, 1] = np.nan
-    frame = (*frame_scalars(grid, (0.1, -0.2, 0.0)), 0, 0, *grid.shape, count)
+    frame = frame_of(grid, (0.1, -0.2, 0.0)), Window(0, 0, *grid.shape), count
     outputs = [np.full((count, 2), 77, np.int32), *np.full((2, count, 4), 77, precision), np.zeros(2, np.int32)]
     flags = scene_flags(precision, "CAREFUL")
     alone, _ = on_both(device, "place_poses", flags, (count,), poses, *outputs, *frame)
     room = [np.zeros(2 * beams, precision) for _ in range(5)]
     readings = (rng.uniform(0, RANGE, beams), np.arange(beams, dtype=np.int32), np.ones((beams, 2)))
     for head in (64, 128):
-        call = (*outputs, *readings, *room, *frame, head, beams, 1, beams, beams, MAX_FIXED, 1, NEAREST, RANGE, -1.0)
-        both = on_both(device, "place_inputs", flags, (head + count,), poses, *call, np.inf, GUARD)
+        rules = ReadingRules(NEAREST, RANGE, -1.0, np.inf, GUARD, beams, 1, beams, beams, MAX_FIXED, 1)
+        call = (*outputs, *readings, *room, *frame, head, rules)
+        both = on_both(device, "place_inputs", flags, (head + count,), poses, *call)
         for found in both:
-            for name in ("pose_cell", "pose", "pose_low", "verdict"):
+            for name in ("pose_cell", "pose", "pose_low", "pose_status"):
                 assert differing(found[name], alone[name]) == 0, name
-        assert both[1]["verdict"].all() and differing(both[1]["reading"], both[0]["reading"]) == 0
+        assert both[1]["pose_status"].all() and differing(both[1]["reading"], both[0]["reading"]) == 0

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.kernel_scenes import EXACT, LASER, LIMIT, RESOLUTION, assert_near, nothing, on_both, planes_of, scene_flags
+from support.kernel_scenes import EXACT, LASER, SCALE, assert_near, nothing, on_both, planes_of, scene_flags
 from support.score_scenes import (
     OCCUPIED,
     RANGE,
+    WINDOW,
     an_order,
     field_scene,
     guards_of,
@@ -19,12 +20,12 @@ from support.score_scenes import (
     rays_of,
     room_for,
     scan,
-    strides,
 )
 
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.interface.constants import BLOCK_TERMS
+from gpusense.interface.structs import ScanBatch, Score, Window
 from gpusense.reference.error_free import strands_in
 
 PER_SCAN, SCANS = 37, 4
@@ -43,25 +44,30 @@ def readings_of(first: np.ndarray, shared: bool) -> tuple[np.ndarray, int]:
     return counts, int(counts.max())
 
 
-def field(names: tuple[str, ...]) -> tuple[list[np.ndarray], frozenset[str], tuple[int, int]]:
-    """Return the first arguments of both kernels of the field, the flags, and rows and columns."""
+def field(names: tuple[str, ...]) -> tuple[list[np.ndarray], frozenset[str], Window]:
+    """Return the first arguments of both kernels of the field, the flags, and the window."""
     scene = field_scene("log table", REAL, all_readings=False)
     some = np.resize(np.arange(150), COUNT)
     scene |= {key: scene[key][some] for key in ("pose_cell", "pose", "pose_low")}
     given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
     rows, cols = scene["table"].shape
-    return given, scene_flags(REAL, "LOG_TABLE", "LINEAR", "HIT", "CAREFUL", "SCANS", *names), (rows - 4, cols - 4)
+    return (
+        given,
+        scene_flags(REAL, "LOG_TABLE", "LINEAR", "HIT", "CAREFUL", "SCANS", *names),
+        Window(0, 0, rows - 4, cols - 4),
+    )
 
 
 @pytest.mark.parametrize("ahead", AHEAD)
 def test_fields_of_scans(ahead: int, device: Backend) -> None:
-    given, flags, sizes = field(())
+    given, flags, window = field(())
     given[1:4] = [each[ahead:] for each in given[1:4]]
     count, most = COUNT - ahead, int(np.diff(START).max())
     guard = float(guards_of(given[4]).max())
     reference, found = on_both(
         device, "score_field", flags, (count,), *given, START, np.array(FIXED, REAL), np.full(count, np.nan, REAL),
-        nothing(REAL), *sizes, count, most, guard, 0.0, 0.75, PER_SCAN, ahead,
+        nothing(REAL), window, count, most, guard, Score(0.0, 0.75),
+        ScanBatch(PER_SCAN, ahead),
     )  # fmt: skip
     assert differing(found["log_p"], reference["log_p"]) == 0
     # The scan without readings has what is fixed.
@@ -72,14 +78,13 @@ def test_fields_of_scans(ahead: int, device: Backend) -> None:
 @pytest.mark.parametrize("spread", [0, 2])
 @pytest.mark.parametrize("names", [(), ("QUICK",)])
 def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: Backend) -> None:
-    given, flags, sizes = field(names)
+    given, flags, window = field(names)
     most = int(np.diff(START).max())
     blocks = -(-most // BLOCK_TERMS)
     guards = np.full(SCANS * blocks, guards_of(given[4]).max(), REAL)
     reference, found = on_both(
         device, "field_blocks", flags, items(COUNT, spread, 64, 64), *given, guards, START,
-        room_for(COUNT, blocks, "particles", REAL), *sizes, COUNT, most, *strides(COUNT, blocks, "particles"), spread,
-        PER_SCAN,
+        room_for(COUNT, blocks, REAL), window, COUNT, most, spread, ScanBatch(PER_SCAN, 0),
     )  # fmt: skip
     # Of each particle the blocks of its scan, and no others.
     assert differing(found["parts"], reference["parts"]) == 0
@@ -100,7 +105,8 @@ def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> N
     parts.reshape(48, COUNT)[np.arange(48)[:, None] >= added[place_scan]] = np.nan
     reference, found = on_both(
         device, "sum_parts", scene_flags(REAL, "SCANS", *names), (COUNT,), parts, an_order(COUNT), counts,
-        np.array(np.abs(FIXED), REAL), np.full(COUNT, np.nan, REAL), COUNT, 48, block, 1, COUNT, 0.0, 0.75, PER_SCAN,
+        np.array(np.abs(FIXED), REAL), np.full(COUNT, np.nan, REAL), COUNT, 48, block, Score(0.0, 0.75),
+        ScanBatch(PER_SCAN, 0),
     )  # fmt: skip
     assert not np.isnan(found["log_p"]).any()
     np.testing.assert_allclose(found["log_p"], reference["log_p"], rtol=1e-6 if "CUBES" in names else 0)
@@ -128,8 +134,8 @@ def test_beams_of_scans(names: tuple[str, ...], device: Backend) -> None:
         count = COUNT - ahead
         reference, found = on_both(
             device, "score_beams", flags, (count,), planes_of(OCCUPIED), nothing(REAL, 2), cell, pose, *arrays,
-            np.array(FIXED, REAL), np.full(count, np.nan, REAL), nothing(REAL), *OCCUPIED.shape, count, rays, most,
-            *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE, 0.0, 0.75, PER_SCAN, ahead,
+            np.array(FIXED, REAL), np.full(count, np.nan, REAL), nothing(REAL), WINDOW, count, rays, most,
+            *LASER, EXACT, SCALE, Score(0.0, 0.75), ScanBatch(PER_SCAN, ahead),
         )  # fmt: skip
         expected = reference["log_p"].astype(np.float64)
         bound = 2 * per_scan(np.full((count, max(most, 1)), 10.0), REAL, fixed=3.0, temperature=0.75)
@@ -145,8 +151,8 @@ def test_tiles_of_beams_of_scans(names: tuple[str, ...], device: Backend) -> Non
     for spread in (0, 3):
         reference, found = on_both(
             device, "beam_tiles", flags, items(COUNT, spread), planes_of(OCCUPIED), nothing(REAL, 2), cell, pose, order,
-            *arrays, room_for(COUNT, each, "particles", REAL), *OCCUPIED.shape, COUNT, rays, most, *LASER, *EXACT, 0,
-            0.0, LIMIT, RESOLUTION, RANGE, *strides(COUNT, each, "particles"), spread, PER_SCAN,
+            *arrays, room_for(COUNT, each, REAL), WINDOW, COUNT, rays, most, *LASER, EXACT, SCALE, spread,
+            ScanBatch(PER_SCAN, 0),
         )  # fmt: skip
         expected = reference["parts"].astype(np.float64)
         assert_near(found["parts"], expected, 8 * per_beam(expected, REAL))

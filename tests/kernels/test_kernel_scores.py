@@ -10,9 +10,8 @@ from support.kernel_scenes import (
     EXACT,
     GRIDS,
     LASER,
-    LIMIT,
     ONE_SCAN,
-    RESOLUTION,
+    SCALE,
     adversarial_poses,
     assert_near,
     directions,
@@ -22,11 +21,13 @@ from support.kernel_scenes import (
     ranges_on_both,
     run,
     scene_flags,
+    window_of,
 )
 from support.score_scenes import FIELD_SCENES, FIELDS, MIXTURES, field_scene, mixture, scan
 
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
+from gpusense.interface.structs import Score, Window
 from gpusense.reference.mixture import log_density
 
 # Each set of flags is compiled. The lines of the components, of the precision and of the rest of the kernel are apart,
@@ -55,9 +56,8 @@ def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real:
     parts = np.full((count, readings), np.nan, real)
     found = run(
         device, "score_beams", flags, (count,), planes_of(occupied), nothing(real, 2), cell, pose, ray, first, reading,
-        terms, nothing(real), nothing(real), first, nothing(real), np.empty(count, real), parts, *occupied.shape, count,
-        len(ray), readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, LIMIT * RESOLUTION, fixed, temperature,
-        *ONE_SCAN,
+        terms, nothing(real), nothing(real), first, nothing(real), np.empty(count, real), parts,
+        window_of(occupied), count, len(ray), readings, *LASER, EXACT, SCALE, Score(fixed, temperature), ONE_SCAN,
     )  # fmt: skip
 
     # The truth: the float64 reference on the same rounded readings, terms and expected ranges.
@@ -79,8 +79,8 @@ def test_no_readings_give_exactly_what_is_fixed(device: Backend) -> None:
     found = run(
         device, "score_beams", frozenset(flags), (count,), planes_of(occupied), nothing(real, 2), cell, pose,
         np.zeros((0, 2), real), np.zeros(1, np.int32), none, terms, none, none, np.zeros(1, np.int32), none,
-        np.empty(count, real), none, *occupied.shape, count, 0, 0, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION,
-        LIMIT * RESOLUTION, -1.5, 1.0, *ONE_SCAN,
+        np.empty(count, real), none, window_of(occupied), count, 0, 0, *LASER, EXACT, SCALE,
+        Score(-1.5, 1.0), ONE_SCAN,
     )  # fmt: skip
     assert (found["log_p"] == -1.5).all()
 
@@ -95,8 +95,8 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
     finite = scene["point"][np.isfinite(scene["point"])]
     guard = 8 * np.finfo(real).eps * (np.abs(finite).max(initial=0.0) + 2)
     return on_both(
-        device, "score_field", flags, (count,), *scene.values(), rows - 4, cols - 4, count, readings, guard, *fixed,
-        *ONE_SCAN,
+        device, "score_field", flags, (count,), *scene.values(), Window(0, 0, rows - 4, cols - 4), count, readings,
+        guard, Score(*fixed), ONE_SCAN,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,6 +72,13 @@ def test_reference_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
     assert list(inspect.signature(body).parameters) == ["flags", *(argument.name for argument in row.arguments)]
 
 
+def warp_types(precision: type) -> Any:
+    """Return the types of Warp's kernels in a precision."""
+    return importlib.import_module(f"{warp_module('tiles').__package__}.prelude").precision(
+        frozenset({"FLOAT64"} if precision is np.float64 else ())
+    )
+
+
 @pytest.mark.parametrize("precision", PRECISIONS)
 @each_kernel
 def test_warp_kernels_have_the_arguments_of_their_row(
@@ -83,6 +91,7 @@ def test_warp_kernels_have_the_arguments_of_their_row(
     types = dict(zip(("real", "real2", "real4"), real, strict=True))
     types |= {"int": wp.int32, "int2": wp.vec2i, "uchar": wp.uint8, "ushort": wp.uint16, "entry": wp.uint16}
     types |= {"double": wp.float64, "coordinate": wp.float64, "measured": wp.float64}
+    types |= vars(warp_types(precision))
     row = KERNELS[kernel]
     made = warp_module(row.file).make(kernel, frozenset({"FLOAT64"} if precision is np.float64 else ()))
     expected = {a.name: (types[a.type], a.shape is not None) for a in row.arguments}

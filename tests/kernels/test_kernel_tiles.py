@@ -10,10 +10,9 @@ import pytest
 from support.kernel_scenes import (
     EXACT,
     LASER,
-    LIMIT,
     ONE_SCAN,
     PRECISIONS,
-    RESOLUTION,
+    SCALE,
     SECTORS,
     assert_near,
     nothing,
@@ -30,6 +29,7 @@ from support.score_scenes import (
     NOWHERE,
     OCCUPIED,
     RANGE,
+    WINDOW,
     an_order,
     field_scene,
     guards_of,
@@ -40,18 +40,17 @@ from support.score_scenes import (
     rays_of,
     room_for,
     scan,
-    strides,
 )
 
 from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.tolerances import differing, per_beam
 from gpusense.interface.constants import BLOCK_TERMS, TILE, strands_in
+from gpusense.interface.structs import Score, Window
 from gpusense.reference.error_free import strand_sums
 
 SPREADS = range(6)
 COUNTS = (1, 15, 16, 17, 777)
 RAYS = (1, 3, 4, 5, 53)
-WAYS = ("particles", "readings", "gaps")
 # ---- ranges
 
 
@@ -61,7 +60,7 @@ def cast_tiles(device: Backend, real: type, count: int, rays: int, spread: int, 
     order = an_order(count) if "ORDERED" in names else np.zeros(1, np.int32)
     flags = scene_flags(real, "ORIGINS_OUTSIDE", *names)
     ranges = np.full((count, rays), np.nan, real)
-    rest = (*OCCUPIED.shape, count, rays, *EXACT, LIMIT, RESOLUTION, RANGE)
+    rest = (WINDOW, count, rays, EXACT, SCALE)
     planes, numpy = planes_of(OCCUPIED), get_backend("numpy")
     expected = run(numpy, "cast_ranges", flags, (rays, count), planes, cell, pose, ray, ranges, *rest)["ranges"]
     found = [
@@ -91,7 +90,7 @@ def test_tiles_of_ranges_in_sectors(sectors: int, device: Backend) -> None:
     real, count, rays = np.float32, 777, 53
     (cell, pose), ray = poses(count, real), rays_of(rays, real)
     ranges, none = np.full((count, rays), np.nan, real), np.zeros(1, np.int32)
-    rest = (ray, ranges, *OCCUPIED.shape, count, rays, *EXACT, LIMIT, RESOLUTION, RANGE)
+    rest = (ray, ranges, WINDOW, count, rays, EXACT, SCALE)
     flags, numpy = scene_flags(real, "ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"), get_backend("numpy")
     expected = run(numpy, "cast_ranges", flags, (rays, count), planes_of(OCCUPIED), cell, pose, *rest)
     flags |= sector_flags(sectors)
@@ -104,7 +103,7 @@ def test_launches_of_no_particles_write_nothing(device: Backend) -> None:
     (cell, pose), ranges, none = poses(1, np.float32), np.full(8, 5, np.float32), np.zeros(1, np.int32)
     found = run(
         device, "cast_tiles", scene_flags(np.float32), (TILE,), planes_of(OCCUPIED), cell, pose, none,
-        rays_of(4, np.float32), ranges, *OCCUPIED.shape, 0, 4, *EXACT, LIMIT, RESOLUTION, RANGE, 0,
+        rays_of(4, np.float32), ranges, WINDOW, 0, 4, EXACT, SCALE, 0,
     )  # fmt: skip
     assert (found["ranges"] == 5).all()
 
@@ -113,7 +112,7 @@ def test_launches_of_no_particles_write_nothing(device: Backend) -> None:
 
 
 def beam_tiles(
-    device: Backend, name: str, real: type, count: int, rays: int, spread: int, way: str, names: tuple[str, ...] = ()
+    device: Backend, name: str, real: type, count: int, rays: int, spread: int, names: tuple[str, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the term of each reading, in the order's places, by a device's tiles and by the reference."""
     (cell, pose), ray = poses(count, real), rays_of(rays, real)
@@ -128,20 +127,18 @@ def beam_tiles(
     each = strands_in(readings) if "STRANDED" in names else readings
     expected, found = on_both(
         device, "beam_tiles", flags, items(count, spread), planes_of(OCCUPIED), nothing(real, 2), cell, pose, order,
-        ray, first, reading, terms, nothing(real), nothing(real), first, room_for(count, each, way, real),
-        *OCCUPIED.shape, count, rays, readings, *LASER, *EXACT, 0, 0.0, LIMIT, RESOLUTION, RANGE,
-        *strides(count, each, way), spread, 1,
+        ray, first, reading, terms, nothing(real), nothing(real), first, room_for(count, each, real),
+        WINDOW, count, rays, readings, *LASER, EXACT, SCALE, spread, ONE_SCAN,
     )  # fmt: skip
     untouched = np.count_nonzero(expected["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
-    return parts_at(found["parts"], count, each, way), parts_at(expected["parts"], count, each, way)
+    return parts_at(found["parts"], count, each), parts_at(expected["parts"], count, each)
 
 
 @pytest.mark.parametrize("names", [(), ("ORDERED",)])
-@pytest.mark.parametrize("way", WAYS)
-def test_tiles_of_beams(way: str, names: tuple[str, ...], device: Backend) -> None:
+def test_tiles_of_beams(names: tuple[str, ...], device: Backend) -> None:
     for count, rays, spread in itertools.product((1, 17), RAYS, SPREADS):
-        found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, way, names)
+        found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, names)
         assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, np.float32))
 
 
@@ -150,12 +147,11 @@ TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
 
 
 @pytest.mark.parametrize("names", [(), ("ORDERED", "ALL_READINGS")])
-@pytest.mark.parametrize("way", WAYS)
-def test_tiles_that_add_up_strands(way: str, names: tuple[str, ...], device: Backend) -> None:
+def test_tiles_that_add_up_strands(names: tuple[str, ...], device: Backend) -> None:
     """The sums of strands, no more and no fewer, are those of the terms of single readings, to the bit."""
     for count, rays, spread in itertools.product((1, 17), (1, 3, 4, 16, 21, 53), SPREADS):
-        found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, way, (*names, "STRANDED"))
-        single, _ = beam_tiles(device, "book", np.float32, count, rays, spread, way, names)
+        found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, (*names, "STRANDED"))
+        single, _ = beam_tiles(device, "book", np.float32, count, rays, spread, names)
         assert differing(found, strand_sums(single)) == 0
         assert_near(found, expected.astype(np.float64), 8 * per_beam(expected, np.float32))
 
@@ -164,7 +160,7 @@ def test_tiles_that_add_up_strands(way: str, names: tuple[str, ...], device: Bac
 @pytest.mark.parametrize("name", ["book", "hit", "short", "hardly any rand"])
 def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     assert name in MIXTURES
-    found, expected = beam_tiles(device, name, real, 777, 53, 2, "particles", names)
+    found, expected = beam_tiles(device, name, real, 777, 53, 2, names)
     assert_near(found, expected.astype(np.float64), 2 * per_beam(expected, real))
 
 
@@ -173,19 +169,18 @@ def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: t
 
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("names", [(), ("ORDERED",), ("CUBES",)])
-@pytest.mark.parametrize("way", WAYS)
-def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Backend) -> None:
+def test_sums_of_parts(names: tuple[str, ...], real: type, device: Backend) -> None:
     sizes = ((1, 1), (17, BLOCK_TERMS), (777, BLOCK_TERMS))
     for each, (count, block) in itertools.product((0, 1, 15, 16, 17, 53), sizes):
         rng = np.random.default_rng([count, each])
-        parts = room_for(count, each, way, real)
+        parts = room_for(count, each, real)
         parts[:] = rng.uniform(0.1, 3, parts.size) if "CUBES" in names else rng.normal(-3, 9, parts.size)
         if "CUBES" not in names and each:
             parts[:: 3 * each] = -np.inf
         reference, found = on_both(
             device, "sum_parts", scene_flags(real, *names), (count,), parts, an_order(count),
             np.zeros(1, np.int32), np.zeros(1, real), np.full(count, 77, real), count, each, block,
-            *strides(count, each, way), 1.25, 0.75, 1,
+            Score(1.25, 0.75), ONE_SCAN,
         )  # fmt: skip
         if "CUBES" in names:
             eps = np.finfo(real).eps
@@ -193,7 +188,7 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
         else:
             assert differing(found["log_p"], reference["log_p"]) == 0
         order = an_order(count) if "ORDERED" in names else np.arange(count)
-        own = parts_at(parts, count, each, way).astype(np.float64)
+        own = parts_at(parts, count, each).astype(np.float64)
         truth = own.sum(axis=1) + 1.25
         truth = 0.75 * (np.log(truth) if "CUBES" in names else truth)
         np.testing.assert_allclose(found["log_p"][order], truth, rtol=2e-5, atol=2e-4)
@@ -203,7 +198,7 @@ def test_sums_of_parts(way: str, names: tuple[str, ...], real: type, device: Bac
 
 
 def field_blocks(
-    device: Backend, name: str, real: type, names: tuple[str, ...], spread: int, way: str, readings: int, count: int
+    device: Backend, name: str, real: type, names: tuple[str, ...], spread: int, readings: int, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return sums of blocks by a device and by the reference, and the bound of each block."""
     flags = scene_flags(real, *FIELDS[name], *names)
@@ -214,10 +209,10 @@ def field_blocks(
     (rows, cols), blocks = scene["table"].shape, -(-readings // BLOCK_TERMS)
     guards = guards_of(scene["point"])
     given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low", "point", "point_low", "terms")]
-    sizes = (rows - 4, cols - 4, count, readings)
+    sizes = (Window(0, 0, rows - 4, cols - 4), count, readings)
     reference, found = on_both(
         device, "field_blocks", flags, items(count, spread, 64, 64), *given, guards, NOWHERE,
-        room_for(count, blocks, way, real), *sizes, *strides(count, blocks, way), spread, 1,
+        room_for(count, blocks, real), *sizes, spread, ONE_SCAN,
     )  # fmt: skip
     untouched = np.count_nonzero(reference["parts"] == -77)
     assert np.count_nonzero(found["parts"] == -77) == untouched
@@ -225,26 +220,25 @@ def field_blocks(
     parts = np.empty((count, readings), real)
     log_p = np.empty(count, real)
     numpy = get_backend("numpy")
-    alone = (NOWHERE, np.zeros(1, real), log_p, parts, *sizes, guards.max(), 0.0, 1.0, *ONE_SCAN)
+    alone = (NOWHERE, np.zeros(1, real), log_p, parts, *sizes, guards.max(), Score(0.0, 1.0), ONE_SCAN)
     parts = run(numpy, "score_field", flags, (count,), *given, *alone)["parts"]
     bound = 2 * per_beam(parts, real) + 16 * np.finfo(real).eps * np.abs(np.where(np.isfinite(parts), parts, 0))
     bound = np.stack([bound[:, i : i + BLOCK_TERMS].sum(axis=1) for i in range(0, readings, BLOCK_TERMS)], axis=1)
-    return parts_at(found["parts"], count, blocks, way), parts_at(reference["parts"], count, blocks, way), bound
+    return parts_at(found["parts"], count, blocks), parts_at(reference["parts"], count, blocks), bound
 
 
 @pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
-    found, expected, bound = field_blocks(device, name, real, names, 1, "particles", 77, 150)
+    found, expected, bound = field_blocks(device, name, real, names, 1, 77, 150)
     if name == "log table":
         assert differing(found, expected) == 0
     assert_near(found, expected.astype(np.float64), bound)
 
 
-@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("names", [("CAREFUL",), ("CAREFUL", "QUICK"), ("CAREFUL", "QUICK", "ALL_READINGS")])
-def test_blocks_of_fields(names: tuple[str, ...], way: str, device: Backend) -> None:
+def test_blocks_of_fields(names: tuple[str, ...], device: Backend) -> None:
     for count, readings, spread in itertools.product((1, 64, 65), (1, 16, 17, 53), SPREADS):
-        found, expected, _ = field_blocks(device, "log table", np.float32, names, spread, way, readings, count)
+        found, expected, _ = field_blocks(device, "log table", np.float32, names, spread, readings, count)
         assert differing(found, expected) == 0
 
 
@@ -264,7 +258,7 @@ def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
         flags = scene_flags(np.float32, *FIELDS["log table"], *names)
         both = on_both(
             device, "field_blocks", flags, items(count, 0, 64, 64), *given, guards_of(high),
-            NOWHERE, np.empty(count * blocks, np.float32), rows, cols, count, readings, 1, count, 0, 1,
+            NOWHERE, np.empty(count * blocks, np.float32), WINDOW, count, readings, 0, ONE_SCAN,
         )  # fmt: skip
         found += [one["parts"] for one in both]
     assert all(differing(one, found[0]) == 0 for one in found)

@@ -25,7 +25,8 @@ import gpusense.models.scan.tiles
 from gpusense.backends import get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.tables.casters import CASTERS, Lookup, March
-from gpusense.world.frames import frame_scalars
+from gpusense.world.frames import frame_of
+from gpusense.world.windows import Window
 from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world.windows import Window
 
@@ -73,7 +74,7 @@ for dtype, careful in itertools.product((np.float32, np.float64), ((), ("CAREFUL
         outs = [one.upload(np.zeros(n, t)) for n, t in
                 ((12, np.int32), (24, np.float32), (24 if careful else 4, np.float32), (2, np.int32))]
         one.compile("place_poses", flags)(
-            (6,), one.upload(poses), *outs, *frame_scalars(grid, (0.1, 0.02, 0.0)), 1, 2, 13, 17, 6)
+            (6,), one.upload(poses), *outs, frame_of(grid, (0.1, 0.02, 0.0)), Window(2, 1, 13, 17), 6)
         results.append(np.concatenate([one.download(outs[0], np.empty(12, np.int32)),
                                        one.download(outs[1], np.empty(24, np.float32)),
                                        one.download(outs[3], np.empty(2, np.int32))]))

@@ -25,7 +25,7 @@ from gpusense.interface.kernel_files import opencl_source, warp_module
 from gpusense.interface.sources import assemble, relevant, uses_double
 from gpusense.reference import heading
 from gpusense.reference.placement import FARTHEST
-from gpusense.world.frames import frame_scalars, place_poses
+from gpusense.world.frames import frame_of, place_poses
 from gpusense.world.windows import Window
 
 WORST = TOLERANCES["cosines and sines of headings"].value
@@ -176,12 +176,11 @@ def launch(
         "pose_cell": np.full((count, 2), 77, np.int32),
         "pose": np.full((count, 4), 77, dtype),
         "pose_low": np.full((count, 4) if "CAREFUL" in names else (1, 4), 77, dtype),
-        "verdict": np.zeros(2, np.int32),
+        "pose_status": np.zeros(2, np.int32),
     }
     buffers = {name: backend.upload(blank) for name, blank in blanks.items()}
-    window = (WINDOW.col, WINDOW.row, WINDOW.rows, WINDOW.cols)
     backend.compile("place_poses", frozenset(flags))(
-        (count,), backend.upload(given_poses), *buffers.values(), *frame_scalars(grid, mount), *window, count
+        (count,), backend.upload(given_poses), *buffers.values(), frame_of(grid, mount), WINDOW, count
     )
     return {name: backend.download(buffers[name], np.empty_like(blank)) for name, blank in blanks.items()}
 
@@ -218,7 +217,7 @@ def test_the_kernel_does_what_the_host_does(name, real, backend):
     cell = expected.cell - np.array([WINDOW.col, WINDOW.row], np.int32)
     host = {"pose_cell": cell, "pose": expected.pose, "pose_low": expected.low}
     assert_same({name: found[name] for name in host}, host)
-    assert found["verdict"].tolist() == [0, 1]
+    assert found["pose_status"].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -254,7 +253,7 @@ def test_frames_without_yaw_and_mount_change_no_bit(backend):
     np.testing.assert_array_equal(found["pose_low"], 0)
 
 
-# ---- the verdict
+# ---- the pose status
 
 INSIDE = np.array([[1.0 + WINDOW.col, 1.0 + WINDOW.row, 0.3]])
 PLAIN = gs.OccupancyGrid(np.zeros((ROWS, COLS), np.int8), 1.0)
@@ -276,12 +275,12 @@ NO_MOUNT = (0.0, 0.0, 0.0)
 def test_one_sensor_outside_the_window_is_reported(x, y, outside, backend):
     poses = np.repeat(INSIDE, 1000, axis=0)
     poses[617, :2] = x, y
-    assert launch(get_backend(backend), poses, PLAIN, NO_MOUNT, "float32")["verdict"].tolist() == [0, outside]
+    assert launch(get_backend(backend), poses, PLAIN, NO_MOUNT, "float32")["pose_status"].tolist() == [0, outside]
 
 
-def test_a_verdict_is_kept_over_launches_until_it_is_cleared(backend):
+def test_a_pose_status_is_kept_over_launches_until_it_is_cleared(backend):
     device = get_backend(backend)
-    verdict = device.upload(np.zeros(2, np.int32))
+    status = device.upload(np.zeros(2, np.int32))
     kernel = device.compile("place_poses", frozenset())
     buffers = (
         device.empty(2, np.dtype(np.int32)),
@@ -291,8 +290,8 @@ def test_a_verdict_is_kept_over_launches_until_it_is_cleared(backend):
     told = []
     for x in (INSIDE[0, 0], -5.0, INSIDE[0, 0]):
         poses = device.upload(np.array([[x, INSIDE[0, 1], 0.0]]))
-        kernel((1,), poses, *buffers, verdict, *frame_scalars(PLAIN, NO_MOUNT), 0, 0, ROWS, COLS, 1)
-        told.append(device.download(verdict, np.empty(2, np.int32)).tolist())
+        kernel((1,), poses, *buffers, status, frame_of(PLAIN, NO_MOUNT), Window(0, 0, ROWS, COLS), 1)
+        told.append(device.download(status, np.empty(2, np.int32)).tolist())
     assert told == [[0, 0], [0, 1], [0, 1]]
 
 
@@ -306,7 +305,7 @@ def test_poses_that_are_not_finite_are_reported_and_harmless(yaw, real, given_as
     grid = gs.OccupancyGrid(np.zeros((ROWS, COLS), np.int8), 1.0, (0.0, 0.0, yaw))
     for poses in (bad, *(bad[i : i + 1] for i in range(9))):
         found = launch(get_backend(backend), poses, grid, (0.1, 0.2, 0.0), real)
-        assert found["verdict"].tolist() == [1, 1]
+        assert found["pose_status"].tolist() == [1, 1]
         farthest = [-int(FARTHEST) - WINDOW.col, -int(FARTHEST) - WINDOW.row]
         assert (found["pose_cell"] == farthest).all()
         assert (found["pose"] == [0, 0, 1, 0]).all()
@@ -318,7 +317,7 @@ def test_a_position_that_overflows_is_far_away(backend):
     grid = gs.OccupancyGrid(np.zeros((3, 3), np.int8), 1.0, (-1.7e308, 1.7e308, 2.0))
     poses = np.array([[1.7e308, -1.7e308, 0.0], [1.7e308, 1.7e308, 1.0], [-1.7e308, -1.7e308, 1.0]])
     found = launch(get_backend(backend), poses, grid, NO_MOUNT, "float32")
-    assert found["verdict"].tolist() == [0, 1]
+    assert found["pose_status"].tolist() == [0, 1]
     assert np.isfinite(found["pose"]).all()
     assert (np.abs(found["pose_cell"].astype(np.int64)) >= 1 << 29).any(axis=1).all()
 

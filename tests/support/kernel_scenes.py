@@ -13,14 +13,16 @@ from scipy.ndimage import distance_transform_edt
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.interface.signatures import KERNELS
+from gpusense.interface.structs import Caster, Cone, MixtureTables, RangeScale, ScanBatch, Window
 from gpusense.tables.rectangles import empty_rectangles
 
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
 UNREACHABLE = (1 << 31) - 1
 SECTORS = (1, 2, 4)
+SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
 # Particles of each scan and those before a launch, which are not read where there is one scan.
-ONE_SCAN = (1, 0)
+ONE_SCAN = ScanBatch(1, 0)
 
 
 def run(
@@ -97,10 +99,15 @@ def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tup
     return cell.astype(np.int32), pose
 
 
-# The exact caster's bins, slack and tolerance.
-EXACT = (0, 0.0, 0.0)
-# Kinds of terms, rays of a cone and the least cosine of an incidence, where no incidence matters; and what is not read.
-LASER = (1, 1, 0.0)
+# The exact caster has no knobs.
+EXACT = Caster(0, 0.0, 0.0)
+# One ray a cone and no bins of incidence.
+LASER = (MixtureTables(1, 0, 0.0), Cone(1, 0.0))
+
+
+def window_of(cells: np.ndarray) -> Window:
+    """Return the window that is a whole map."""
+    return Window(0, 0, *cells.shape)
 
 
 def nothing(real: type, numbers: int = 1) -> np.ndarray:
@@ -144,8 +151,8 @@ def ranges_on_both(
     """Return ranges along every kind of bearing, by the reference with 1 sector and by a device with any number."""
     ray = directions(real)
     ranges = np.full((len(pose), len(ray)), np.nan, real)
-    size, counts = (len(ray), len(pose)), (*occupied.shape, len(pose), len(ray))
-    rest = (cell, pose, ray, ranges, *counts, *EXACT, LIMIT, RESOLUTION, LIMIT * RESOLUTION)
+    size, counts = (len(ray), len(pose)), (len(pose), len(ray))
+    rest = (cell, pose, ray, ranges, window_of(occupied), *counts, EXACT, SCALE)
     reference = run(get_backend("numpy"), "cast_ranges", flags, size, planes_of(occupied), *rest)
     flags |= sector_flags(sectors)
     found = run(device, "cast_ranges", flags, size, planes_of(occupied, sectors), *rest)

@@ -11,6 +11,7 @@ from support.ray_oracles import Ray, walk
 
 from gpusense.backends import get_backend
 from gpusense.interface.lanes import widened
+from gpusense.interface.structs import Caster, RangeScale, Window
 from gpusense.tables.rectangles import empty_rectangles
 
 LAST_FLOAT32 = 1 - 2.0**-24
@@ -68,7 +69,17 @@ def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: 
     rays, ranges = device.upload(np.array([[1.0, 0.0]], real)), device.empty(count, real)
     code = widened(device.info.lanes, "cast_ranges", flags) if wide else frozenset(flags)
     device.compile("cast_ranges", code)(
-        (1, count), table, cell, pose, rays, ranges, rows, cols, count, 1, 0, 0.0, 0.0, scene.limit, 1.0, scene.limit
+        (1, count),
+        table,
+        cell,
+        pose,
+        rays,
+        ranges,
+        Window(0, 0, rows, cols),
+        count,
+        1,
+        Caster(0, 0.0, 0.0),
+        RangeScale(scene.limit, 1.0, scene.limit),
     )
     return device.download(ranges, np.empty(count, real))
 

@@ -10,6 +10,7 @@ from support.kernel_scenes import (
     adversarial_poses,
     directions,
     squared_distances,
+    window_of,
     with_low_parts,
 )
 
@@ -118,7 +119,7 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
         "point_low": point_low,
         "terms": with_low_parts(terms, real),
         "start": np.zeros(1, np.int32),
-        "fixed_of": np.zeros(1, real),
+        "constant_terms": np.zeros(1, real),
         "log_p": np.empty(count, real),
         "parts": np.full((count, len(end)), np.nan, real),
     }
@@ -136,6 +137,7 @@ FIELD_SCENES = [
 
 OCCUPIED = GRIDS["rooms"]
 RANGE = LIMIT * RESOLUTION
+WINDOW = window_of(OCCUPIED)
 # Where scans begin, which is not read where there is one.
 NOWHERE = np.zeros(1, np.int32)
 
@@ -159,19 +161,14 @@ def an_order(count: int) -> np.ndarray:
     return np.random.default_rng(count).permutation(count).astype(np.int32)
 
 
-def strides(count: int, each: int, way: str) -> tuple[int, int]:
-    """Return (across, along): parts of a particle, or of a reading, lie together; or with gaps between them."""
-    return {"particles": (1, count), "readings": (each, 1), "gaps": (2 * each + 3, 2)}[way]
+def parts_at(parts: np.ndarray, count: int, each: int) -> np.ndarray:
+    """Return (count, each) parts, which lie together by reading."""
+    return parts[: count * each].reshape(each, count).T
 
 
-def parts_at(parts: np.ndarray, count: int, each: int, way: str) -> np.ndarray:
-    across, along = strides(count, each, way)
-    return parts[np.arange(count)[:, None] * across + np.arange(each) * along]
-
-
-def room_for(count: int, each: int, way: str, real: type) -> np.ndarray:
-    across, along = strides(count, each, way)
-    return np.full(max(count * across + each * along, 1), -77, real)
+def room_for(count: int, each: int, real: type) -> np.ndarray:
+    """Return room for parts, and one more number, that is filled with -77."""
+    return np.full(count * each + 1, -77, real)
 
 
 def guards_of(point: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from support.raycast_scenes import cast as scene_cast
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.casters import ENTRIES
+from gpusense.interface.structs import RangeScale, Window
 from gpusense.models.scan.densities import log_mixture
 from gpusense.tables import casters
 from gpusense.tables.caster_base import CasterInput
@@ -26,8 +27,8 @@ from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "casters.md"
 KINDS = [
-    *(Exact(), Dda(), Bresenham(), March(), March(0.02), March(1.5, "centre")),
-    *(Cddt(), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),
+    *(make() for name, make in casters.CASTERS.items() if name != "lookup"),
+    *(March(0.02), March(1.5, "centre"), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),
 ]
 CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
@@ -90,8 +91,8 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     result = device.empty(count, real)
     device.compile("cast_ranges", frozenset(flags))(
         (1, count), table.buffer, device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real)),
-        device.upload(np.array([[1.0, 0.0]], real)), result, rows, cols, count, 1, *kind.scalars(), scene.limit, 1.0,
-        scene.limit,
+        device.upload(np.array([[1.0, 0.0]], real)), result, Window(0, 0, rows, cols), count, 1, kind.struct(),
+        RangeScale(scene.limit, 1.0, scene.limit),
     )  # fmt: skip
     return device.download(result, np.empty(count, real))
 

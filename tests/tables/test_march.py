@@ -9,6 +9,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.interface.structs import Window
 from gpusense.reference import march as march_reference
 from gpusense.tables.caster_base import CasterInput
 from gpusense.tables.casters import March
@@ -83,10 +84,8 @@ def steps(grid: gs.OccupancyGrid, poses: np.ndarray, kind: March, limit: float) 
     table = Counting(kind.prepare(get_backend("numpy"), CasterInput(grid.occupied, limit, "free")).buffer)
     cell = np.floor(poses[:, :2])
     pose = np.column_stack([poses[:, :2] - cell, np.cos(poses[:, 2]), np.sin(poses[:, 2])])
-    ahead, (_, slack, tolerance) = np.tile([1.0, 0.0], (len(pose), 1)), kind.scalars()
-    march_reference.cast_ray(
-        frozenset({"FLOAT64"}), table, *grid.shape, cell.astype(int), pose, ahead, limit, 0, slack, tolerance
-    )
+    ahead, window = np.tile([1.0, 0.0], (len(pose), 1)), Window(0, 0, *grid.shape)
+    march_reference.cast_ray(frozenset({"FLOAT64"}), table, window, cell.astype(int), pose, ahead, limit, kind.struct())
     return table.count
 
 

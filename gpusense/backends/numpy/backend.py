@@ -10,6 +10,7 @@ import numpy as np
 from gpusense.backends.base import Backend, Launcher
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import host_memory
+from gpusense.interface import structs
 from gpusense.interface.signatures import KERNELS
 
 
@@ -56,9 +57,11 @@ class NumpyBackend(Backend):
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
 
         def launch(size: tuple[int, ...], *arguments: Any) -> None:
-            bound = []
+            bound: list[Any] = []
             for declared, value in zip(row.arguments, arguments, strict=True):
-                if declared.shape is None:
+                if declared.is_struct:
+                    bound.append(structs.rounded(value, declared.type, real))
+                elif declared.shape is None:
                     dtype = declared.dtype(real)
                     bound.append(int(value) if dtype.kind == "i" else dtype.type(value))
                 else:

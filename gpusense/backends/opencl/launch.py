@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -12,7 +13,8 @@ import pyopencl as cl
 from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.memory import driver_errors
 from gpusense.backends.opencl.replay import BoundLaunch
-from gpusense.interface.signatures import Kernel, lanes_of
+from gpusense.interface import structs
+from gpusense.interface.signatures import Argument, Kernel, lanes_of
 
 
 class Enqueuer(Protocol):
@@ -42,7 +44,11 @@ class Launch:
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.
-        self._types = [a.dtype(real).type if a.shape is None else None for a in row.arguments]
+        self._types = [_set_as(argument, real) for argument in row.arguments]
+        self._packers = [
+            (place, _Packer(argument.type, real)) for place, argument in enumerate(row.arguments) if argument.is_struct
+        ]
+        self._last_size: tuple[Any, Any] = (None, None)
         with without_caches():
             kernel.set_arg_types(self._types)
 
@@ -51,8 +57,10 @@ class Launch:
         self._before_first()
         # Arguments belong to the kernel object, so two threads must not interleave.
         with self._lock, driver_errors():
-            self._kernel.set_args(*arguments)
-            self._backend.enqueue(self._kernel, *self._sizes(size))
+            self._kernel.set_args(*self._packed(arguments))
+            if size != self._last_size[0]:
+                self._last_size = size, self._sizes(size)
+            self._backend.enqueue(self._kernel, *self._last_size[1])
 
     def bind(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> BoundLaunch:
         """Set the arguments of a new kernel object, and start nothing."""
@@ -60,8 +68,15 @@ class Launch:
         kernel = new_kernel(self._kernel.program, self._kernel.function_name)
         with without_caches():
             kernel.set_arg_types(self._types)
-        kernel.set_args(*arguments)
+        kernel.set_args(*self._packed(arguments))
         return BoundLaunch(kernel, *self._sizes(size), arguments)
+
+    def _packed(self, arguments: tuple[Any, ...]) -> list[Any]:
+        """Return the arguments with structs as the bytes that the device reads."""
+        packed = list(arguments)
+        for place, pack in self._packers:
+            packed[place] = pack(packed[place])
+        return packed
 
     def _before_first(self) -> None:
         """Call back before the first launch."""
@@ -73,3 +88,25 @@ class Launch:
         """Return the size in whole groups, and the group."""
         group = (self._group, *(1 for _ in size[1:]))
         return (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:]), group
+
+
+class _Packer:
+    """Packs a struct into the bytes that the device reads; calls mostly repeat the last one."""
+
+    def __init__(self, name: str, real: np.dtype) -> None:
+        self._pack = struct.Struct(structs.layout(name, real)).pack
+        self._last: tuple[Any, bytes] = (None, b"")
+
+    def __call__(self, value: tuple[Any, ...]) -> bytes:
+        last, packed = self._last
+        if value is not last:
+            packed = self._pack(*value)
+            self._last = value, packed
+        return packed
+
+
+def _set_as(argument: Argument, real: np.dtype) -> Any:
+    """Return the type by which pyopencl sets an argument; None for buffers."""
+    if argument.is_struct:
+        return np.dtype(("V", struct.calcsize(structs.layout(argument.type, real))))
+    return argument.dtype(real).type if argument.shape is None else None

@@ -46,7 +46,9 @@ class Launch:
         gathering: Callable[[], CallQueue | None],
     ) -> None:
         self._device, self._kernel, self._group, self._gathering = device, kernel, group, gathering
-        self._binds = [_binding(argument) for argument in row.arguments]
+        self._binds = [
+            _binding(argument, declared.type) for argument, declared in zip(row.arguments, kernel.adj.args, strict=True)
+        ]
         self._thread = threading.local()
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
@@ -112,11 +114,21 @@ def slice_of(buffer: wp.array, begin: int, count: int) -> wp.array:
     return wp.array(ptr=start, dtype=buffer.dtype, shape=(count,), device=buffer.device)
 
 
-def _binding(argument: Argument) -> Callable[[Any], Any]:
-    """Return the function that converts a value to an argument of a kernel."""
+def _binding(argument: Argument, declared: Any) -> Callable[[Any], Any]:
+    """Return the function that converts a value to an argument of a kernel, which declares it of some type."""
+    if argument.is_struct:
+        return functools.partial(_instance, declared)
     if argument.shape is None:
         return float if argument.type in ("real", "double") else int
     return functools.partial(_view, width=argument.width)
+
+
+def _instance(declared: Any, value: Any) -> Any:
+    """Return a struct as Warp's."""
+    made = declared()
+    for name, number in value._asdict().items():
+        setattr(made, name, number)
+    return made
 
 
 def _view(buffer: wp.array, width: int) -> wp.array:

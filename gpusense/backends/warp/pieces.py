@@ -69,7 +69,7 @@ class SharedLaunch:
         self._axis = row.launch.index(self._name)
         self._count = next(i for i, argument in enumerate(row.arguments) if argument.name == _SHARED[self._name])
         # The scan of a particle follows from its number in the whole launch.
-        self._ahead = next((i for i, argument in enumerate(row.arguments) if argument.name == "ahead"), None)
+        self._batch = next((i for i, argument in enumerate(row.arguments) if argument.name == "batch"), None)
         self._work = [
             i for i, argument in enumerate(row.arguments) if argument.name in ("rays", "readings", "features")
         ]
@@ -134,8 +134,9 @@ class SharedLaunch:
         """Return the arguments of a launch of ``count`` particles from ``begin`` on."""
         cut = list(arguments)
         cut[self._count] = count
-        if self._ahead is not None:
-            cut[self._ahead] += begin
+        if self._batch is not None:
+            batch = arguments[self._batch]
+            cut[self._batch] = batch._replace(ahead=batch.ahead + begin)
         for i, each in rows:
             cut[i] = slice_of(arguments[i], begin * each, count * each)
         return cut

@@ -1,6 +1,6 @@
 """List the candidates: methods with their variants and knobs, and how to make each for a scene.
 
-To add a caster or a value of a knob, add a line to :data:`CURVES`.
+Every caster has a candidate with its default knobs; ``_VARIED`` has those whose knobs are varied.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.evaluation.benchmark.measure import Runner
 from gpusense.evaluation.benchmark.scenes import Scene
+from gpusense.interface.casters import ENTRIES
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
@@ -86,17 +87,16 @@ class Curve:
     quick: tuple[int, ...] = (1,)
 
 
-CURVES = (
-    Curve("exact"),
-    Curve("dda"),
+_VARIED = (
     Curve("march", "safe", "tolerance", (2.0, 1.0, 0.5, 0.1, 0.01), {"rule": "safe"}, (1, 3)),
     # No tolerance below 1 cell: the distance between the centres of two cells is at least 1.
     Curve("march", "centre", "tolerance", (4.0, 2.0, 1.0), {"rule": "centre"}, (2,)),
-    Curve("bresenham"),
     Curve("cddt", "", "bins", (54, 108, 216, 720), {"pruned": False}, (1,)),
     Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, ()),
     Curve("lookup", "", "bins", (27, 54, 108), {}, (1,)),
 )
+_WITH_KNOBS = {curve.method for curve in _VARIED}
+CURVES = (*(Curve(name) for name in ENTRIES if name not in _WITH_KNOBS), *_VARIED)
 """The casters, for ranges and for the beam model."""
 
 BIN_WIDTHS = (0.5, 0.2, 0.1, 0.05, 0.02)

@@ -15,6 +15,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.plan import Omission
+from gpusense.interface.structs import Buckets, Score, SensorView
 from gpusense.interface.terms import log_weight
 from gpusense.models.landmark.call import Call, known_features
 from gpusense.models.landmark.features import (
@@ -241,8 +242,9 @@ class LandmarkModel(PointModel):
             landmark=self._tables.landmark, signature=self._tables.signature, pose_cell=placed.cell, pose=placed.pose,
             pose_low=placed.low, terms=self._tables.terms, arcs=self._tables.arcs, log_p=log_p, **result,
             feature=space.upload("feature", np.resize(numbers, (max(features, 1), numbers.shape[1]))),
-            landmarks=len(self.landmarks), particles=count, features=features, size=self._buckets.resolution,
-            fixed=call.fixed, temperature=self.temperature,
+            landmarks=len(self.landmarks), particles=count, features=features,
+            buckets=Buckets(*self._buckets.shape, self._buckets.resolution),
+            score=Score(call.fixed, self.temperature),
         )  # fmt: skip
         score = (self._joint_launch if call.joint else self._each_launch)(call, common)
         unseen = (self._unseen_launch(placed, result["which"], log_p, features),) if self.negative else ()
@@ -268,13 +270,13 @@ class LandmarkModel(PointModel):
 
     def _each_launch(self, call: Call, common: dict[str, Any]) -> Launch:
         """Return the launch in which each feature chooses its landmark, or sums over them, independently."""
-        landmarks, (rows, cols) = len(self.landmarks), self._buckets.shape
+        landmarks = len(self.landmarks)
         prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
         partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
         flags = widened(self._backend.info.lanes, "score_features", call.flags)
         return launch(
             "score_features", flags, (common["particles"],), **common, start=self._tables.start, partner=partner,
-            rows=rows, cols=cols, share=prior,
+            share=prior,
         )  # fmt: skip
 
     def _joint_launch(self, call: Call, common: dict[str, Any]) -> Launch:
@@ -288,12 +290,14 @@ class LandmarkModel(PointModel):
 
     def _unseen_launch(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Launch:
         """Return the launch that adds the landmarks in view without a feature."""
-        p, (rows, cols) = self.parameters, self._buckets.shape
+        p = self.parameters
         return launch(
             "count_unseen", self._flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
-            pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p, rows=rows,
-            cols=cols, particles=placed.count, features=features, size=self._buckets.resolution, range_max=p.range_max,
-            axis_cosine=math.cos(self.mount[2]), axis_sine=math.sin(self.mount[2]),
-            least=-2.0 if full_circle(p) else math.cos(p.field_of_view / 2),
-            log_missed=self.temperature * log_weight(1 - p.p_detect),
+            pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p,
+            buckets=Buckets(*self._buckets.shape, self._buckets.resolution), particles=placed.count, features=features,
+            view=SensorView(
+                p.range_max, math.cos(self.mount[2]), math.sin(self.mount[2]),
+                -2.0 if full_circle(p) else math.cos(p.field_of_view / 2),
+                self.temperature * log_weight(1 - p.p_detect),
+            ),
         )  # fmt: skip

@@ -178,5 +178,5 @@ class PointModel(ABC):
             body(frozenset(), poses.host[slice(*part)], placed, np.zeros(2, np.int32), *numbers.values(), count)
             return space.upload(kernel, placed), ()
         result = space.empty(kernel, width * count, self._real)
-        arguments = {"poses": source, name: result, "verdict": pose_status(space), "particles": count}
+        arguments = {"poses": source, name: result, "pose_status": pose_status(space), "particles": count}
         return result, (launch(kernel, self._flags | poses.flags, (count,), **arguments, **numbers),)

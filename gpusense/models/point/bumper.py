@@ -147,8 +147,8 @@ class BumperModel(PointModel):
             score = launch(
                 "score_contact", flags, (placed.count,), table=self._table, pose_cell=placed.cell, pose=placed.pose,
                 pose_low=placed.low, point=points[0], point_low=points[1], start=space.upload("start", start),
-                pressed=space.upload("pressed", known), terms=self._terms_buffer, log_p=log_p, rows=window.rows,
-                cols=window.cols, particles=placed.count, segments=len(known), guard=self._guard,
+                pressed=space.upload("pressed", known), terms=self._terms_buffer, log_p=log_p, window=window,
+                particles=placed.count, segments=len(known), guard=self._guard,
                 temperature=self.temperature,
             )  # fmt: skip
             return (*placed.launches(), score)

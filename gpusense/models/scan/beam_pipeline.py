@@ -12,6 +12,7 @@ from gpusense.interface.constants import BLOCK_TERMS, strands_in
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
+from gpusense.interface.structs import MixtureTables
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.cones import Cones
@@ -53,9 +54,9 @@ class BeamPipeline(ScanPipeline):
         self._terms = upload(mixture.terms)
         self._constants = dict(
             terms=self._terms, edges=upload(mixture.cosines.astype(self.real)),
-            sensor=upload(np.zeros(1, self.real) if mixture.table is None else mixture.table), kinds=mixture.bins,
-            cone_rays=cones.rays, critical=cones.critical, cells=cells, per_metre=cells / self.scanner.range_max,
-            limit=caster.limit, range_max=self.scanner.range_max,
+            sensor=upload(np.zeros(1, self.real) if mixture.table is None else mixture.table),
+            tables=MixtureTables(mixture.bins, cells, cells / self.scanner.range_max),
+            cone=cones.struct,
         )  # fmt: skip
         # The first reading of each ray where no rays are shared.
         self._one_each: Buffer = upload(np.arange(self.scanner.count + 1, dtype=np.int32))
@@ -83,7 +84,7 @@ class BeamPipeline(ScanPipeline):
         shared, several = scans.shared or not self.specialize, scans.scans > 1
         arrays = dict(ray=vectors.astype(self.real), reading=values)
         if several:
-            arrays["fixed_of"] = (scans.constants + self.setting.constant_term).astype(self.real)
+            arrays["constant_terms"] = (scans.constants + self.setting.constant_term).astype(self.real)
         uploaded = dict(zip(arrays, space.upload_all("scan", list(arrays.values())), strict=True))
         start = counts = self.nothing
         if several:
@@ -91,11 +92,11 @@ class BeamPipeline(ScanPipeline):
             start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
         # Kernels without shared rays read no first reading, but NumPy's does, of a single scan.
         first = space.upload("first", scans.first) if shared and (several or scans.shared) else self._one_each
-        fixed = float(scans.constants[0]) + self.setting.constant_term
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SHARED_RAYS=shared, SCANS=several),
             dict(ray=uploaded["ray"], reading=uploaded["reading"], first=first, start=start),
-            dict(counts=counts, fixed_of=uploaded.get("fixed_of", self._terms), fixed=fixed),
+            dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
+            float(scans.constants[0]) + self.setting.constant_term,
             (scans.scans, scans.most_rays, scans.most_readings, len(scans.rays), len(scans.readings)),
         )  # fmt: skip
 
@@ -143,28 +144,27 @@ class BeamPipeline(ScanPipeline):
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""
         placed, readings, parts, caster = scoring.placed, scoring.readings, scoring.parts, self.caster
-        window, count, per_scan = placed.frame.window, placed.count, scoring.per_scan
+        window, count = placed.frame.window, placed.count
         common = dict(
             map_table=scoring.table, normals=caster.normals(window, self.cones.flags), pose_cell=placed.cell,
-            pose=placed.pose, rows=window.rows, cols=window.cols, particles=count, rays=readings.rays,
-            readings=readings.readings, resolution=self.grid.resolution, parts=parts.buffer, per_scan=per_scan,
-            **caster.knobs, **self._constants, **readings.arguments,
+            pose=placed.pose, window=window, particles=count, rays=readings.rays, readings=readings.readings,
+            parts=parts.buffer, caster=caster.method.struct(), scale=caster.scale, batch=scoring.batch,
+            **self._constants, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
             common |= self.numbers(scoring)
+            constant_terms = readings.sums["constant_terms"]
             return (
                 launch(
-                    "score_beams", scoring.flags, (count,), **common, fixed_of=readings.sums["fixed_of"],
-                    log_p=scoring.log_p, temperature=self.setting.temperature, ahead=0,
+                    "score_beams", scoring.flags, (count,), **common, constant_terms=constant_terms,
+                    log_p=scoring.log_p,
                 ),
             )  # fmt: skip
         order = self.nothing if scoring.tiles.order is None else scoring.tiles.order.order
         items, spread = tiles_of(count, readings.rays)
-        tiles = launch(
-            "beam_tiles", scoring.flags, (items,), **common, order=order, across=1, along=count, spread=spread
-        )
+        tiles = launch("beam_tiles", scoring.flags, (items,), **common, order=order, spread=spread)
         summing = sum_launch(
-            scoring.flags | readings.sum_flags, count, parts, order, readings.sums, scoring.log_p,
-            self.setting.temperature, per_scan,
+            scoring.flags | readings.sum_flags, count, parts, order=order, log_p=scoring.log_p, batch=scoring.batch,
+            **readings.sums, **self.numbers(scoring),
         )  # fmt: skip
         return (tiles, summing) if readings.readings else (summing,)

@@ -153,12 +153,13 @@ class DeviceCall(BoundCall):
         pipeline, space = self._pipeline, self._space
         sensing = pipeline.sensing()
         placing, filled = device_readings(sensing, adopted.buffer, adopted.dtype, limits, space)
-        places, fixed = sensing.places, filled.pop("fixed")
+        places, constant_term = sensing.places, filled.pop("constant_term")
         counts = -(-places // BLOCK_TERMS) if sensing.end_points else places
         return Readings(
             1, places, places, frozenset({"ALL_READINGS"}),
             pipeline.place_arguments(filled),
-            dict(counts=space.upload("counts", np.array([counts], _INT)), fixed_of=fixed, fixed=0.0),
+            dict(counts=space.upload("counts", np.array([counts], _INT)), constant_terms=constant_term),
+            0.0,
             constants_there=sensing.constants_there, placing=placing,
         )  # fmt: skip
 

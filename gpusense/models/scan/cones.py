@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.interface import structs
 from gpusense.interface.flags import flags_if
 from gpusense.tables.casters import Caster
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
@@ -32,9 +33,9 @@ class Cones:
     incidence: bool = False
 
     @property
-    def scalars(self) -> tuple[int, float]:
-        """The kernels' arguments cone_rays and critical."""
-        return self.rays, self.critical
+    def struct(self) -> structs.Cone:
+        """The cone as kernels take it."""
+        return structs.Cone(self.rays, self.critical)
 
     @property
     def flags(self) -> frozenset[str]:

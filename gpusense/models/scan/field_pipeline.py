@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -122,18 +123,18 @@ class FieldPipeline(ScanPipeline):
             arrays["guard"] = (self._guard * (self._longest_of_blocks(lengths, scans) + 2)).astype(self.real)
         several = scans.scans > 1
         if several:
-            arrays["fixed_of"] = (scans.constants + self.setting.constant_term).astype(self.real)
+            arrays["constant_terms"] = (scans.constants + self.setting.constant_term).astype(self.real)
         uploaded = dict(zip(arrays, space.upload_all("points", list(arrays.values())), strict=True))
         start = counts = self.nothing
         if several:
             blocks = -(-scans.counts // BLOCK_TERMS)
             begins = np.append(0, np.cumsum(scans.counts))
             start, counts = space.upload_all("scans", [begins.astype(np.int32), blocks.astype(np.int32)])
-        fixed = float(scans.constants[0]) + self.setting.constant_term
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SCANS=several),
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
-            dict(counts=counts, fixed_of=uploaded.get("fixed_of", self._terms), fixed=fixed),
+            dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
+            float(scans.constants[0]) + self.setting.constant_term,
             (scans.scans, scans.most_readings, len(scans.readings)), longest + 2,
         )  # fmt: skip
 
@@ -180,7 +181,7 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.layout."""
         return readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1
 
-    def numbers(self, scoring: Scoring) -> dict[str, float]:
+    def numbers(self, scoring: Scoring) -> dict[str, Any]:
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
         numbers = super().numbers(scoring)
         if scoring.tiles is None:
@@ -191,28 +192,26 @@ class FieldPipeline(ScanPipeline):
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""
         placed, readings, parts = scoring.placed, scoring.readings, scoring.parts
-        window, count, per_scan = placed.frame.window, placed.count, scoring.per_scan
+        count = placed.count
         common = dict(
             table=scoring.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=self._terms,
-            rows=window.rows, cols=window.cols, particles=count, readings=readings.readings, per_scan=per_scan,
+            window=placed.frame.window, particles=count, readings=readings.readings, batch=scoring.batch,
             parts=parts.buffer, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
             # Vectors of particles hold those of one scan.
-            size = readings.scans * -(-per_scan // _GROUP) * _GROUP if "WIDE" in scoring.flags else count
+            size = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP if "WIDE" in scoring.flags else count
             common |= self.numbers(scoring)
             return (
                 launch(
-                    "score_field", scoring.flags, (size,), **common, fixed_of=readings.sums["fixed_of"],
-                    log_p=scoring.log_p, temperature=self.setting.temperature, ahead=0,
+                    "score_field", scoring.flags, (size,), **common, log_p=scoring.log_p,
+                    constant_terms=readings.sums["constant_terms"],
                 ),
             )  # fmt: skip
         items = (-(-count // _GROUP) << scoring.tiles.spread) * _GROUP
-        blocks = launch(
-            "field_blocks", scoring.flags, (items,), **common, across=1, along=count, spread=scoring.tiles.spread
-        )
+        blocks = launch("field_blocks", scoring.flags, (items,), **common, spread=scoring.tiles.spread)
         summing = sum_launch(
-            scoring.flags | readings.sum_flags, count, parts, self.nothing, readings.sums, scoring.log_p,
-            self.setting.temperature, per_scan,
+            scoring.flags | readings.sum_flags, count, parts, order=self.nothing, log_p=scoring.log_p,
+            batch=scoring.batch, **readings.sums, **self.numbers(scoring),
         )  # fmt: skip
         return (blocks, summing) if readings.readings else (summing,)

@@ -17,6 +17,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
+from gpusense.interface.structs import RangeScale
 from gpusense.models.poses import Frame, PlacedPoses, Poses, place
 from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.models.scan.cones import LASER, Cones
@@ -101,9 +102,9 @@ class MapCaster:
         return self._normals[1]
 
     @property
-    def knobs(self) -> dict[str, Any]:
-        """The kernels' arguments bins, slack and tolerance."""
-        return dict(zip(("bins", "slack", "tolerance"), self.method.scalars(), strict=True))
+    def scale(self) -> RangeScale:
+        """The scale of ranges."""
+        return RangeScale(self.limit, self.grid.resolution, self.range_max)
 
     def omission(self) -> Omission | None:
         """Return the omission by cropping the map, None before the first cloud."""
@@ -182,16 +183,15 @@ class MapCaster:
         space, window, count = self._workspace, placed.frame.window, placed.count
         flags = self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
         common = dict(
-            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, rows=window.rows, cols=window.cols,
-            particles=count, rays=rays, **self.knobs, limit=self.limit, resolution=self.grid.resolution,
-            range_max=self.range_max,
+            map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=window, particles=count,
+            rays=rays, caster=self.method.struct(), scale=self.scale,
         )  # fmt: skip
         if "ECHO" in flags:
             other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
             ranges, incidence = (other, result) if cones.incidence else (result, other)
             heard = dict(
-                normals=self.normals(window, cones.flags), ranges=ranges, incidence=incidence, cone_rays=cones.rays,
-                critical=cones.critical,
+                normals=self.normals(window, cones.flags), ranges=ranges, incidence=incidence,
+                cone=cones.struct,
             )  # fmt: skip
             return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
         if self.backend.info.kind == "gpu":

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
+from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
 from gpusense.models.run import Piece, chunk_of
 from gpusense.models.scan.classed import ClassedScans, class_scans
@@ -92,9 +94,9 @@ class Scoring:
     tiles: Tiles | None
 
     @property
-    def per_scan(self) -> int:
+    def batch(self) -> ScanBatch:
         """Particles of each scan."""
-        return self.placed.count // self.readings.scans
+        return ScanBatch(self.placed.count // self.readings.scans, 0)
 
 
 class ScanPipeline(ABC):
@@ -157,9 +159,9 @@ class ScanPipeline(ABC):
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """Return the count of numbers that each particle's sum adds, and their block size; see ``Parts``."""
 
-    def numbers(self, scoring: Scoring) -> dict[str, float]:
+    def numbers(self, scoring: Scoring) -> dict[str, Any]:
         """Return the arguments of the launches that change from call to call."""
-        return dict(fixed=scoring.readings.sums["fixed"])
+        return dict(score=Score(scoring.readings.constant_term, self.setting.temperature))
 
     @abstractmethod
     def score_launches(self, scoring: Scoring) -> Program:

@@ -13,6 +13,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
+from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.rules import BeamChoice, Beams
 from gpusense.world.scanner import Scanner
@@ -32,10 +33,11 @@ class Readings:
         readings: Readings of the scan that has most.
         flags: Flags of kernels that score them.
         arguments: Their arguments of scoring kernels, by name.
-        sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms.
+        sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms of scans.
+        constant_term: The constant term of a single scan.
         key: All values on which the launches depend, except buffers.
         reach: Longest range in cells, and a bound of its error; infinite if unknown.
-        constants_there: Whether a constant term of a single scan is in ``fixed_of`` on the device.
+        constants_there: Whether a constant term of a single scan is in ``constant_terms`` on the device.
         placing: The launch that places them on the device; None where the host has placed them.
     """
 
@@ -45,6 +47,7 @@ class Readings:
     flags: frozenset[str]
     arguments: dict[str, Any]
     sums: dict[str, Any]
+    constant_term: float
     key: Hashable = None
     reach: float = np.inf
     constants_there: bool = False
@@ -158,7 +161,7 @@ def device_readings(
         point_low=space.empty("point_low", 2 * places if end_points else 2, real),
         reading=space.empty("reading", 1 if end_points else places, real),
         guard=space.empty("guard", -(-places // BLOCK_TERMS) if end_points else 1, real),
-        fixed=space.empty("fixed", 1, real),
+        constant_term=space.empty("constant_term", 1, real),
     )
     flags = flags_if(
         END_POINTS=end_points, FLOAT64=real == np.float64, ALL_READINGS=not sensing.specialize,
@@ -170,9 +173,10 @@ def device_readings(
     arguments = dict(
         filled, ranges=ranges, beam=space.upload("beam", columns.astype(_INT)),
         vector=space.upload("vector", sensing.vectors[columns]), head=-(-max(len(columns), 1) // _GROUP) * _GROUP,
-        beams=len(columns), each=each, places=places, chosen=chosen, max_readings=kind, possible=int(sensing.possible),
-        nearest=nearest, farthest=farthest, log_max=float(np.log(sensing.z_max)) if kind == MAX_FIXED else 0.0,
-        top=sensing.top, guard_scale=sensing.guard_scale,
+        rules=ReadingRules(
+            nearest, farthest, float(np.log(sensing.z_max)) if kind == MAX_FIXED else 0.0, sensing.top,
+            sensing.guard_scale, len(columns), each, places, chosen, kind, int(sensing.possible),
+        ),
     )  # fmt: skip
     return Placing(flags, arguments), filled
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -118,23 +119,16 @@ class Parts:
     buffer: Buffer = None
 
 
-def sum_launch(
-    flags: frozenset[str], particles: int, parts: Parts, order: Buffer, sums: dict[str, object], log_p: Buffer,
-    temperature: float, per_scan: int,
-) -> Launch:  # fmt: skip
+def sum_launch(flags: frozenset[str], particles: int, parts: Parts, **arguments: Any) -> Launch:
     """Return the launch that sums the parts of each particle.
 
     Args:
         flags: Flags of its code.
         particles: Particles of the launch.
         parts: Their numbers.
-        order: Order of the particles.
-        sums: Constant terms and counts of the scans; see ``Readings.sums``.
-        log_p: The buffer for the sums.
-        temperature: Multiplies them.
-        per_scan: Particles of each scan.
+        **arguments: The other arguments of ``sum_parts``.
     """
     return launch(
-        "sum_parts", flags, (particles,), parts=parts.buffer, order=order, **sums, log_p=log_p, particles=particles,
-        count=parts.count, block=parts.block, across=1, along=particles, temperature=temperature, per_scan=per_scan,
+        "sum_parts", flags, (particles,), parts=parts.buffer, particles=particles, count=parts.count,
+        block=parts.block, **arguments,
     )  # fmt: skip

@@ -6,30 +6,27 @@
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global const int *start, global const real *fixed_of,
-                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
-                        const int rays, const int readings, const int kinds, const int cone_rays, const real critical,
-                        const int bins, const real slack, const real tolerance, const int cells, const real per_metre,
-                        const real limit, const real resolution, const real range_max, const real fixed,
-                        const real temperature, const int per_scan, const int ahead) {
+                        global const real *sensor, global const int *start, global const real *constant_terms,
+                        global real *log_p, global real *parts, const Window window, const int particles,
+                        const int rays, const int readings, const MixtureTables tables, const Cone cone,
+                        const Caster caster, const RangeScale scale, const Score score, const ScanBatch batch) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS
-    const int scan = (n + ahead) / per_scan, size = start[scan + 1] - start[scan];
-    const real constant_term = fixed_of[scan];
+    const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
+    const real constant_term = constant_terms[scan];
     ray += start[scan];
     reading += start[scan];
 #else
     const int size = readings;
-    const real constant_term = fixed;
+    const real constant_term = score.constant_term;
 #endif
     real2 total = (real2)(constant_term, 0);
     real values[LANES];
     for (int k = 0; k < size; k += LANES) {
         lanes x, y;
         load_ray_lanes(ray, k, size, &x, &y);
-        const lanes expected = expected_range_lanes(map_table, rows, cols, pose_cell[n], pose[n], x, y, limit,
-                                                    resolution, range_max);
+        const lanes expected = expected_range_lanes(map_table, window, pose_cell[n], pose[n], x, y, scale);
         const int count = min(size - k, LANES);
         lanes z;
         if (count == LANES) {
@@ -50,5 +47,5 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
         }
         total = add_strands(total, ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi);
     }
-    log_p[n] = temperature * (total.x + total.y);
+    log_p[n] = score.temperature * (total.x + total.y);
 }

@@ -23,9 +23,9 @@ typedef struct {
 // Return log p of one beam. Both cells of the ring hold the same value, so the four cells are neighbours even beyond an
 // edge.
 lanes log_field_lanes(global const real *table, const Particles *particle, const real2 point, const real2 point_low,
-                      global const real *terms, const int rows, const int cols) {
+                      global const real *terms, const Window window) {
     const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
-    const int stride = cols + 2 * FIELD_RING;
+    const int stride = window.cols + 2 * FIELD_RING;
     lanes rest_x, rest_y, to_next_x, to_next_y;
     const LanePair x = careful_offset_lanes(particle->x, particle->x_low, particle->cos, particle->cos_low, p,
                                             particle->sin, particle->sin_low, q, -1);
@@ -34,7 +34,7 @@ lanes log_field_lanes(global const real *table, const Particles *particle, const
                                             particle->cos, particle->cos_low, q, 1);
     const ilanes to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
     const ilanes c = within_lanes(particle->col + to_col, stride - 2);
-    const ilanes r = within_lanes(particle->row + to_row, rows + 2 * FIELD_RING - 2);
+    const ilanes r = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 2);
     const ilanes index = r * stride + c;
     const int *at = (const int *)&index;
     global const real *right = table + 1, *above = table + stride, *opposite = above + 1;
@@ -57,8 +57,8 @@ typedef struct {
 __attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, const int first, const int count,
                                             global const int2 *pose_cell, global const real4 *pose,
                                             global const real4 *pose_low, global const real2 *point,
-                                            global const real2 *point_low, const int size, const int rows,
-                                            const int cols, const real guard) {
+                                            global const real2 *point_low, const int size, const Window window,
+                                            const real guard) {
     for (int k = 0; k < size; ++k) {
         if (!any_lane(ends->off[k] > as_int(most[k]))) continue;
         int *cell = (int *)&ends->cell[k], *off = (int *)&ends->off[k];
@@ -66,7 +66,7 @@ __attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, c
             if (off[i] <= as_int(most[k])) continue;
             const int n = first + i;
             const EndPoint end = end_point(pose[n], pose_low[n], point[k], point_low[k], 0, guard);
-            cell[i] = field_cell(pose_cell[n].x + end.cell.x, pose_cell[n].y + end.cell.y, rows, cols);
+            cell[i] = field_cell(pose_cell[n].x + end.cell.x, pose_cell[n].y + end.cell.y, window);
         }
     }
 }
@@ -75,26 +75,25 @@ __attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, c
 // Score scans: one work-item takes VECTORS * LANES particles, and the beams block by block.
 kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                        global const real *terms, global const int *start, global const real *fixed_of,
-                        global real *log_p, global real *parts, const int rows, const int cols, const int particles,
-                        const int readings, const real guard, const real fixed, const real temperature,
-                        const int per_scan, const int ahead) {
+                        global const real *terms, global const int *start, global const real *constant_terms,
+                        global real *log_p, global real *parts, const Window window, const int particles,
+                        const int readings, const real guard, const Score score, const ScanBatch batch) {
     const int item = get_global_id(0);
 #if SCANS
     // No work-item has particles of two scans.
-    const int items = (per_scan + VECTORS * LANES - 1) / (VECTORS * LANES) * VECTORS, scan = item / items;
-    const int begin = scan * per_scan + LANES * (item % items), left = (scan + 1) * per_scan - begin;
+    const int items = (batch.per_scan + VECTORS * LANES - 1) / (VECTORS * LANES) * VECTORS, scan = item / items;
+    const int begin = scan * batch.per_scan + LANES * (item % items), left = (scan + 1) * batch.per_scan - begin;
     if (item % VECTORS != 0 || left <= 0 || begin >= particles) return;
     const int all_readings = start[scan + 1] - start[scan];
-    const real constant_term = fixed_of[scan];
+    const real constant_term = constant_terms[scan];
     point += start[scan];
     point_low += start[scan];
 #else
     const int begin = LANES * item, left = particles - begin, all_readings = readings;
-    const real constant_term = fixed;
+    const real constant_term = score.constant_term;
     if (item % VECTORS != 0 || left <= 0) return;
 #endif
-    const int stride = cols + 2 * FIELD_RING, count = left < VECTORS * LANES ? left : VECTORS * LANES;
+    const int stride = window.cols + 2 * FIELD_RING, count = left < VECTORS * LANES ? left : VECTORS * LANES;
     Particles all[VECTORS];
     lanes total[VECTORS], total_low[VECTORS];
     for (int v = 0; v * LANES < count; ++v) {
@@ -157,20 +156,19 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
                 const ilanes off_y = size_bits(at_y - (near_y - ROUND_INT));
                 const ilanes off = off_x > off_y ? off_x : off_y;
                 const ilanes c = within_lanes(as_ilanes(near_x) - ROUND_BITS + col, stride - 1);
-                const ilanes r = within_lanes(as_ilanes(near_y) - ROUND_BITS + row, rows + 2 * FIELD_RING - 1);
+                const ilanes r = within_lanes(as_ilanes(near_y) - ROUND_BITS + row, window.rows + 2 * FIELD_RING - 1);
                 ends.cell[k] = r * stride + c;
                 ends.off[k] = off;
                 worst = worst > off ? worst : off;
             }
             if (any_lane(worst > as_int(least)))
                 refine_cells(&ends, most, first, used, pose_cell, pose, pose_low, point + from, point_low + from, size,
-                             rows, cols, guard);
+                             window, guard);
 #pragma unroll 4
 #endif
             for (int k = 0; k < size; ++k) {
 #if BILINEAR
-                const lanes term = log_field_lanes(table, &all[v], point[from + k], point_low[from + k], terms, rows,
-                                                   cols);
+                const lanes term = log_field_lanes(table, &all[v], point[from + k], point_low[from + k], terms, window);
 #else
                 const int *at = (const int *)&ends.cell[k];
                 const lanes term = GATHER_AT(lanes, table, at);
@@ -188,6 +186,6 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
     }
     for (int i = 0; i < count; ++i) {
         const real high = ((const real *)total)[i];
-        log_p[begin + i] = isinf(high) ? high : temperature * (high + ((const real *)total_low)[i]);
+        log_p[begin + i] = isinf(high) ? high : score.temperature * (high + ((const real *)total_low)[i]);
     }
 }

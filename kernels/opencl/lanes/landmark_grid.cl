@@ -64,40 +64,40 @@ void search_buckets_lanes(global const real4 *landmark, global const int *start,
 }
 
 // Return the first and last column, and the first and last row, of the buckets that discs touch.
-int4 touched_buckets(const real2 x, const real2 y, const float radius, const int rows, const int cols,
-                     const float size) {
-    return (int4)(bucket_at(x.x - radius, size, cols), bucket_at(x.y + radius, size, cols),
-                  bucket_at(y.x - radius, size, rows), bucket_at(y.y + radius, size, rows));
+int4 touched_buckets(const real2 x, const real2 y, const float radius, const Buckets buckets) {
+    const int left = bucket_at(x.x - radius, buckets.size, buckets.cols);
+    const int right = bucket_at(x.y + radius, buckets.size, buckets.cols);
+    const int low = bucket_at(y.x - radius, buckets.size, buckets.rows);
+    return (int4)(left, right, low, bucket_at(y.y + radius, buckets.size, buckets.rows));
 }
 
 // Return the log densities of the likeliest landmarks. Where the discs of all particles touch few more buckets together
 // than each disc alone, the particles search together, else one after the other. A lane has the same bits in both
 // cases.
 lanes search_lanes(global const real4 *landmark, global const int *start, const LanePlace place, const LanePlace turned,
-                   global const real *feature, global const real *terms, const int rows, const int cols,
-                   const real size) {
+                   global const real *feature, global const real *terms, const Buckets buckets) {
     const real radius = feature[RADIUS];
     lanes best = -INFINITY;
     if (radius < 0) return best;
     const lanes end_x = place.x.hi + feature[REACH] * turned.x.hi, end_y = place.y.hi + feature[REACH] * turned.y.hi;
     const real2 x = ends_of_lanes(end_x), y = ends_of_lanes(end_y);
-    const int4 all = touched_buckets(x, y, radius, rows, cols, size);
-    const int across = min((int)(2 * fmin(radius, size * cols) / size) + 2, cols);
-    const int up = min((int)(2 * fmin(radius, size * rows) / size) + 2, rows);
+    const int4 all = touched_buckets(x, y, radius, buckets);
+    const int across = min((int)(2 * fmin(radius, buckets.size * buckets.cols) / buckets.size) + 2, buckets.cols);
+    const int up = min((int)(2 * fmin(radius, buckets.size * buckets.rows) / buckets.size) + 2, buckets.rows);
     const lanes most = radius * radius;
     if ((long)(all.y - all.x + 1) * (all.w - all.z + 1) <= TOGETHER * (long)across * up) {
-        search_buckets_lanes(landmark, start, all, cols, 0.5f * (x.x + x.y), 0.5f * (y.x + y.y), place, turned, end_x,
-                             end_y, feature, terms, most, &best);
+        search_buckets_lanes(landmark, start, all, buckets.cols, 0.5f * (x.x + x.y), 0.5f * (y.x + y.y), place, turned,
+                             end_x, end_y, feature, terms, most, &best);
         return best;
     }
     real each_x[LANES], each_y[LANES];
     store_lanes(end_x, 0, each_x);
     store_lanes(end_y, 0, each_y);
     for (int i = 0; i < LANES; ++i) {
-        const int4 touched = touched_buckets((real2)each_x[i], (real2)each_y[i], radius, rows, cols, size);
+        const int4 touched = touched_buckets((real2)each_x[i], (real2)each_y[i], radius, buckets);
         const ilanes active = (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) == i;
         // No squared distance is negative, so the other lanes find nothing.
-        search_buckets_lanes(landmark, start, touched, cols, each_x[i], each_y[i], place, turned, end_x, end_y,
+        search_buckets_lanes(landmark, start, touched, buckets.cols, each_x[i], each_y[i], place, turned, end_x, end_y,
                              feature, terms, active ? most : (lanes)-1, &best);
     }
     return best;

@@ -7,21 +7,20 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
                            global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
                            global const real *feature, global const int *partner, global const real *terms,
                            global const real2 *arcs, global real *log_p, global real *parts, global int *which,
-                           const int rows, const int cols, const int landmarks, const int particles,
-                           const int features, const real size, const real share, const real fixed,
-                           const real temperature) {
+                           const Buckets buckets, const int landmarks, const int particles, const int features,
+                           const real share, const Score score) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;
     real p[8][LANES];
     for (int i = 0; i < LANES; ++i) {
         const int n = min(first_particle + i, particles - 1);
-        const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, size);
+        const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);
         p[0][i] = place.x, p[1][i] = place.y, p[2][i] = place.z, p[3][i] = place.w;
         p[4][i] = high.z, p[5][i] = low.z, p[6][i] = high.w, p[7][i] = low.w;
     }
     const LanePlace place = {{load_lanes(0, p[0]), load_lanes(0, p[1])}, {load_lanes(0, p[2]), load_lanes(0, p[3])}};
     const LanePlace heading = {{load_lanes(0, p[4]), load_lanes(0, p[5])}, {load_lanes(0, p[6]), load_lanes(0, p[7])}};
-    LanePair total = {(lanes)fixed, (lanes)0};
+    LanePair total = {(lanes)score.constant_term, (lanes)0};
     ilanes impossible = 0;
     for (int first = 0; first < features; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, features);
@@ -33,7 +32,7 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
             const lanes detected = log_detection_lanes(offset_lanes(landmark[partner[k]], place), turned, numbers,
                                                        terms);
 #else
-            const lanes detected = search_lanes(landmark, start, place, turned, numbers, terms, rows, cols, size);
+            const lanes detected = search_lanes(landmark, start, place, turned, numbers, terms, buckets);
 #endif
             const lanes value = either_lanes(detected, numbers[FALSE_POSITIVE]);
             const ilanes zero = !(value > -INFINITY);
@@ -43,7 +42,7 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
         const LanePair sum = two_sum_lanes(total.hi, block);
         total = (LanePair){sum.hi, total.lo + sum.lo};
     }
-    const lanes all = impossible ? (lanes)-INFINITY : temperature * (total.hi + total.lo);
+    const lanes all = impossible ? (lanes)-INFINITY : score.temperature * (total.hi + total.lo);
     if (first_particle + LANES <= particles) {
         store_lanes(all, 0, log_p + first_particle);
     } else {

@@ -3,7 +3,7 @@
 
 // Return the distances in cells to the first occupied cell along LANES rays of one pose inside the grid. A lane that
 // has ended reads the first cell of the table's ring, which is 0.
-lanes cast_ray_lanes(global const entry *map_table, const int rows, const int cols, const int2 cell, const real4 pose,
+lanes cast_ray_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
                      const lanes ray_x, const lanes ray_y, const real limit) {
     lanes dx = pose.z * ray_x - pose.w * ray_y, dy = pose.w * ray_x + pose.z * ray_y;
     dx = fabs(dx) < TINY ? (lanes)0 : dx;
@@ -12,7 +12,7 @@ lanes cast_ray_lanes(global const entry *map_table, const int rows, const int co
     const lanes speed_x = fabs(dx), speed_y = fabs(dy), inv_x = 1 / speed_x, inv_y = 1 / speed_y;
     const lanes a_x = right ? (lanes)(1 - pose.x) : (lanes)pose.x;
     const lanes a_y = up ? (lanes)(1 - pose.y) : (lanes)pose.y;
-    const int size = (rows + 2) * (cols + 2);
+    const int size = (window.rows + 2) * (window.cols + 2);
     ilanes plane = (right ? (ilanes)0 : (ilanes)SECTORS) + (up ? (ilanes)0 : (ilanes)(2 * SECTORS));
 #if SECTORS_2
     plane = speed_y > speed_x ? plane + 1 : plane;
@@ -21,8 +21,9 @@ lanes cast_ray_lanes(global const entry *map_table, const int rows, const int co
     plane = speed_y > speed_x ? plane + 2 : plane;
     plane = speed_y > (speed_y > speed_x ? (lanes)2.4142136f : (lanes)0.41421356f) * speed_x ? plane + 1 : plane;
 #endif
-    const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)(cols + 2) : (ilanes)(-cols - 2);
-    const ilanes origin = plane * size + padded(cell.y, cell.x, cols);
+    const int stride = window.cols + 2;
+    const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)stride : (ilanes)-stride;
+    const ilanes origin = plane * size + padded(cell.y, cell.x, window.cols);
     lanes k_x = COUNT, k_y = COUNT, t = 0, nearest = limit;
     ilanes going = -1;
     for (;;) {
@@ -74,21 +75,20 @@ void load_ray_lanes(global const real2 *ray, const int first, const int rays, la
 }
 
 // Return the expected ranges of LANES rays in metres, of origins outside the grid as well.
-lanes expected_range_lanes(global const entry *map_table, const int rows, const int cols, const int2 cell,
-                           const real4 pose, const lanes ray_x, const lanes ray_y, const real limit,
-                           const real resolution, const real range_max) {
+lanes expected_range_lanes(global const entry *map_table, const Window window, const int2 cell, const real4 pose,
+                           const lanes ray_x, const lanes ray_y, const RangeScale scale) {
     lanes t;
 #if ORIGINS_OUTSIDE
-    if (off_grid(cell.x, cell.y, rows, cols)) {
+    if (off_grid(cell.x, cell.y, window.rows, window.cols)) {
         float x[LANES], y[LANES], one[LANES];
         store_lanes(ray_x, 0, x);
         store_lanes(ray_y, 0, y);
         for (int i = 0; i < LANES; ++i)
-            one[i] = cast_ray(map_table, rows, cols, cell, pose, (real2)(x[i], y[i]), limit, 0, 0, 0);
+            one[i] = cast_ray(map_table, window, cell, pose, (real2)(x[i], y[i]), scale.limit, (Caster){0, 0, 0});
         t = load_lanes(0, one);
     } else
 #endif
-        t = cast_ray_lanes(map_table, rows, cols, cell, pose, ray_x, ray_y, limit);
-    const lanes range = t * resolution;
-    return t >= limit || range > range_max ? (lanes)range_max : range;
+        t = cast_ray_lanes(map_table, window, cell, pose, ray_x, ray_y, scale.limit);
+    const lanes range = t * scale.resolution;
+    return t >= scale.limit || range > scale.range_max ? (lanes)scale.range_max : range;
 }

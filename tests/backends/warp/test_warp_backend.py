@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from gpusense.backends import Backend, get_backend
+from gpusense.interface.structs import ScanBatch, Score, Window
 
 
 @pytest.fixture
@@ -154,12 +155,12 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     assert isinstance(launch, _warp_pieces.SharedLaunch)
     nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)
     inputs = [backend.upload(array) for array in (*arrays, *nowhere)]
-    scalars = (rows, cols, particles, readings, 1e-4, 0.25, 0.5, 1, 0)
+    scalars = (readings, 1e-4, Score(0.25, 0.5), ScanBatch(1, 0))
     real = np.dtype(np.float32)
 
     def run(target: Callable[..., None], count: int = particles) -> tuple[np.ndarray, np.ndarray]:
         log_p, parts = backend.empty(particles, real, zero=True), backend.empty(particles * readings, real, zero=True)
-        target((count,), *inputs, log_p, parts, rows, cols, count, *scalars[3:])
+        target((count,), *inputs, log_p, parts, Window(0, 0, rows, cols), count, *scalars)
         found = np.empty(particles, real), np.empty((particles, readings), real)
         return backend.download(log_p, found[0]), backend.download(parts, found[1])
 

@@ -1,0 +1,160 @@
+"""Structs: numbers that travel together from the host to kernels, declared once for all languages.
+
+A field is an ``int``, a ``real`` of the model's precision or a ``double``. OpenCL's declarations are written from the
+annotations, Warp's structs are made from them, and the NumPy reference takes the tuples themselves.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+real: TypeAlias = float
+double: TypeAlias = float
+
+_INT, _DOUBLE = np.dtype(np.int32), np.dtype(np.float64)
+
+
+class Window(NamedTuple):
+    """A part of a grid: its first row and column, and its size."""
+
+    row: int
+    col: int
+    rows: int
+    cols: int
+
+
+class Frame(NamedTuple):
+    """A grid's frame in the world, and the scanner's place on the robot [m]; yaw is that of the grid."""
+
+    origin_x: double
+    origin_y: double
+    resolution: double
+    mount_x: double
+    mount_y: double
+    yaw_cos: double
+    yaw_sin: double
+
+
+class Caster(NamedTuple):
+    """The knobs of casters; each reads its own."""
+
+    bins: int
+    slack: real
+    tolerance: real
+
+
+class RangeScale(NamedTuple):
+    """Longest distance that is looked for [cells], size of a cell and largest range [m]."""
+
+    limit: real
+    resolution: real
+    range_max: real
+
+
+class Cone(NamedTuple):
+    """Rays of a sensor's cone, and the least cosine of an angle of incidence that returns."""
+
+    rays: int
+    critical: real
+
+
+class MixtureTables(NamedTuple):
+    """Bins of the angle of incidence, each with terms of its own, and the cells of a table of log densities."""
+
+    incidence_bins: int
+    cells: int
+    per_metre: real
+
+
+class Score(NamedTuple):
+    """log p = temperature * (constant_term + the sum over readings)."""
+
+    constant_term: real
+    temperature: real
+
+
+class ScanBatch(NamedTuple):
+    """Particles of each scan, and those of earlier launches."""
+
+    per_scan: int
+    ahead: int
+
+
+class ReadingRules(NamedTuple):
+    """Rules by which readings on the device are selected and placed; see the kernel file ``scan``."""
+
+    nearest: double
+    farthest: double
+    log_max: double
+    top: double
+    guard_scale: double
+    beams: int
+    each: int
+    places: int
+    chosen: int
+    max_readings: int
+    possible: int
+
+
+class Buckets(NamedTuple):
+    """Square buckets of landmarks: their rows and columns, and the length of a side [m]."""
+
+    rows: int
+    cols: int
+    size: real
+
+
+class SensorView(NamedTuple):
+    """Field of view of a landmark sensor, and the log probability that a landmark in it is missed."""
+
+    range_max: real
+    axis_cosine: real
+    axis_sine: real
+    least: real
+    log_missed: real
+
+
+STRUCTS: dict[str, type[tuple[Any, ...]]] = {
+    struct.__name__: struct
+    for struct in (
+        Window, Frame, Caster, RangeScale, Cone, MixtureTables, Score, ScanBatch, ReadingRules, Buckets, SensorView,
+    )
+}  # fmt: skip
+
+
+def fields(struct: str) -> dict[str, str]:
+    """Return the types of a struct's fields, ``int``, ``real`` or ``double``, by name."""
+    # NamedTuple makes forward references of annotations that are strings.
+    kinds = STRUCTS[struct].__annotations__.items()
+    return {name: str(getattr(kind, "__forward_arg__", kind)) for name, kind in kinds}
+
+
+@functools.cache
+def dtypes(struct: str, precision: np.dtype) -> tuple[np.dtype, ...]:
+    """Return the NumPy types of a struct's fields in a precision."""
+    known: dict[str, np.dtype] = {"int": _INT, "real": precision, "double": _DOUBLE}
+    return tuple([known[kind] for kind in fields(struct).values()])
+
+
+def rounded(value: tuple[Any, ...], struct: str, precision: np.dtype) -> tuple[Any, ...]:
+    """Return a struct with real numbers in a precision, as kernels see them."""
+    made: type[Any] = STRUCTS[struct]
+    pairs = zip(value, dtypes(struct, precision), strict=True)
+    return made(*(int(number) if kind == _INT else kind.type(number) for number, kind in pairs))
+
+
+def declaration(struct: str) -> str:
+    """Return a struct's declaration in OpenCL C, in one line."""
+    members = " ".join(f"{kind} {name};" for name, kind in fields(struct).items())
+    return f"typedef struct {{ {members} }} {struct};\n"
+
+
+@functools.cache
+def layout(struct: str, precision: np.dtype) -> str:
+    """Return the format of ``struct.pack`` for a struct as C compilers lay it out: aligned, and padded at the end."""
+    types = dtypes(struct, precision)
+    widest = max(types, key=lambda kind: kind.itemsize)
+    return "@" + "".join(kind.char for kind in types) + f"0{widest.char}"

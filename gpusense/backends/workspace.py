@@ -33,14 +33,12 @@ class KeptProgram:
         self._launches = [(one.without(names), one.places(names)) for one in program]
 
     def run(self, backend: Backend, changing: dict[str, Any]) -> None:
-        """Run the program with the arguments of a call."""
-        launches = []
+        """Run the program with the arguments of a call; a launch does not wait for the arguments of the next."""
         for one, places in self._launches:
             arguments = list(one.arguments)
             for place, name in places:
                 arguments[place] = changing[name]
-            launches.append(one._replace(arguments=tuple(arguments)))
-        backend.run(tuple(launches))
+            backend.compile(one.kernel, one.flags)(one.size, *arguments)
 
 
 class KeptRecording(KeptProgram):

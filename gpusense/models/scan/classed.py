@@ -18,22 +18,44 @@ from gpusense.world.scanner import Scanner
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Readings of a scan that are not evaluated at every pose.
+    """Readings of a scan that are not evaluated at every pose; they are counted when asked for.
 
     Attributes:
-        missing: Missing readings.
-        ignored_max: Max readings without information because z_max = 0.
-        constant_max: (C,) positions of the max readings in the constant term.
-        thinned: Informative readings left out by ``beams=``.
+        hit: (K,) whether each reading is a range.
+        far: Whether it is a max reading.
+        used: Whether it is a range that is used.
+        used_max: Whether it is a max reading that is used.
+        constant: Whether it is part of the constant term.
+        informs: Whether max readings have information: z_max > 0.
     """
 
-    missing: int
-    ignored_max: int
-    constant_max: np.ndarray
-    thinned: int
+    hit: np.ndarray
+    far: np.ndarray
+    used: np.ndarray
+    used_max: np.ndarray
+    constant: np.ndarray
+    informs: bool
 
+    @property
+    def missing(self) -> int:
+        """Number of missing readings."""
+        return int(np.count_nonzero(~(self.hit | self.far)))
 
-_NOTHING = LeftOut(0, 0, np.zeros(0, np.intp), 0)
+    @property
+    def ignored_max(self) -> int:
+        """Number of max readings without information because z_max = 0."""
+        return 0 if self.informs else int(np.count_nonzero(self.far))
+
+    @property
+    def constant_max(self) -> np.ndarray:
+        """(C,) positions of the max readings in the constant term."""
+        return self.constant.nonzero()[0]
+
+    @property
+    def thinned(self) -> int:
+        """Number of informative readings left out by ``beams=``."""
+        informative = self.hit | self.far if self.informs else self.hit
+        return int(np.count_nonzero(informative & ~(self.used | self.used_max)))
 
 
 @dataclass(frozen=True)
@@ -72,15 +94,15 @@ class ClassedScans:
         """Whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
 
-    @functools.cached_property
+    @property
     def most_readings(self) -> int:
         """Readings of the scan that has most."""
-        return int(np.maximum.reduce(self.counts))
+        return max(self.counts.tolist())
 
-    @functools.cached_property
+    @property
     def most_rays(self) -> int:
         """Rays of the scan that has most."""
-        return self.most_readings if self.ray_counts is self.counts else int(np.maximum.reduce(self.ray_counts))
+        return max(self.ray_counts.tolist())
 
     def part(self, begin: int, end: int) -> ClassedScans:
         """Return scans ``begin`` to ``end`` - 1."""
@@ -143,32 +165,21 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     else:
         evaluated, constant = used | used_max | (not rules.specialize), np.zeros_like(far)
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
-    columns, counts = evaluated.nonzero()[1], np.add.reduce(evaluated, axis=1)
-    if len(columns) < ranges.size or not rules.specialize:
-        # Adding 0 makes 0 of -0, the product without max readings.
-        constants = np.add.reduce(constant, axis=1) * rules.log_max + 0.0
+    rows, columns = evaluated.nonzero()
+    counts = np.bincount(rows, minlength=len(ranges))
+    # Adding 0 makes 0 of -0, the product without max readings.
+    constants = np.bincount(constant.nonzero()[0], minlength=len(ranges)) * rules.log_max + 0.0
+    if len(columns) < ranges.size:
         values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
-        left_out = _left_out(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules)
     else:
         # Scans without gaps need no selection.
-        constants, values, left_out = np.zeros(len(ranges)), ranges.reshape(-1).astype(np.float64), _NOTHING
+        values = ranges.reshape(-1).astype(np.float64)
         vectors = rules.vectors if len(ranges) == 1 else rules.vectors[columns]
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
-        left_out,
+        LeftOut(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),
     )  # fmt: skip
     return scans if rules.separate else _join([_grouped(scans.part(i, i + 1)) for i in range(scans.scans)])
-
-
-def _left_out(
-    hit: np.ndarray, far: np.ndarray, used: np.ndarray, used_max: np.ndarray, constant: np.ndarray, rules: Rules
-) -> LeftOut:
-    """Return the readings of a scan that are not evaluated, from whether each is of a class and used."""
-    hits, maxima, kept, kept_max = (int(np.count_nonzero(each)) for each in (hit, far, used, used_max))
-    ignored = 0 if rules.z_max > 0 else maxima
-    return LeftOut(
-        len(hit) - hits - maxima, ignored, constant.nonzero()[0], hits + maxima - ignored - kept - kept_max
-    )  # fmt: skip
 
 
 def _grouped(scan: ClassedScans) -> ClassedScans:

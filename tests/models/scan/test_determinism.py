@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.full_device import full_device
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -145,6 +144,9 @@ def test_any_order(call):
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_after_running_out_of_memory(kind, precision, backend):
     """Pieces are halved until they fit; a piece of 256 particles must."""
+    # This file also runs as a script, without the helpers.
+    from support.full_device import full_device
+
     owner, call = shared(kind, precision, backend)
     poses = cloud(3000)
     whole, device, most = call(poses), get_backend(backend), 256 * len(BEARINGS) + 1

@@ -247,5 +247,5 @@ def test_groups_of_scans():
     """Rays and readings of each scan: none, as many, or fewer rays."""
     rays, counts = np.array([5, 4, 9, 0, 0, 3, 3, 3, 2, 2, 0]), np.array([5, 4, 9, 0, 0, 3, 3, 3, 7, 4, 0])
     whole = np.zeros(counts.sum())
-    scans = ClassedScans(whole, whole, whole, whole, whole, rays, counts, whole, LeftOut(0, 0, whole, 0))
+    scans = ClassedScans(whole, whole, whole, whole, whole, rays, counts, whole, LeftOut(*[whole > 0] * 5, False))
     assert [*scans.groups()] == [(0, 3), (3, 4), (4, 5), (5, 8), (8, 10), (10, 11)]

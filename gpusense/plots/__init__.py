@@ -3,15 +3,13 @@
 from gpusense.plots.drawing import (
     add_colour_bar,
     draw_map,
-    draw_particles,
     draw_pose,
-    draw_pose_density,
     draw_scan,
     new_figure,
-    pose_lattice,
     save,
 )
 from gpusense.plots.localization import localization_figure
+from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
 from gpusense.plots.positions import (
     draw_beacons,
     draw_fix,

@@ -1,4 +1,4 @@
-"""Draw maps, scans, particles and densities over poses, each onto a Matplotlib ``Axes``.
+"""Draw maps, scans and poses, each onto a Matplotlib ``Axes``.
 
 Matplotlib is imported on first use. ``pyplot`` and its global state are never touched: make a figure with
 :func:`new_figure`, draw, and write it with :func:`save`.
@@ -20,7 +20,6 @@ from gpusense.world.scanner import Reading, Scanner, classify
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.collections import PathCollection
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
@@ -168,105 +167,6 @@ def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
     bar.outline.set_edgecolor(FRAME)
 
 
-def draw_particles(
-    ax: Axes, poses: ArrayLike, log_p: ArrayLike, *, size: float = 3.0, depth: float | None = None
-) -> PathCollection:
-    """Draw particles coloured by their log-likelihood, the likeliest on top.
-
-    Args:
-        ax: Axes to draw onto.
-        poses: (N, 3) x, y and theta in the world [m, m, rad].
-        log_p: (N,) log-likelihoods, natural logarithm; -inf has the colour of the scale's low end.
-        size: Area of a particle [points squared].
-        depth: Extent of the colour scale below the best value [nats]; by default half of the particles lie on it.
-
-    Returns:
-        The collection, for :func:`add_colour_bar`.
-
-    Example:
-        >>> import gpusense as gs
-        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
-        >>> poses = [(0.0, 0.0, 0.0), (1.0, 2.0, 0.5)]
-        >>> gs.plots.draw_particles(ax, poses, [-3.0, -1.0]).get_offsets().tolist()
-        [[0.0, 0.0], [1.0, 2.0]]
-    """
-    position = checks.array("poses", poses, ("N", 3))[:, :2]
-    value = checks.array("log_p", log_p, (len(position),), finite=False)
-    low, high = _scale(value, depth)
-    order = np.argsort(value, kind="stable")
-    return ax.scatter(
-        position[order, 0], position[order, 1], s=size, c=np.maximum(value[order], low), cmap=_colours(), vmin=low,
-        vmax=high, linewidths=0, rasterized=True, zorder=3,
-    )  # fmt: skip
-
-
-def pose_lattice(
-    grid: OccupancyGrid, spacing: float, theta: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool], tuple[float, float]]:
-    """Make a lattice of poses with one heading over a map, along the grid's axes.
-
-    Args:
-        grid: The map.
-        spacing: Distance between neighbours [m], > 0; it is rounded to whole cells.
-        theta: The heading of all poses in the world [rad].
-
-    Returns:
-        (R C, 3) poses row by row, (R, C) whether the pose's tile has a free cell, and the lattice's extent (W, H)
-        along the grid's axes [m], for :func:`draw_pose_density`. A pose lies in the free cell nearest to the middle of
-        its tile.
-
-    Raises:
-        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
-
-    Example:
-        >>> import gpusense as gs
-        >>> poses, free, extent = gs.plots.pose_lattice(gs.worlds.building(), 0.5, theta=0.0)
-        >>> poses.shape, free.shape, extent
-        ((2400, 3), (40, 60), (30.0, 20.0))
-    """
-    step = max(round(checks.real("spacing", spacing, above=0) / grid.resolution), 1)
-    rows, cols = (-(-count // step) for count in grid.shape)
-    padded = np.zeros((rows * step, cols * step), bool)
-    padded[: grid.shape[0], : grid.shape[1]] = grid.free
-    tiles = padded.reshape(rows, step, cols, step).swapaxes(1, 2).reshape(rows, cols, step * step)
-    within = np.stack(np.divmod(np.arange(step * step), step))
-    order = np.argsort(((within - (step - 1) / 2) ** 2).sum(axis=0), kind="stable")
-    chosen = within[:, order[tiles[:, :, order].argmax(axis=2)]]
-    row, col = (np.indices((rows, cols)) * step + chosen).reshape(2, -1)
-    poses = np.column_stack([grid.cell_centers(row, col), np.full(rows * cols, checks.real("theta", theta))])
-    extent = (cols * step * grid.resolution, rows * step * grid.resolution)
-    free: NDArray[np.bool] = tiles.max(axis=2)
-    return poses, free, extent
-
-
-def draw_pose_density(
-    ax: Axes, grid: OccupancyGrid, log_p: ArrayLike, extent: tuple[float, float], *, depth: float | None = None
-) -> AxesImage:
-    """Draw P(z | x, m) over a lattice of poses with one heading, as log-likelihood below the best.
-
-    Args:
-        ax: Axes to draw onto, usually those of :func:`draw_map`.
-        grid: The map, whose frame the lattice has.
-        log_p: (R, C) log-likelihoods from the grid's first row and column on, natural logarithm; NaN is left blank.
-        extent: (W, H) of the lattice along the grid's axes [m], as :func:`pose_lattice` returns it.
-        depth: Extent of the colour scale below the best value [nats]; by default half of the values lie on it.
-
-    Returns:
-        The image, for :func:`add_colour_bar`.
-
-    Example:
-        >>> import gpusense as gs
-        >>> import numpy as np
-        >>> ax, grid = gs.plots.new_figure(6.0, 4.0).subplots(), gs.worlds.building()
-        >>> _, free, extent = gs.plots.pose_lattice(grid, 0.5, theta=0.0)
-        >>> image = gs.plots.draw_pose_density(ax, grid, np.where(free, -1.0, np.nan), extent)
-    """
-    value = checks.array("log_p", log_p, ("R", "C"), finite=False)
-    low, high = _scale(value[~np.isnan(value)], depth)
-    below = np.maximum(value, low) - high
-    return _over_grid(ax, grid, below, extent, cmap=_colours(), vmin=low - high, vmax=0.0, zorder=1)
-
-
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure atomically, in the format of the path's ending.
 
@@ -290,16 +190,6 @@ def _colours() -> Colormap:
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("gpusense", SCALE)
-
-
-def _scale(value: NDArray[np.float64], depth: float | None) -> tuple[float, float]:
-    """Return the ends of a colour scale for log-likelihoods."""
-    finite = value[np.isfinite(value)]
-    if finite.size == 0:
-        return -1.0, 0.0
-    high = float(finite.max())
-    low = float(np.quantile(finite, 0.5)) if depth is None else high - checks.real("depth", depth, above=0)
-    return min(low, high - 1.0), high
 
 
 def _over_grid(

@@ -12,12 +12,11 @@ from gpusense.plots.drawing import (
     ROBOT,
     add_colour_bar,
     draw_map,
-    draw_particles,
     draw_pose,
-    draw_pose_density,
     draw_scan,
     new_figure,
 )
+from gpusense.plots.pose_densities import draw_particles, draw_pose_density
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 

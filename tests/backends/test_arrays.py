@@ -7,6 +7,7 @@ import types
 
 import numpy as np
 import pytest
+from support.array_calls import METHODS, result_call
 from support.array_libraries import CUDA, Array, OldArray, Recorded, installed
 
 import gpusense as gs
@@ -20,7 +21,6 @@ GRID = gs.OccupancyGrid(np.where(RNG.random((60, 70)) < 0.04, 100, 0).astype(np.
 SCANNER = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE)
 POSES = np.column_stack([RNG.uniform(0, 6, (COUNT, 2)), RNG.uniform(-4, 4, COUNT)])
 SCAN = RNG.uniform(0, 5.5, BEAMS)
-METHODS = ("log_likelihood", "field", "expected_ranges", "cast")
 
 
 @pytest.fixture(autouse=True)
@@ -30,13 +30,8 @@ def fakelib(monkeypatch):
 
 def call_of(method: str, backend, scan=SCAN):
     """Return the call that takes poses and ``out=``, and the shape of its result."""
-    if method == "cast":
-        caster = gs.RayCaster(GRID, RANGE, backend=backend)
-        return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options), (COUNT, BEAMS)
-    model = (gs.LikelihoodFieldModel if method == "field" else gs.BeamModel)(GRID, SCANNER, backend=backend)
-    if method == "expected_ranges":
-        return model.expected_ranges, (COUNT, BEAMS)
-    return lambda poses, **options: model.log_likelihood(poses, scan, **options), (COUNT,)
+    call, shape = result_call(method, backend, GRID, SCANNER, scan)
+    return call, (COUNT, *shape)
 
 
 # ---- in

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from support.array_calls import METHODS, result_call
 from support.array_libraries import Array, to_device
 from support.frameworks import each_framework, framework
 
@@ -21,18 +22,12 @@ GRID = gs.OccupancyGrid(np.where(RNG.random((60, 70)) < 0.04, 100, 0).astype(np.
 SCANNER = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, mount=(0.1, 0.0, 0.2))
 POSES = np.column_stack([RNG.uniform(-1, 7, (COUNT, 2)), RNG.uniform(-4, 4, COUNT)])
 SCAN = RNG.uniform(0, 5.5, BEAMS)
-METHODS = ("log_likelihood", "field", "expected_ranges", "cast")
 
 
 def call_of(method: str, backend, scan=SCAN):
     """Return the call that takes poses and ``out=``, and the shape of its result."""
-    if method == "cast":
-        caster = gs.RayCaster(GRID, RANGE, backend=backend)
-        return lambda poses, **options: caster.cast(poses, SCANNER.bearings, **options), (COUNT, BEAMS)
-    model = (gs.LikelihoodFieldModel if method == "field" else gs.BeamModel)(GRID, SCANNER, backend=backend)
-    if method == "expected_ranges":
-        return model.expected_ranges, (COUNT, BEAMS)
-    return lambda poses, **options: model.log_likelihood(poses, scan, **options), (COUNT,)
+    call, shape = result_call(method, backend, GRID, SCANNER, scan)
+    return call, (COUNT, *shape)
 
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])

@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from support.full_device import full_device
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -30,24 +31,16 @@ def room() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("model_type", [gs.BeamModel, gs.LikelihoodFieldModel])
-def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type, monkeypatch):
+def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type):
     grid, scanner, poses, ranges = room()
     model = model_type(grid, scanner, backend=backend)
     whole = model.log_likelihood(poses, ranges)
     device = get_backend(backend)
-    empty, asked = type(device).empty, []
     # Of 2000 particles; GPUs keep the 41 numbers of each of a beam model's 256 until they are summed.
     room_for = 11_000 if device.info.kind == "gpu" and model_type is gs.BeamModel else 2500
 
-    def short_of_memory(self, count, dtype, *, zero=False):
-        asked.append(count)
-        if count > room_for:
-            raise MemoryError("the device is full")
-        return empty(self, count, dtype, zero=zero)
-
     model._workspace.release()
-    with monkeypatch.context() as patch:
-        patch.setattr(type(device), "empty", short_of_memory)
+    with full_device(device, room_for) as asked:
         pieces = model.log_likelihood(poses, ranges)
         assert max(asked) > room_for
     np.testing.assert_array_equal(pieces, whole)

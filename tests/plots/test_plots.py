@@ -9,8 +9,9 @@ import pytest
 from matplotlib.colors import to_rgb
 
 import gpusense as gs
+from gpusense import plots
 from gpusense.evaluation import worlds
-from gpusense.plots import drawing as plots
+from gpusense.plots import drawing
 
 TURNED = (5e5, -3e5, 0.6)
 
@@ -41,7 +42,7 @@ def test_map_is_drawn_where_its_cells_are(origin):
     grid = lone_cell(origin)
     figure, ax = new_axes()
     plots.draw_map(ax, grid)
-    wanted = {(5, 22): plots.OCCUPIED, (14, 6): plots.UNKNOWN, (10, 15): plots.FREE, (14, 22): plots.FREE}
+    wanted = {(5, 22): drawing.OCCUPIED, (14, 6): drawing.UNKNOWN, (10, 15): drawing.FREE, (14, 22): drawing.FREE}
     for (row, col), colour in wanted.items():
         x, y = grid.cell_centers([row], [col])[0]
         assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(colour), abs=0.01), (row, col)
@@ -118,9 +119,9 @@ def test_density_is_drawn_where_its_poses_are():
     image = plots.draw_pose_density(ax, grid, log_p, extent, depth=40)
     assert image.get_clim() == (-40.0, 0.0)
     x, y = poses.reshape(*free.shape, 3)[2:4, 11:13, :2].mean(axis=(0, 1))
-    assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(plots.SCALE[-1]), abs=0.02)
+    assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(drawing.SCALE[-1]), abs=0.02)
     x, y = poses.reshape(*free.shape, 3)[6, 8, :2]
-    assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(plots.SCALE[0]), abs=0.02)
+    assert colour_at(figure, ax, x, y) == pytest.approx(to_rgb(drawing.SCALE[0]), abs=0.02)
 
 
 def test_colour_bar_says_what_it_shows():

@@ -18,6 +18,13 @@ def log_with(*lines: str, name: str = "run.log", **options: Any) -> Action:
 
 
 LOG = "{tmp}/input/run.log"
+
+
+def bad_lines(name: str, message: str, *lines: str, **options: Any) -> tuple[str, Action, type[Exception], str]:
+    """Return the case of a log of these lines that is refused with a message after the log's name."""
+    return name, log_with(*lines, **options), ValueError, LOG + message
+
+
 LOG_CASES = [
     (
         "log-missing",
@@ -47,84 +54,52 @@ LOG_CASES = [
         "range_max: must be finite and > 0, got -1",
     ),
     ("log-odometry", log_with(GOOD_LINE, odometry=1), TypeError, "odometry: must be True or False, got 1"),
-    (
-        "log-other-text",
-        log_with("hello", "world"),
-        ValueError,
-        f"{LOG}: must hold laser or ODOM messages of CARMEN, got none in 2 lines",
-    ),
-    (
-        "log-truncated",
-        log_with("# a log", GOOD_LINE, GOOD_LINE[:30]),
-        ValueError,
-        f"{LOG}:3: FLASER: must have 14 fields, got 10",
-    ),
-    ("log-no-count", log_with("FLASER"), ValueError, f"{LOG}:1: FLASER: field 1 must be a count, got ''"),
-    (
+    bad_lines("log-other-text", ": must hold laser or ODOM messages of CARMEN, got none in 2 lines", "hello", "world"),
+    bad_lines("log-truncated", ":3: FLASER: must have 14 fields, got 10", "# a log", GOOD_LINE, GOOD_LINE[:30]),
+    bad_lines("log-no-count", ":1: FLASER: field 1 must be a count, got ''", "FLASER"),
+    bad_lines(
         "log-negative-count",
-        log_with(GOOD_LINE.replace("FLASER 3", "FLASER -3")),
-        ValueError,
-        f"{LOG}:1: FLASER: field 1 must be a count, got '-3'",
+        ":1: FLASER: field 1 must be a count, got '-3'",
+        GOOD_LINE.replace("FLASER 3", "FLASER -3"),
     ),
-    (
+    bad_lines(
         "log-count-of-a-billion",
-        log_with(GOOD_LINE.replace("FLASER 3", "FLASER 1000000000")),
-        ValueError,
-        f"{LOG}:1: FLASER: field 1 must count at most 12 values, got 1000000000",
+        ":1: FLASER: field 1 must count at most 12 values, got 1000000000",
+        GOOD_LINE.replace("FLASER 3", "FLASER 1000000000"),
     ),
-    (
-        "log-count-too-small",
-        log_with(GOOD_LINE.replace("FLASER 3", "FLASER 2")),
-        ValueError,
-        f"{LOG}:1: FLASER: must have 13 fields, got 14",
+    bad_lines(
+        "log-count-too-small", ":1: FLASER: must have 13 fields, got 14", GOOD_LINE.replace("FLASER 3", "FLASER 2")
     ),
-    (
+    bad_lines(
         "log-range-is-no-number",
-        log_with(GOOD_LINE, GOOD_LINE.replace("2.0", "2.O")),
-        ValueError,
-        f"{LOG}:2: FLASER: field 3 must be a number, got '2.O'",
+        ":2: FLASER: field 3 must be a number, got '2.O'",
+        GOOD_LINE,
+        GOOD_LINE.replace("2.0", "2.O"),
     ),
-    (
-        "log-range-with-underscore",
-        log_with(GOOD_LINE.replace("2.0", "2_0")),
-        ValueError,
-        f"{LOG}:1: FLASER: field 3 must be a number, got '2_0'",
+    bad_lines(
+        "log-range-with-underscore", ":1: FLASER: field 3 must be a number, got '2_0'", GOOD_LINE.replace("2.0", "2_0")
     ),
-    (
-        "log-time-is-no-number",
-        log_with(GOOD_LINE.replace("12.5", "noon")),
-        ValueError,
-        f"{LOG}:1: FLASER: field 11 must be a number, got 'noon'",
+    bad_lines(
+        "log-time-is-no-number", ":1: FLASER: field 11 must be a number, got 'noon'", GOOD_LINE.replace("12.5", "noon")
     ),
-    (
-        "log-pose-nan",
-        log_with(GOOD_LINE.replace("1 2 3 4", "1 2 nan 4")),
-        ValueError,
-        f"{LOG}:1: a pose must be finite, got (1.0, 2.0, nan)",
+    bad_lines(
+        "log-pose-nan", ":1: a pose must be finite, got (1.0, 2.0, nan)", GOOD_LINE.replace("1 2 3 4", "1 2 nan 4")
     ),
-    (
-        "log-odom-short",
-        log_with("ODOM 1 2 3 0 0 0 1.0 robot"),
-        ValueError,
-        f"{LOG}:1: ODOM: must have 10 fields, got 9",
-    ),
-    (
+    bad_lines("log-odom-short", ":1: ODOM: must have 10 fields, got 9", "ODOM 1 2 3 0 0 0 1.0 robot"),
+    bad_lines(
         "log-no-range-at-all",
-        log_with("FLASER 1 0.0 1 2 3 4 5 6 1.0 robot 1.0"),
-        ValueError,
-        f"{LOG}: must have a reading > 0 unless range_max is given, got none",
+        ": must have a reading > 0 unless range_max is given, got none",
+        "FLASER 1 0.0 1 2 3 4 5 6 1.0 robot 1.0",
     ),
-    (
+    bad_lines(
         "log-robotlaser-remissions",
-        log_with("ROBOTLASER1 0 -1.57 3.14 0.1 80 0.01 0 1 2.5 999999999 1 2 3 4 5 6 0 0 0 0 0 1.0 robot 1.0"),
-        ValueError,
-        f"{LOG}:1: ROBOTLASER1: field 10 must count at most 14 values, got 999999999",
+        ":1: ROBOTLASER1: field 10 must count at most 14 values, got 999999999",
+        "ROBOTLASER1 0 -1.57 3.14 0.1 80 0.01 0 1 2.5 999999999 1 2 3 4 5 6 0 0 0 0 0 1.0 robot 1.0",
     ),
-    (
+    bad_lines(
         "log-robotlaser-range-max",
-        log_with("ROBOTLASER1 0 -1.57 3.14 0.1 0 0.01 0 1 2.5 0 1 2 3 4 5 6 0 0 0 0 0 1.0 robot 1.0"),
-        ValueError,
-        f"{LOG}:1: range_max: must be finite and > 0, got 0.0",
+        ":1: range_max: must be finite and > 0, got 0.0",
+        "ROBOTLASER1 0 -1.57 3.14 0.1 0 0.01 0 1 2.5 0 1 2 3 4 5 6 0 0 0 0 0 1.0 robot 1.0",
     ),
     (
         "log-gzip-truncated",

@@ -1,4 +1,4 @@
-"""Features for a device: checks, numbers of the kernels, and the discs of the landmarks that can matter."""
+"""Features for a device: checks, and the numbers of the kernels."""
 
 from __future__ import annotations
 
@@ -9,78 +9,13 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface import feature_layout as at
+from gpusense.models.landmark.reach import reach_of
+from gpusense.models.landmark.sensor import Sensor, full_circle
 from gpusense.world.frames import Mount, split
-from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 
-_SPREAD = 4.0
 # Discs are widened by this share, for rounding errors of distances.
 _WIDER = 1e-5
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """Constants of a sensor and its map, in float64.
-
-    Attributes:
-        scales: 1 / (sigma sqrt 2) of range, bearing and signature; 0 for a part that is left out.
-        peaks: Logarithms of the components' largest densities, before the mass is divided out.
-        least_masses: Logarithms of the least mass of each, including a bearing's on a full circle.
-        uniforms: Logarithms of the uniform densities of range, bearing and signature.
-        span: The smallest and largest signature.
-    """
-
-    scales: tuple[float, float, float]
-    peaks: tuple[float, float, float]
-    least_masses: tuple[float, float, float]
-    uniforms: tuple[float, float, float]
-    span: tuple[float, float]
-
-
-def span_of(p: LandmarkParameters, landmarks: LandmarkMap) -> tuple[float, float]:
-    """Return the smallest and largest signature of a feature."""
-    if p.signature_span is not None or p.sigma_signature is None:
-        return p.signature_span or (0.0, 1.0)
-    signatures = landmarks.signatures if landmarks.signatures is not None and len(landmarks) else np.zeros(1)
-    return float(signatures.min()) - _SPREAD * p.sigma_signature, float(signatures.max()) + _SPREAD * p.sigma_signature
-
-
-def signature_mass(p: LandmarkParameters, landmarks: LandmarkMap) -> np.ndarray:
-    """Return the mass of each landmark's signature on the span; signatures are clamped to the span."""
-    from scipy.special import erf  # loads SciPy
-
-    if p.sigma_signature is None or landmarks.signatures is None:
-        return np.ones(len(landmarks))
-    (low, high), scale = span_of(p, landmarks), math.sqrt(0.5) / p.sigma_signature
-    clamped = np.clip(landmarks.signatures, low, high)
-    mass: np.ndarray = 0.5 * (erf((clamped - low) * scale) + erf((high - clamped) * scale))
-    return mass
-
-
-def describe(p: LandmarkParameters, landmarks: LandmarkMap) -> Sensor:
-    """Return the constants of a sensor."""
-    span = span_of(p, landmarks)
-    lengths = (p.range_max, p.field_of_view, span[1] - span[0])
-    deviations = (p.sigma_range, p.sigma_bearing, p.sigma_signature)
-    scales = tuple(0.0 if sigma is None else math.sqrt(0.5) / sigma for sigma in deviations)
-    peaks = tuple(math.log(scale / math.sqrt(math.pi)) if scale else 0.0 for scale in scales)
-    masses = [0.5 * math.erf(min(length, cut) * scale) for length, cut, scale in
-              zip(lengths, (math.inf, math.pi, math.inf), scales, strict=True)]  # fmt: skip
-    if full_circle(p):
-        masses[1] = math.erf(math.pi * scales[1])
-    least = tuple(math.log(mass) if mass > 0 else 0.0 for mass in masses)
-    uniforms = tuple(-math.log(length) for length in lengths)
-    return Sensor(_three(scales), _three(peaks), _three(least), _three(uniforms), span)
-
-
-def _three(values: tuple[float, ...]) -> tuple[float, float, float]:
-    first, second, third = values
-    return first, second, third
-
-
-def full_circle(p: LandmarkParameters) -> bool:
-    """Return whether the field of view is a full circle."""
-    return p.field_of_view >= 2 * math.pi
 
 
 def _read(features: object, p: LandmarkParameters) -> np.ndarray:
@@ -163,58 +98,6 @@ def check_correspondence(correspondence: object, count: int, landmarks: int) -> 
         rule = f"indices must be in [-1, {landmarks})"
         raise ValueError(f"correspondence: {rule}, got {indices[bad[0]]} at index {bad[0]}")
     return indices
-
-
-@dataclass(frozen=True)
-class Reach:
-    """Bounds of the landmarks that can matter to a feature.
-
-    Attributes:
-        reach: Distance of the disc's centre along the bearing [m].
-        radius: Radius of the disc [m]; negative where no landmark matters.
-        hole: Least distance from the sensor [m].
-    """
-
-    reach: float
-    radius: float
-    hole: float
-
-
-def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
-    """Return the disc outside which exponents are larger than ``bound``.
-
-    Args:
-        p: Deviations and limits.
-        sensor: Constants of the sensor.
-        z: The range; not read where it was not measured.
-        measured: Whether range, bearing and signature were measured.
-        bound: Largest exponent that matters; infinite where all do.
-    """
-    if bound < 0:
-        return Reach(0.0, -1.0, 0.0)
-    wide = math.sqrt(bound)
-    near, far = 0.0, p.range_max
-    if measured[0]:
-        near, far = max(z - wide / sensor.scales[0], 0.0), z + wide / sensor.scales[0]
-    elif not measured[1]:
-        return Reach(0.0, far, 0.0)
-    angle = min(wide / sensor.scales[1], math.pi) if measured[1] else math.pi
-    around = Reach(0.0, far, near)
-    if not measured[1]:
-        return around
-    if math.isinf(far):
-        # All landmarks may matter until one is likelier than all beyond some distance.
-        return Reach(z, far, 0.0)
-    # Of the points of a ring's sector, a corner is farthest from its middle.
-    if measured[0]:
-        ahead = z
-    else:
-        ahead = far / (2 * math.cos(angle)) if angle <= math.pi / 4 else far * math.cos(min(angle, math.pi / 2))
-    cosine = math.cos(angle)
-    radius = math.sqrt(max(max(ahead**2 + d**2 - 2 * ahead * d * cosine for d in (near, far)), 0.0))
-    if not measured[0]:
-        radius = max(radius, abs(far - ahead))
-    return Reach(ahead, radius, near) if radius < far else around
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -18,15 +17,15 @@ from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import Buckets, Score, SensorView
 from gpusense.interface.terms import log_weight
+from gpusense.models.landmark.call import Call, known_features
 from gpusense.models.landmark.features import (
     PreparedFeatures,
     check_correspondence,
-    describe,
-    full_circle,
     possible_features,
     prepare_features,
 )
 from gpusense.models.landmark.plan import feature_omissions, looked_at, parameter_omissions
+from gpusense.models.landmark.sensor import describe, full_circle
 from gpusense.models.landmark.tables import upload_tables
 from gpusense.models.point.base import PointModel
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
@@ -40,22 +39,6 @@ JOINT_LANDMARKS = 1024
 _INT = np.dtype(np.int32)
 # Landmarks of a launch that cost what a reading of a scan does.
 _PER_READING = 8
-
-
-@dataclass(frozen=True)
-class _Call:
-    """Values that all particles of a call share: the evaluated features, and the landmarks' places of known ones."""
-
-    prepared: PreparedFeatures
-    places: np.ndarray
-    fixed: float
-    flags: frozenset[str]
-    joint: bool
-
-    @property
-    def count(self) -> int:
-        """Number of evaluated features."""
-        return len(self.prepared.columns)
 
 
 class LandmarkModel(PointModel):
@@ -193,7 +176,7 @@ class LandmarkModel(PointModel):
             KNOWN=known, MARGINAL=not known and self.association == "sum", PER_BEAM=each,
         )  # fmt: skip
 
-    def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> _Call:
+    def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> Call:
         """Return the values of (F, 3) possible features that all particles share."""
         known = correspondence is not None
         prepared = prepare_features(
@@ -205,17 +188,11 @@ class LandmarkModel(PointModel):
         joint = not known and self.association == "joint"
         if known:
             partner = check_correspondence(correspondence, len(full), len(self.landmarks))[prepared.columns]
-            # False positives are the same at every pose.
-            mine = partner >= 0
-            fixed = float(prepared.false[prepared.columns[~mine]].sum())
-            places = self._buckets.place_of[partner[mine]]
-            prepared = PreparedFeatures(
-                prepared.columns[mine], prepared.numbers[mine], prepared.measured[mine], prepared.false
-            )
+            prepared, places, fixed = known_features(prepared, partner, self._buckets)
         elif joint and len(prepared.columns) > JOINT_FEATURES:
             rule = f"must be at most {JOINT_FEATURES} with association='joint'"
             raise ValueError(f"features: {rule}, got {len(prepared.columns)}")
-        return _Call(prepared, places, fixed, self._code(prepared, known, each or self.negative), joint)
+        return Call(prepared, places, fixed, self._code(prepared, known, each or self.negative), joint)
 
     def _evaluate(
         self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
@@ -243,7 +220,7 @@ class LandmarkModel(PointModel):
         which, added = zip(*(pieces[first] for first in sorted(pieces)), strict=True)
         return log_p, np.concatenate(which), np.concatenate(added)
 
-    def _cost(self, call: _Call, known: bool) -> tuple[int, float]:
+    def _cost(self, call: Call, known: bool) -> tuple[int, float]:
         """Return the cost of a particle, in readings of a scan, and the bytes that it keeps for each."""
         looked = 1.0 if known else len(self.landmarks) if call.joint else looked_at(call.prepared, self._buckets)
         work, kept = max(call.count, 1) * (1 + looked / _PER_READING), 0.0
@@ -254,7 +231,7 @@ class LandmarkModel(PointModel):
         work = min(work, 1e9)
         return math.ceil(work), self._real.itemsize * kept / work
 
-    def _program(self, call: _Call, poses: Poses, part: Part, log_p: Buffer) -> Program:
+    def _program(self, call: Call, poses: Poses, part: Part, log_p: Buffer) -> Program:
         """Return the launches that score some poses into a buffer."""
         space, real, features = self._workspace, self._real, call.count
         frame = Frame(Window(0, 0, *self._buckets.shape), self._buckets, self.mount)
@@ -273,13 +250,13 @@ class LandmarkModel(PointModel):
         unseen = (self._unseen_launch(placed, result["which"], log_p, features),) if self.negative else ()
         return (*placed.launches(), score, *unseen)
 
-    def _results(self, call: _Call, count: int) -> dict[str, Buffer]:
+    def _results(self, call: Call, count: int) -> dict[str, Buffer]:
         """Return the buffers of the log-likelihoods of features, and of their landmarks."""
         size = count * call.count if "PER_BEAM" in call.flags else 1
         space = self._workspace
         return dict(parts=space.empty("parts", size, self._real), which=space.empty("which", size, _INT))
 
-    def _download(self, call: _Call, count: int, features: int) -> tuple[np.ndarray, np.ndarray]:
+    def _download(self, call: Call, count: int, features: int) -> tuple[np.ndarray, np.ndarray]:
         """Return (n, F) landmarks in the map and log-likelihoods; -1 and 0 for features that are not evaluated."""
         which, added = np.full((count, features), -1, _INT), np.zeros((count, features), self._real)
         if call.count:
@@ -291,7 +268,7 @@ class LandmarkModel(PointModel):
             added[:, call.prepared.columns] = parts
         return which, added
 
-    def _each_launch(self, call: _Call, common: dict[str, Any]) -> Launch:
+    def _each_launch(self, call: Call, common: dict[str, Any]) -> Launch:
         """Return the launch in which each feature chooses its landmark, or sums over them, independently."""
         landmarks = len(self.landmarks)
         prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
@@ -302,7 +279,7 @@ class LandmarkModel(PointModel):
             share=prior,
         )  # fmt: skip
 
-    def _joint_launch(self, call: _Call, common: dict[str, Any]) -> Launch:
+    def _joint_launch(self, call: Call, common: dict[str, Any]) -> Launch:
         """Return the launch that finds the likeliest joint assignment."""
         space, sets, count = self._workspace, 1 << call.count, common["particles"]
         return launch(

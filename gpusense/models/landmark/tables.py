@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.interface.feature_layout import ARCS
-from gpusense.models.landmark.features import Sensor, full_circle, signature_mass
+from gpusense.models.landmark.sensor import Sensor, full_circle, signature_mass
 from gpusense.world.frames import split
 from gpusense.world.landmarks import Buckets, LandmarkMap
 from gpusense.world.parameters import LandmarkParameters

@@ -178,7 +178,7 @@ class HeadingModel(PointModel):
             raise TypeError(f"parameters: must be HeadingParameters, got {checks.show(parameters)}")
         super().__init__(backend, precision, temperature)
         self._kind, terms = self._mixture()
-        self._flags |= flags_if(RAND=self.parameters.z_rand)
+        self._flags |= flags_if(RAND=self.parameters.z_rand > 0)
         self._terms_buffer = self._backend.upload(terms)
 
     def log_likelihood(self, poses: object, heading: object, *, out: Any = None) -> np.ndarray:

@@ -65,7 +65,7 @@ class BeaconModel(PointModel):
         self.xy = checks.array("xy", points.reshape(0, 2) if points.shape == (0,) else points, ("M", 2)).copy()
         self.xy.flags.writeable = False
         super().__init__(backend, precision, temperature)
-        self._flags |= flags_if(RAND=self.parameters.z_rand)
+        self._flags |= flags_if(RAND=self.parameters.z_rand > 0)
         # Poses and beacons are placed relative to the middle of the beacons.
         middle = (self.xy.min(axis=0) / 2 + self.xy.max(axis=0) / 2) if len(self.xy) else np.zeros(2)
         self._origin = float(middle[0]), float(middle[1])

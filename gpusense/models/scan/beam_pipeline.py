@@ -124,8 +124,8 @@ class BeamPipeline(ScanPipeline):
         shared = "SHARED_RAYS" in readings.flags
         return self.caster.flags | flags_if(
             ORIGINS_OUTSIDE=not (self.specialize and all_within(placed, 0)),
-            ORDERED=tiles and tiles.order,
-            STRANDED=tiles and not shared and stranded(readings.rays, tiles.spread),
+            ORDERED=tiles is not None and tiles.order is not None,
+            STRANDED=tiles is not None and not shared and stranded(readings.rays, tiles.spread),
         )
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:

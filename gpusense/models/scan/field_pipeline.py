@@ -168,7 +168,7 @@ class FieldPipeline(ScanPipeline):
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
         """See ScanPipeline.conditions."""
-        return flags_if(INSIDE=tiles and self.quick and all_within(placed, readings.reach, RING))
+        return flags_if(INSIDE=tiles is not None and self.quick and all_within(placed, readings.reach, RING))
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """See ScanPipeline.flags."""

@@ -70,7 +70,8 @@ class MapCaster:
             backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._refresh
         )
         # The exact caster has no flag.
-        self._fixed_flags = flags_if(OUTSIDE_OCCUPIED=outside == "occupied", **{method.entry.flag: method.entry.flag})
+        caster = {method.entry.flag: method.entry.flag != ""}
+        self._fixed_flags = flags_if(OUTSIDE_OCCUPIED=outside == "occupied", **caster)
         # Include the table's flags once it is made.
         self.flags = self._fixed_flags
         self._precision_flags = flags_if(FLOAT64=real == np.float64)

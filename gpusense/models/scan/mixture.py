@@ -80,7 +80,7 @@ def mixture_on_device(
     if table is not None:
         values = table.sensor_table(real)
         # Sums of finite numbers need no check for impossible readings.
-        flags = flags_if(SENSOR_TABLE=True, LINEAR=np.isfinite(values).all())
+        flags = flags_if(SENSOR_TABLE=True, LINEAR=bool(np.isfinite(values).all()))
         return Mixture(flags, terms, cosines, values)
     if width is None:
         return Mixture(flags, terms, cosines)

@@ -142,22 +142,16 @@ def test_any_order(call):
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_after_running_out_of_memory(kind, precision, backend, monkeypatch):
+def test_after_running_out_of_memory(kind, precision, backend):
     """Pieces are halved until they fit; a piece of 256 particles must."""
+    # This file also runs as a script, without the helpers.
+    from support.full_device import full_device
+
     owner, call = shared(kind, precision, backend)
     poses = cloud(3000)
-    whole, device, asked = call(poses), get_backend(backend), []
-    empty, most = type(device).empty, 256 * len(BEARINGS) + 1
-
-    def short_of_memory(self, count, dtype, *, zero=False):
-        asked.append(count)
-        if count > most:
-            raise MemoryError("the device is full")
-        return empty(self, count, dtype, zero=zero)
-
+    whole, device, most = call(poses), get_backend(backend), 256 * len(BEARINGS) + 1
     owner._workspace.release()
-    with monkeypatch.context() as patch:
-        patch.setattr(type(device), "empty", short_of_memory)
+    with full_device(device, most) as asked:
         same_bits(call(poses), whole)
     assert max(asked) > most
     same_bits(call(poses), whole)

@@ -15,6 +15,7 @@ from gpusense.backends import Selection
 from gpusense.learning.beam.book import climb_book
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
+from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Bounds, Point, first_guess, random_start
@@ -100,30 +101,52 @@ def fit_beam_parameters(
     if initial is not None and not isinstance(initial, BeamParameters):
         raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
     device = DeviceSums(*open_device(backend, precision), pairs)
-    start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds)
-    return fit_pairs(device, pairs, bounds, start, options)
+    if initial is None:
+        return fit_pairs(device, pairs, bounds, first_guess(pairs, bounds), options)
+    return fit_pairs(device, pairs, bounds, start_of(initial, pairs, bounds), options, chosen=True)
 
 
 def fit_pairs(
-    device: DeviceSums, pairs: Pairs, bounds: Bounds, start: Point, options: Options, prior: Prior = NO_PRIOR
+    device: DeviceSums,
+    pairs: Pairs,
+    bounds: Bounds,
+    start: Point,
+    options: Options,
+    prior: Prior = NO_PRIOR,
+    *,
+    chosen: bool = False,
 ) -> BeamFit:
     """Fit pairs on a device from several starts, and report the best result.
+
+    Args:
+        device: Sums over the pairs.
+        pairs: The readings.
+        bounds: Bounds of the shapes.
+        start: The first start; its causes of weight 0 stay out.
+        options: Options of the fit.
+        prior: Pseudo-readings.
+        chosen: Whether the user chose the start, so that no other replaces it.
 
     Raises:
         ValueError: The start makes a reading impossible.
     """
     problem = Problem(device, pairs, bounds, prior, options.range_bias)
+    if not math.isfinite(problem.value(start).objective):
+        raise ValueError(f"initial: must make every reading possible, got {start.parameters()}")
     rng = np.random.default_rng(options.seed)
-    starts = [start, *(random_start(start, bounds, rng) for _ in range(options.restarts))]
-    with _watcher(options, len(starts)) as watch:
-        climbs = [_climb(problem, each, options, watch) for each in starts]
-    best = max(climbs, key=lambda climb: climb.value.objective)
+    more = [random_start(start, bounds, rng) for _ in range(options.restarts)]
+    with _watcher(options, 1 + len(more)) as watch:
+        search = Search(problem, lambda *task: _climb(*task, options), watch)
+        if options.method == "em-book":
+            best = max((search.method(problem, each, watch) for each in (start, *more)), key=lambda c: c.value.objective)
+        elif chosen:
+            best = search.from_user(start, more)
+        else:
+            best = search.from_readings(start, more)
     return report(problem, best, options)
 
 
-def _climb(problem: Problem, start: Point, options: Options, watch: Watch) -> Climb:
-    if not math.isfinite(problem.value(start).objective):
-        raise ValueError(f"initial: must make every reading possible, got {start.parameters()}")
+def _climb(problem: Problem, start: Point, watch: Watch, options: Options) -> Climb:
     settings = {"max_iterations": options.max_iterations, "tolerance": options.tolerance, "watch": watch}
     match options.method:
         case "em":

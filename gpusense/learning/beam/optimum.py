@@ -17,9 +17,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpusense.learning.beam.em import Climb, Watch
-from gpusense.learning.beam.point import HIT, NAMES, SHORT, Floats, Point, possible_causes
+from gpusense.learning.beam.point import HIT, SHORT, Floats, Point, possible_causes
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 from gpusense.learning.beam.starts import choose_starts
 
@@ -47,27 +48,29 @@ class Search:
     method: Method
     watch: Watch
 
-    def from_readings(self, start: Point, more: list[Point]) -> Climb:
+    def from_readings(self, start: Point, more: list[Point], known: Point | None = None) -> Climb:
         """Search from the likeliest start, and from others that turn out to be better.
 
         Args:
             start: A start; starts of the same causes are chosen from the readings.
             more: Further starts, each of which is climbed from.
+            known: Another start, which may lack some of these causes, or None.
         """
-        values = [self.problem.value(start), *self._others(start)]
+        values = [self.problem.value(point) for point in (start, known) if point is not None] + self._others(start)
         values = sorted(values, key=lambda value: -value.objective)
-        climb = self._climb(values[0].point)
+        causes = start.weights > 0
+        climb = self._climb(values[0].point, causes)
         for value in values[1:]:
             if value.objective > climb.value.objective + _SAME:
-                climb = max(climb, self._climb(value.point), key=_objective)
-        ends = [climb, *(self._climb(point) for point in more)]
+                climb = max(climb, self._climb(value.point, causes), key=_objective)
+        ends = [climb, *(self._climb(point, causes) for point in more)]
         best = max(ends, key=_objective)
         best.notes += _lower([best.value.objective - end.value.objective for end in ends])
         return best
 
     def from_user(self, start: Point, more: list[Point]) -> Climb:
         """Search from a user's start and from others; a note reports a higher likelihood elsewhere."""
-        ends = [self._climb(point) for point in (start, *more)]
+        ends = [self._climb(point, start.weights > 0) for point in (start, *more)]
         best = max(ends, key=_objective)
         best.notes += _lower([best.value.objective - end.value.objective for end in ends])
         higher = max((value.objective for value in self._others(start)), default=-math.inf) - best.value.objective
@@ -81,22 +84,25 @@ class Search:
         values = [problem.value(point) for point in points]
         return [value for value in values if math.isfinite(value.objective)]
 
-    def _climb(self, start: Point) -> Climb:
-        """Search from a start, and continue with causes that the search left out too early."""
-        causes = (start.weights > 0) & possible_causes(self.problem.pairs)
+    def _climb(self, start: Point, causes: NDArray[np.bool_]) -> Climb:
+        """Search from a start, and continue with those of some causes that the search left out too early."""
+        causes = causes & possible_causes(self.problem.pairs)
         climb = self.method(self.problem, start, self.watch)
         for _ in range(_MOST):
             point = self._revived(climb.value, causes) if climb.converged else None
             if point is None:
                 return climb
-            done = len(climb.trace) - 1
-            following = self.method(self.problem, point, lambda i, value, done=done: self.watch(done + i, value))  # type: ignore[misc]
+            following = self.method(self.problem, point, self._watch_after(len(climb.trace) - 1))
             if following.value.objective <= climb.value.objective + _SAME:
                 return climb
             climb = replace(following, trace=climb.trace + following.trace[1:])
         return climb
 
-    def _revived(self, value: Value, causes: np.typing.NDArray[np.bool_]) -> Point | None:
+    def _watch_after(self, done: int) -> Watch:
+        """Return the watch of a search that continues after some iterations."""
+        return lambda iteration, value: self.watch(done + iteration, value)
+
+    def _revived(self, value: Value, causes: NDArray[np.bool_]) -> Point | None:
         """Return a likelier point with a cause of weight 0 that should have some weight, or None."""
         best = value
         for cause in np.flatnonzero(causes & (value.point.weights == 0)):

@@ -5,9 +5,9 @@ decides. Short runs from several starts, followed by one long run from the best 
 small, and all runs are computed together.
 
 The starts assume in turn that a share of the readings is correct: all, a half, a fifth, a twentieth. sigma_hit is then
-the median distance of the nearest readings of that share. lambda_short has three values: the mean length of readings
-before the expected range, a steep one and a flat one. If the offset of correct ranges is free, the distances are
-taken from 0, from the median deviation and from the densest deviation.
+the median distance of the nearest readings of that share. lambda_short has four values: the inverse of the mean length
+of readings before the expected range, two steeper ones and a flat one. If the offset of correct ranges is free, the
+distances are taken from 0, from the median deviation and from the densest deviation.
 
 Source: Biernacki, Celeux and Govaert (2003), "Choosing starting values for the EM algorithm for getting the highest
 likelihood in multivariate Gaussian mixture models".
@@ -95,9 +95,7 @@ def _biases(sample: Sample) -> list[float]:
     return [0.0, middle, float(off.mean())]
 
 
-def _assume(
-    sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: float, share: float
-) -> list[Point]:
+def _assume(sample: Sample, bounds: Bounds, causes: NDArray[np.bool_], bias: float, share: float) -> list[Point]:
     """Return starts that assume a share of correct readings, one for each lambda_short."""
     z, top = sample.reading, sample.range_max
     off = np.abs(z - sample.expected - bias)
@@ -110,16 +108,17 @@ def _assume(
     weights[MAX] = 0.0
     weights *= (1 - sample.share * causes[MAX]) / weights.sum()
     weights[MAX] = sample.share * causes[MAX]
-    rates = (1 / max(length, 1e-3 * top), 5 / max(length, 1e-3 * top), 0.1 / top)
+    rates = [0.1 / top, *(factor / max(length, 1e-3 * top) for factor in (1, 5, 25))]
     return [bounds.hold(Point(weights, sigma, rate, bias)) for rate in rates]
 
 
 def short_runs(
     sample: Sample, starts: list[Point], bounds: Bounds, fit_bias: bool
 ) -> tuple[list[Point], NDArray[np.float64]]:
-    """Run a few steps of EM from each start on a sample, with fixed lambda_short.
+    """Run a few steps of EM from each start on a sample.
 
-    The steps of sigma_hit and of the offset are the book's, without truncation: the long run corrects them.
+    The steps of sigma_hit and of the offset are the book's, without truncation: the long run corrects them. The step of
+    lambda_short is one fixed-point step of the exact M-step.
 
     Returns:
         The ends, with weights of at least half a reading, and (C,) log-likelihoods of the sample.
@@ -143,6 +142,7 @@ def short_runs(
         if fit_bias:
             bias = np.clip((parts[0] * off).sum(axis=0) / hits, -bounds.bias, bounds.bias)
         sigma = np.clip(np.sqrt((parts[0] * (off - bias) ** 2).sum(axis=0) / hits), *bounds.sigma)
+        rate = _next_rate(parts[1], z, rate * expected, rate, bounds)
     count = len(sample.reading)
     weights = np.where(used, weights * count + 0.5, 0.0)
     weights /= weights.sum(axis=1, keepdims=True)
@@ -150,9 +150,24 @@ def short_runs(
     return ends, total.sum(axis=0)
 
 
-def _log_components(
-    sample: Sample, z: Floats, expected: Floats, sigma: Floats, rate: Floats, bias: Floats
-) -> Floats:
+def _next_rate(parts: Floats, z: Floats, x: Floats, rate: Floats, bounds: Bounds) -> Floats:
+    """Return lambda_short for which the lengths of short readings are as large as the truncated exponentials' means.
+
+    Args:
+        parts: (m, C) responsibilities of short readings.
+        z: (m, 1) readings [m].
+        x: (m, C) lambda_short times the expected range.
+        rate: (C,) lambda_short [1/m]; kept where no reading is short.
+        bounds: Bounds of the shapes.
+    """
+    x = np.clip(x, 1e-9, 700.0)
+    lengths = (parts * z).sum(axis=0)
+    likely = (parts * (1 - x / np.expm1(x))).sum(axis=0)
+    known = (lengths > 0) & (likely > 0)
+    return np.where(known, np.clip(likely / np.where(known, lengths, 1.0), *bounds.rate), rate)
+
+
+def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, rate: Floats, bias: Floats) -> Floats:
     """Return (3, m, C) log densities of hit, short and rand; -inf where a cause is impossible."""
     from scipy.special import ndtr
 

@@ -83,8 +83,8 @@ def compare_held_out(
     """Score held-out readings with fitted parameters and with the defaults of nav2_amcl and Beluga.
 
     All likelihoods are those of the book's normalised mixture, not the weights that these programs compute. Where the
-    fitted parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it. The
-    fit by angles of incidence is another row, whose gain is negative where it is better; it is softened in the same way.
+    fitted parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it.
+    The fit by angles of incidence is another row, whose gain is negative where it is better; it is softened likewise.
 
     Args:
         fitted: Parameters fitted without ``data``.

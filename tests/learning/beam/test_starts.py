@@ -23,7 +23,7 @@ def two_modes() -> tuple[np.ndarray, np.ndarray]:
 
 
 def brute_force(z: np.ndarray, expected: np.ndarray, range_max: float, count: int) -> float:
-    """Return the highest log-likelihood that Nelder and Mead's simplex finds from random starts, max readings absent."""
+    """Return the highest log-likelihood that Nelder and Mead's simplex finds from random starts, without z_max."""
     rng = np.random.default_rng(1)
 
     def loss(x: np.ndarray) -> float:

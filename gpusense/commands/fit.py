@@ -36,7 +36,8 @@ return', nan a missing reading.
 
 --holdout leaves every other block (one scan of a log, 100 pairs of a file; see --block) out of the fit, and scores
 these blocks with the fitted parameters and with the defaults of nav2_amcl and Beluga. The standard error is over
-blocks, because errors within a scan are correlated.
+blocks, because errors within a scan are correlated; so are the standard errors of the parameters. With --incidence,
+the fit by angles of incidence is scored too.
 
 A map made from the same scans hides their errors. Fit with other scans than the map's: for a map of the even scans,
 use --every 2 --offset 1.
@@ -160,22 +161,28 @@ def _fit(args: argparse.Namespace, data: RangeData) -> Result:
     from gpusense.evaluation.held_out import compare_held_out
     from gpusense.learning.beam.fit import fit_beam_parameters
     from gpusense.learning.beam.incidence import fit_incidence_parameters
+    from gpusense.world.scanner import Reading
 
     data, rest = data.halves() if args.holdout else (data, None)
     sensor = {"range_max": data.range_max, "range_min": data.range_min, "backend": args.backend}
+    known = data.block[data.kinds != Reading.MISSING]
+    blocks = data.block if len(set(known.tolist())) > 1 else None
     fit = fit_beam_parameters(
         data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
-        range_bias=args.range_bias, progress=True,
+        range_bias=args.range_bias, progress=True, blocks=blocks,
     )  # fmt: skip
     incidence = None
     if data.incidence is not None and args.incidence:
         incidence = fit_incidence_parameters(
-            data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias
-        )
+            data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias,
+            blocks=blocks,
+        )  # fmt: skip
     bias = fit.range_bias if fit.bias_fitted else 0.0
     compared = []
     if rest is not None:
-        compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias)
+        compared = compare_held_out(
+            fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias, incidence=incidence
+        )
     return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges))
 
 

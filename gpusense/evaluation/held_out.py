@@ -6,14 +6,15 @@ Errors within a scan and between neighbouring scans are correlated, so standard 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.evaluation.range_data import RangeData
+from gpusense.learning.beam.incidence import IncidenceFit
 from gpusense.world.compat import PEERS
-from gpusense.world.parameters import BeamParameters
+from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
 
 Floats = NDArray[np.float64]
@@ -38,7 +39,7 @@ class HeldOut:
     """
 
     name: str
-    parameters: BeamParameters
+    parameters: BeamParameters | IncidenceParameters
     per_beam: float
     error: float
     gain: float
@@ -72,18 +73,25 @@ def softened(fitted: BeamParameters, readings: int) -> BeamParameters:
 
 
 def compare_held_out(
-    fitted: BeamParameters, data: RangeData, *, readings: int, range_bias: float = 0.0
+    fitted: BeamParameters,
+    data: RangeData,
+    *,
+    readings: int,
+    range_bias: float = 0.0,
+    incidence: IncidenceFit | None = None,
 ) -> list[HeldOut]:
     """Score held-out readings with fitted parameters and with the defaults of nav2_amcl and Beluga.
 
     All likelihoods are those of the book's normalised mixture, not the weights that these programs compute. Where the
     fitted parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it.
+    The fit by angles of incidence is another row, whose gain is negative where it is better; it is softened likewise.
 
     Args:
         fitted: Parameters fitted without ``data``.
         data: The held-out readings.
         readings: Number of readings that the parameters were fitted to.
         range_bias: Fitted offset, subtracted from the readings before they are scored [m].
+        incidence: Fit by angles of incidence, or None; ``data`` then has angles.
 
     Raises:
         ValueError: every reading is missing.
@@ -98,14 +106,63 @@ def compare_held_out(
     if np.isneginf(baseline).any():
         candidates["fitted, softened"] = softened(fitted, readings)
         baseline = log_densities(candidates["fitted, softened"], data, range_bias)
-    rows = []
-    for name, parameters in {**candidates, **peer_parameters()}.items():
-        log_p = log_densities(parameters, data, range_bias if name in candidates else 0.0)
-        with np.errstate(invalid="ignore"):
-            gain = np.where(baseline == log_p, 0.0, baseline - log_p)
-        mean, gained = block_mean(log_p, place), block_mean(gain, place)
-        rows.append(HeldOut(name, parameters, *mean, *gained, int(np.count_nonzero(np.isneginf(log_p)))))
+    rows = [_row("fitted", fitted, log_densities(fitted, data, range_bias), baseline, place)]
+    if len(candidates) > 1:
+        rows.append(_row("fitted, softened", candidates["fitted, softened"], baseline, baseline, place))
+    if incidence is not None:
+        rows += _incidence_rows(incidence, data, baseline, place)
+    rows += [
+        _row(name, parameters, log_densities(parameters, data), baseline, place)
+        for name, parameters in peer_parameters().items()
+    ]
     return rows
+
+
+def _row(
+    name: str,
+    parameters: BeamParameters | IncidenceParameters,
+    log_p: Floats,
+    baseline: Floats,
+    place: NDArray[np.intp],
+) -> HeldOut:
+    """Return the score of one set of parameters from log p of the readings, of the baseline, and their blocks."""
+    with np.errstate(invalid="ignore"):
+        gain = np.where(baseline == log_p, 0.0, baseline - log_p)
+    impossible = int(np.count_nonzero(np.isneginf(log_p)))
+    return HeldOut(name, parameters, *block_mean(log_p, place), *block_mean(gain, place), impossible)
+
+
+def _incidence_rows(fit: IncidenceFit, data: RangeData, baseline: Floats, place: NDArray[np.intp]) -> list[HeldOut]:
+    """Return the score of a fit by angles of incidence, and of the softened fit if a reading is impossible."""
+    log_p = incidence_log_densities(fit, data)
+    rows = [_row("fitted by incidence", fit.parameters, log_p, baseline, place)]
+    if np.isneginf(log_p).any():
+        bins = zip(fit.parameters.parameters, fit.counts, strict=True)
+        parameters = tuple(softened(each, count) for each, count in bins)
+        none = fit.parameters.no_surface
+        other = None if none is None else softened(none, fit.no_surface_count)
+        soft = IncidenceParameters(fit.parameters.edges, parameters, other)
+        log_p = incidence_log_densities(replace(fit, parameters=soft), data)
+        rows.append(_row("fitted by incidence, softened", soft, log_p, baseline, place))
+    return rows
+
+
+def incidence_log_densities(fit: IncidenceFit, data: RangeData) -> Floats:
+    """Return (n,) log p of readings that are not missing, each with the parameters and the fitted offset of its bin.
+
+    A beam that hits no surface has the parameters for these, or those of the first bin, as in a model.
+    """
+    assert data.incidence is not None
+    edges, bins = fit.parameters.edges, len(fit.parameters.parameters)
+    place = np.digitize(data.incidence, edges[1:-1])
+    place[np.isnan(data.incidence)] = bins
+    sets = [*fit.parameters.parameters, fit.parameters.no_surface or fit.parameters.parameters[0]]
+    fits = [*fit.fits, fit.no_surface or fit.fits[0]]
+    log_p = np.zeros(len(data.ranges))
+    for number, (parameters, own) in enumerate(zip(sets, fits, strict=True)):
+        bias = own.range_bias if own.bias_fitted else 0.0
+        log_p[place == number] = log_densities(parameters, data.chosen(place == number), bias)
+    return log_p
 
 
 def log_densities(parameters: BeamParameters, data: RangeData, range_bias: float = 0.0) -> Floats:

@@ -17,6 +17,7 @@ from gpusense.commands.cli import main
 from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
 from gpusense.evaluation.worlds import building, free_pose, simulate_scan
+from gpusense.models.scan.densities import log_mixture
 
 TRUTH = gs.BeamParameters(z_hit=0.8, z_short=0.08, z_max=0.05, z_rand=0.07, sigma_hit=0.04, lambda_short=0.5)
 SCANS, BEAMS, RANGE = 60, 60, 10.0
@@ -107,6 +108,36 @@ def test_held_out_scans_are_likelier_by_the_fit_than_by_defaults(capsys, recorde
         assert sum(weights) == pytest.approx(1)
     code, text, _ = run(capsys, *of_log(recorded), "--holdout")
     assert code == 0 and "held out: 1800 readings" in text and "Beluga's defaults" in text and "z_hit" in text
+
+
+def test_the_fit_by_incidence_is_scored_on_held_out_pairs(capsys, tmp_path):
+    """Readings whose deviation rises with the angle: each bin's mixture, beside the one for all angles."""
+    random = np.random.default_rng(1)
+    angle, expected = random.uniform(0, 1.5, 4000), random.uniform(2, 8, 4000)
+    angle[::50] = math.nan
+    z = expected + random.normal(0, np.where(angle > 0.75, 0.3, 0.03))
+    rows = [",".join(map(repr, row)) for row in np.stack([z, expected, angle], 1).tolist()]
+    (tmp_path / "angles.csv").write_text("\n".join(rows))
+    arguments = ["--pairs", tmp_path / "angles.csv", "--range-max", RANGE, "--incidence", 2, "--holdout"]
+    code, text, _ = run(capsys, *arguments, "--json")
+    document = json.loads(text)
+    fitted, own, *others = document["held_out"]
+    assert code == 0 and own["name"] == "fitted by incidence" and len(others) == 2
+    assert own["gain"] < -0.3 < -10 * own["gain_error"]
+    assert fitted["per_beam"] - own["per_beam"] == pytest.approx(own["gain"])
+    # By hand: the densities of each bin's parameters at the readings of blocks 1, 3, 5, ....
+    odd = np.arange(4000) // 100 % 2 == 1
+    parameters = gs.IncidenceParameters.from_dict(document["incidence"]["parameters"])
+    total = 0.0
+    for chosen, each in (
+        (angle < math.pi / 4, parameters.parameters[0]), (angle >= math.pi / 4, parameters.parameters[1]),
+        (np.isnan(angle), parameters.no_surface),
+    ):  # fmt: skip
+        total += log_mixture(z[odd & chosen], expected[odd & chosen], range_max=RANGE, **each.to_dict()).sum()
+    assert own["per_beam"] == pytest.approx(total / 2000, rel=1e-9)
+    assert document["fit"]["blocks"] == 20 and document["incidence"]["pooled"]["blocks"] == 20
+    _, text, _ = run(capsys, *arguments)
+    assert "fitted by incidence" in text and "if independent" in text
 
 
 def test_a_bias_is_fitted_and_taken_off_held_out_readings(capsys, recorded, tmp_path):

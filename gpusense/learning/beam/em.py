@@ -30,6 +30,8 @@ _LONGEST = 2.0
 # Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 20
 _HALVINGS = 30
+# Iterations without progress after which the search ends: at a kink, where z* + b is clamped, there is none.
+_STILL = 8
 # Remaining gain [nats] below which a Newton step is accepted despite rounding.
 _NEAR = 1e-4
 
@@ -57,7 +59,7 @@ def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: 
     """Climb until the remaining gain, estimated from the information matrix, is at most ``tolerance`` nats."""
     value = problem.value(start)
     trace = [value.objective]
-    newton = False
+    newton, still = False, 0
     for iteration in range(1, max_iterations + 1):
         before = value.objective
         value = em_step(problem, value, second=newton)
@@ -72,6 +74,9 @@ def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: 
         watch(iteration, value)
         if left <= tolerance:
             return Climb(value, trace, True)
+        still = still + 1 if value.objective - before <= problem.noise(value) else 0
+        if still == _STILL:
+            return Climb(value, trace, False, [f"no progress, with {left:.2g} nats left to gain by the derivatives"])
     return Climb(value, trace, False, [f"no convergence within {max_iterations} iterations"])
 
 

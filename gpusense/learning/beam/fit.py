@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +14,11 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.progress import progress as progress_bar
 from gpusense.backends import Selection
+from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.book import climb_book
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
+from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import Bounds, Point, first_guess, random_start
@@ -41,6 +45,7 @@ def fit_beam_parameters(
     seed: int = 0,
     range_bias: bool = False,
     responsibilities: bool = False,
+    blocks: ArrayLike | None = None,
     sigma_bounds: tuple[float, float] | None = None,
     lambda_bounds: tuple[float, float] | None = None,
     progress: bool = False,
@@ -59,17 +64,20 @@ def fit_beam_parameters(
             failures; ``"gradient"``: L-BFGS-B; ``"hill_climb"``: Powell's method; ``"genetic"``: differential
             evolution, finished by gradients.
         range_min: Readings below ``range_min`` are missing [m].
-        initial: Start of the search; None guesses it from the readings. A cause of weight 0 stays out; shapes beyond
-            their bounds are clamped.
+        initial: Start of the search; None chooses the best of several from the readings. A cause of weight 0 stays
+            out; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
         backend: The device, see :func:`gpusense.devices`.
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
         max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.
         tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
         restarts: Number of additional random starts; the best result is returned.
         seed: Seed of the random starts and of ``"genetic"``.
-        range_bias: Whether to fit an offset b of correct ranges, too: z = z* + b. p_hit then has its mean at z* + b,
-            clamped to [0, range_max].
+        range_bias: Whether the parameters contain an offset b of correct ranges, too: z = z* + b. p_hit then has its
+            mean at z* + b, clamped to [0, range_max].
         responsibilities: Whether to return each reading's probabilities of the four causes, too.
+        blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
+            independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
+            then computed over blocks.
         sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
             sqrt(12), or else 1e-6 range_max, to range_max.
         lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
@@ -93,6 +101,8 @@ def fit_beam_parameters(
         (True, 0.098)
     """
     pairs = make_pairs(ranges, expected, range_max, range_min)
+    if blocks is not None:
+        pairs = replace(pairs, block=check_blocks(blocks, np.shape(ranges), pairs))
     options = check_options(
         method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities
     )
@@ -100,30 +110,54 @@ def fit_beam_parameters(
     if initial is not None and not isinstance(initial, BeamParameters):
         raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
     device = DeviceSums(*open_device(backend, precision), pairs)
-    start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds)
-    return fit_pairs(device, pairs, bounds, start, options)
+    if initial is None:
+        return fit_pairs(device, pairs, bounds, first_guess(pairs, bounds), options)
+    return fit_pairs(device, pairs, bounds, start_of(initial, pairs, bounds), options, chosen=True)
 
 
 def fit_pairs(
-    device: DeviceSums, pairs: Pairs, bounds: Bounds, start: Point, options: Options, prior: Prior = NO_PRIOR
+    device: DeviceSums,
+    pairs: Pairs,
+    bounds: Bounds,
+    start: Point,
+    options: Options,
+    prior: Prior = NO_PRIOR,
+    *,
+    chosen: bool = False,
 ) -> BeamFit:
     """Fit pairs on a device from several starts, and report the best result.
+
+    Args:
+        device: Sums over the pairs.
+        pairs: The readings.
+        bounds: Bounds of the shapes.
+        start: The first start; its causes of weight 0 stay out.
+        options: Options of the fit.
+        prior: Pseudo-readings.
+        chosen: Whether the user chose the start, so that no other replaces it.
 
     Raises:
         ValueError: The start makes a reading impossible.
     """
     problem = Problem(device, pairs, bounds, prior, options.range_bias)
-    rng = np.random.default_rng(options.seed)
-    starts = [start, *(random_start(start, bounds, rng) for _ in range(options.restarts))]
-    with _watcher(options, len(starts)) as watch:
-        climbs = [_climb(problem, each, options, watch) for each in starts]
-    best = max(climbs, key=lambda climb: climb.value.objective)
-    return report(problem, best, options)
-
-
-def _climb(problem: Problem, start: Point, options: Options, watch: Watch) -> Climb:
     if not math.isfinite(problem.value(start).objective):
         raise ValueError(f"initial: must make every reading possible, got {start.parameters()}")
+    rng = np.random.default_rng(options.seed)
+    more = [random_start(start, bounds, rng) for _ in range(options.restarts)]
+    with _watcher(options, 1 + len(more)) as watch:
+        search = Search(problem, partial(_climb, options), watch)
+        if options.method == "em-book":
+            best = max(
+                (search.method(problem, each, watch) for each in (start, *more)), key=lambda c: c.value.objective
+            )
+        elif chosen:
+            best = search.from_user(start, more)
+        else:
+            best = search.from_readings(start, more)
+    return report(problem, best, options, start)
+
+
+def _climb(options: Options, problem: Problem, start: Point, watch: Watch) -> Climb:
     settings = {"max_iterations": options.max_iterations, "tolerance": options.tolerance, "watch": watch}
     match options.method:
         case "em":

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.backends import Backend, Selection
+from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.fit import fit_pairs
 from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
@@ -128,6 +129,7 @@ def fit_incidence_parameters(
     restarts: int = 0,
     seed: int = 0,
     range_bias: bool = False,
+    blocks: ArrayLike | None = None,
     sigma_bounds: tuple[float, float] | None = None,
     lambda_bounds: tuple[float, float] | None = None,
     progress: bool = False,
@@ -163,6 +165,7 @@ def fit_incidence_parameters(
         restarts: Number of additional random starts of each fit.
         seed: Seed of the random starts.
         range_bias: Whether to fit an offset of correct ranges in each bin, too.
+        blocks: Integer label of each reading's block, for standard errors of correlated readings.
         sigma_bounds: Smallest and largest sigma_hit [m].
         lambda_bounds: Smallest and largest lambda_short [1/m].
         progress: Whether to show a progress bar for each fit on standard error if that is a terminal.
@@ -185,6 +188,8 @@ def fit_incidence_parameters(
         [0.06, 0.2]
     """
     pairs = make_pairs(ranges, expected, range_max, range_min)
+    if blocks is not None:
+        pairs = replace(pairs, block=check_blocks(blocks, np.shape(ranges), pairs))
     angles = _angles(incidence, np.shape(ranges), pairs)
     edges = _edges(bins)
     strength = checks.real("strength", strength, low=0)
@@ -202,7 +207,8 @@ def fit_incidence_parameters(
     surfaces = pairs.subset(surface)
     bounds = make_bounds(surfaces, sigma_bounds, lambda_bounds)
     start = first_guess(surfaces, bounds) if initial is None else start_of(initial, surfaces, bounds)
-    pooled = fit_pairs(DeviceSums(*device, surfaces), surfaces, bounds, start, options)
+    sums = DeviceSums(*device, surfaces)
+    pooled = fit_pairs(sums, surfaces, bounds, start, options, chosen=initial is not None)
     binned = _Binned(device, bounds, options, pooled, strength)
     fits, counts = binned.fit_bins(pairs, surface, angles, edges)
     no_surface, no_surface_count = binned.fit_no_surface(pairs.subset(~surface))

@@ -26,6 +26,7 @@ class Pairs:
         kinds: (n,) class of every reading.
         range_max: Longest range [m].
         quantum: Step that readings are multiples of; 0 if there is none [m].
+        block: (n,) number of each reading's block, or None.
     """
 
     reading: NDArray[np.floating]
@@ -34,6 +35,7 @@ class Pairs:
     kinds: NDArray[np.uint8]
     range_max: float
     quantum: float
+    block: NDArray[np.intp] | None = None
 
     @property
     def hits(self) -> int:
@@ -54,7 +56,9 @@ class Pairs:
         """Return the pairs of the readings in ``mask`` (n,)."""
         hits = mask[self.places]
         places = np.cumsum(mask)[self.places[hits]] - 1
-        return Pairs(self.reading[hits], self.expected[hits], places, self.kinds[mask], self.range_max, self.quantum)
+        block = None if self.block is None else self.block[mask]
+        chosen = self.reading[hits], self.expected[hits], places, self.kinds[mask]
+        return Pairs(*chosen, self.range_max, self.quantum, block)
 
 
 def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_min: float = 0.0) -> Pairs:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.learning.beam.blocks import block_scatter, count_blocks
 from gpusense.learning.beam.device_sums import DeviceSums
-from gpusense.learning.beam.em import Climb, newton_direction
+from gpusense.learning.beam.em import Climb, Watch, climb_em
+from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Options
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import BIAS, HIT, NAMES, RATE, SHORT, SIGMA, Point
@@ -17,37 +20,29 @@ from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.uncertainty import standard_errors
 from gpusense.world.scanner import Reading
 
+# Most iterations of the search for an offset that was not fitted.
+_JOINT = 500
+# Standard errors over fewer blocks are rough.
+_FEW_BLOCKS = 10
 
-def report(problem: Problem, climb: Climb, options: Options) -> BeamFit:
-    """Build the fit from the end of a search."""
+
+def report(problem: Problem, climb: Climb, options: Options, start: Point) -> BeamFit:
+    """Build the fit from the end of a search that began with the causes of ``start``."""
     device, pairs = problem.device, problem.pairs
     value = problem.value(climb.value.point, second=True)
     held = _held(problem, value)
-    errors = standard_errors(problem, value)
-    bias, bias_error = _bias(problem, value)
-    parameter_errors = {name: errors[name] for name in NAMES[:BIAS]}
-    notes = list(climb.notes)
-    if not climb.converged and not notes:
-        notes.append("did not converge")
-    count = int((value.point.weights > 0).sum()) - 1 + int(value.point.weights[HIT] > 0)
-    if problem.readings < count:
-        readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
-        notes.append(f"{readings} cannot determine {count} parameters")
-    for name, error in parameter_errors.items():
-        if error == math.inf:
-            held[name] = "the readings do not determine it"
-    notes += [f"{name}: {reason}" for name, reason in held.items()]
-    head = "converged" if climb.converged else "stopped"
+    errors, independent = _errors(problem, value)
+    bias, errors[NAMES[BIAS]], independent[NAMES[BIAS]] = _bias(problem, value, climb, options, start)
     return BeamFit(
         parameters=value.point.parameters(),
         log_likelihood=value.log_likelihood,
         trace=np.array(climb.trace),
         converged=climb.converged,
-        status="; ".join([head, *notes]),
-        standard_errors=parameter_errors,
+        status=_status(problem, climb, value, errors, held),
+        standard_errors={name: errors[name] for name in NAMES[:BIAS]},
         held=held,
         range_bias=bias,
-        range_bias_error=bias_error,
+        range_bias_error=errors[NAMES[BIAS]],
         bias_fitted=options.range_bias,
         iterations=len(climb.trace) - 1,
         passes=device.passes,
@@ -58,8 +53,38 @@ def report(problem: Problem, climb: Climb, options: Options) -> BeamFit:
         method=options.method,
         precision=device.real.name,
         device=device.selection,
+        independent_errors=independent,
+        blocks=count_blocks(pairs),
         responsibilities=_responsibilities(device, pairs, value.point) if options.responsibilities else None,
     )
+
+
+def _status(problem: Problem, climb: Climb, value: Value, errors: dict[str, float], held: dict[str, str]) -> str:
+    """Return the status in words, and add the parameters that the readings do not determine to ``held``."""
+    notes = list(climb.notes)
+    if not climb.converged and not notes:
+        notes.append("did not converge")
+    weights = value.point.weights
+    count = int((weights > 0).sum()) - 1 + int(weights[HIT] > 0)
+    if problem.readings < count:
+        readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
+        notes.append(f"{readings} cannot determine {count} parameters")
+    blocks = count_blocks(problem.pairs)
+    if problem.pairs.block is not None and blocks < _FEW_BLOCKS:
+        notes.append(f"standard errors are rough, from {blocks} {'block' if blocks == 1 else 'blocks'}")
+    for name in NAMES[:BIAS]:
+        if errors[name] == math.inf:
+            held[name] = "the readings do not determine it"
+    notes += [f"{name}: {reason}" for name, reason in held.items()]
+    return "; ".join(["converged" if climb.converged else "stopped", *notes])
+
+
+def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str, float]]:
+    """Return standard errors by name: over blocks if there are any, and as if readings were independent."""
+    independent = standard_errors(problem, value)
+    if problem.pairs.block is None:
+        return dict(independent), independent
+    return standard_errors(problem, value, block_scatter(problem, value.point)), independent
 
 
 def _held(problem: Problem, value: Value) -> dict[str, str]:
@@ -82,22 +107,29 @@ def _held(problem: Problem, value: Value) -> dict[str, str]:
     return held
 
 
-def _bias(problem: Problem, value: Value) -> tuple[float, float]:
-    """Return the offset of correct ranges and its standard error; to first order if it was not fitted."""
-    if value.totals[HIT] <= NOTHING:
-        return value.point.bias, math.nan
-    with_bias = Problem(problem.device, problem.pairs, problem.bounds, problem.prior, True)
-    error = standard_errors(with_bias, value)[NAMES[BIAS]]
+def _bias(problem: Problem, value: Value, climb: Climb, options: Options, start: Point) -> tuple[float, float, float]:
+    """Return the offset of correct ranges and its standard errors: over blocks, and for independent readings.
+
+    An offset that was not fitted comes from a search over all parameters; NaN if a search did not converge.
+    """
     if problem.fit_bias:
-        return value.point.bias, error
-    if math.isfinite(error):
-        # One Newton step from 0 in all coordinates.
-        return float(newton_direction(with_bias, value)[0][BIAS]), error
-    # Too far from the optimum for a Newton step: the mean of correct readings, weighted by their responsibilities.
-    correct = float(value.sums[1])
-    if correct <= 0:
-        return 0.0, error
-    return float(value.sums[12]) / correct, value.point.sigma / math.sqrt(correct)
+        errors, independent = _errors(problem, value)
+        return value.point.bias, errors[NAMES[BIAS]], independent[NAMES[BIAS]]
+    if not climb.converged or options.method == "em-book":
+        return math.nan, math.nan, math.nan
+    if value.totals[HIT] <= NOTHING:
+        return value.point.bias, math.nan, math.nan
+    joint = Problem(problem.device, problem.pairs, problem.bounds, problem.prior, True)
+    search = Search(joint, partial(_climb_joint, options), lambda iteration, value: None)
+    best = search.from_readings(start, [], value.point)
+    if not best.converged:
+        return math.nan, math.nan, math.nan
+    errors, independent = _errors(joint, joint.value(best.value.point, second=True))
+    return best.value.point.bias, errors[NAMES[BIAS]], independent[NAMES[BIAS]]
+
+
+def _climb_joint(options: Options, problem: Problem, start: Point, watch: Watch) -> Climb:
+    return climb_em(problem, start, max_iterations=_JOINT, tolerance=options.tolerance, watch=watch)
 
 
 def _responsibilities(device: DeviceSums, pairs: Pairs, point: Point) -> NDArray[np.float64]:

@@ -29,13 +29,18 @@ class BeamFit:
         converged: Whether the method converged, at an optimum of the likelihood; with ``"em-book"``, at a solution of
             the book's equations. ``status`` gives the reason for False.
         status: Summary of the fit in words.
-        standard_errors: Standard error of each parameter by name, from the observed information. NaN for a held
-            parameter (the weight of a cause that does not occur, a shape at a bound or of such a cause), infinite if
-            the readings do not determine it; ``held`` has the reasons.
+        standard_errors: Standard error of each parameter by name: with ``blocks=``, from the scatter over blocks; else
+            from the observed information, for independent readings. NaN for a held parameter (the weight of a cause
+            that does not occur, a shape at a bound or of such a cause), infinite if the readings do not determine it;
+            ``held`` has the reasons.
+        independent_errors: Standard errors as if readings were independent, by name; those of ``standard_errors``
+            without blocks.
+        blocks: Number of blocks that ``standard_errors`` are computed over; 0 without blocks.
         held: Reason why a parameter has no standard error, by name.
-        range_bias: Offset b of correct ranges, z = z* + b: fitted with ``range_bias=True``, else estimated to first
-            order [m].
-        range_bias_error: Standard error of ``range_bias`` [m].
+        range_bias: Offset b of correct ranges, z = z* + b [m]: its estimate of maximum likelihood, together with the
+            other parameters. Without ``range_bias=True`` it comes from a second search and is not in
+            ``parameters``. NaN if a search did not converge, and with ``"em-book"``, which has no offset.
+        range_bias_error: Standard error of ``range_bias`` [m], as in ``standard_errors``.
         bias_fitted: Whether the parameters were fitted together with the offset.
         iterations: Iterations of the method.
         passes: Passes over the pairs.
@@ -75,15 +80,18 @@ class BeamFit:
     method: str
     precision: str
     device: str
+    independent_errors: dict[str, float]
+    blocks: int
     responsibilities: NDArray[np.float64] | None = field(default=None, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all attributes but ``responsibilities`` as plain numbers, lists and strings; None if not finite."""
         names = ["log_likelihood", "converged", "status", "held", "bias_fitted", "iterations", "passes", "hits"]
-        names += ["max_readings", "missing", "outliers", "method", "precision", "device"]
+        names += ["max_readings", "missing", "outliers", "method", "precision", "device", "blocks"]
         return {
             "parameters": self.parameters.to_dict(),
             "standard_errors": {name: _finite(error) for name, error in self.standard_errors.items()},
+            "independent_errors": {name: _finite(error) for name, error in self.independent_errors.items()},
             "range_bias": _finite(self.range_bias),
             "range_bias_error": _finite(self.range_bias_error),
             "trace": [_finite(number) for number in self.trace.tolist()],
@@ -95,20 +103,31 @@ class BeamFit:
         return f"BeamFit({values}, converged={self.converged})"
 
     def __str__(self) -> str:
-        rows = [(name, value, self.standard_errors[name]) for name, value in self.parameters.to_dict().items()]
-        lines = [f"{'parameter':14}{'value':>13}{'std. error':>13}"]
-        for name, value, error in rows:
-            shown = f"{error:13.3g}" if math.isfinite(error) else f"{'inf' if error == math.inf else '-':>13}"
-            note = f"  {self.held[name]}" if name in self.held else ""
-            lines.append(f"{name:14}{value:13.6g}{shown} {_UNITS.get(name, ''):4}{note}".rstrip())
+        lines = [
+            f"{'parameter':14}{'value':>13}{'std. error':>13}{'if independent' if self.blocks else '':>16}".rstrip()
+        ]
+        for name, value in self.parameters.to_dict().items():
+            lines.append(self._row(name, value, self.standard_errors[name], self.held.get(name, "")))
         kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
-        lines.append(f"{'range_bias':14}{self.range_bias:13.6g}{self.range_bias_error:13.3g} m    {kind}")
+        lines.append(self._row("range_bias", self.range_bias, self.range_bias_error, kind))
+        if self.blocks:
+            lines.append(f"standard errors over {self.blocks} blocks of readings")
         lines.append(
             f"log-likelihood {self.log_likelihood:.6f} of {self.hits} hits and {self.max_readings} max readings; "
             f"{self.missing} missing, {self.outliers} unexplained"
         )
         lines.append(f"{self.method}, {self.iterations} iterations, {self.precision} on {self.device}: {self.status}")
         return "\n".join(lines)
+
+    def _row(self, name: str, value: float, error: float, note: str) -> str:
+        """Return a line of the table."""
+        number = f"{value:13.6g}" if math.isfinite(value) else f"{'-':>13}"
+        independent = f"{_error(self.independent_errors[name]):>16}" if self.blocks else ""
+        return f"{name:14}{number}{_error(error):>13}{independent} {_UNITS.get(name, ''):4}  {note}".rstrip()
+
+
+def _error(error: float) -> str:
+    return f"{error:.3g}" if math.isfinite(error) else "inf" if error == math.inf else "-"
 
 
 def _finite(number: float) -> float | None:

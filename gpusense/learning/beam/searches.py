@@ -158,7 +158,8 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
                 "maxiter": max_iterations + 1 - len(search.trace),
                 "xtol": 1e-4,
                 "ftol": 1e-13,
-                "direc": directions,
+                # SciPy changes the directions in place.
+                "direc": directions.copy(),
             },
         )
         if search.best.objective - before <= max(10 * tolerance, problem.noise(search.best)):

@@ -26,6 +26,10 @@ _FIRST, _SECOND = 1e-5, 1e-3
 _FLAT = 2e-6
 # Number of steps of the coarse search that precedes a search with many steps.
 _FEW = 100
+# Number of starts that are searched from, and of restarts of a search that ends before the gradient vanishes.
+_BEST, _RESTARTS = 3, 3
+# Information below this share of the largest, scaled to a diagonal of 1, counts as none.
+_FLAT_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -95,29 +99,48 @@ def learn_causes(ranges: object, expected: object, range_max: float, bins: int) 
     """Learn the most likely causes; see ``DiscreteBeamModel.learn``.
 
     The search is a quasi-Newton search over the logarithms of rates and sigma_hit and the log odds of detection, within
-    bounds beyond which the table does not change. It starts from the best two of a few starts; for many steps, from the
-    result of the same search with few steps.
+    bounds beyond which the table does not change. It starts from the best few of several starts, and the highest end is
+    the result; for many steps, the ends of the same searches with few steps are further starts.
     """
     data = count_pairs(ranges, expected, range_max, bins)
+    starts = _starts(data)
     if bins > 2 * _FEW:
         coarse = data.coarser(_FEW)
-        theta = min((_search(coarse, start) for start in _starts(coarse)[:2]), key=lambda result: result[0])[1]
-        theta[3] = max(theta[3], math.log(0.2 * data.width))
-        value, theta, trace = _search(data, theta)
-    else:
-        value, theta, trace = min((_search(data, start) for start in _starts(data)[:2]), key=lambda result: result[0])
+        for start in _starts(coarse)[:_BEST]:
+            theta = _search(coarse, start)[1]
+            theta[3] = max(theta[3], math.log(0.2 * data.width))
+            starts.append(theta)
+        starts.sort(key=lambda theta: _loss(data, theta))
+    value, theta, trace = min((_search(data, start) for start in starts[:_BEST]), key=lambda result: result[0])
     return _causes(theta), _fit(data, value, theta, trace)
 
 
 def _search(data: Counts, start: Floats) -> tuple[float, Floats, list[float]]:
     """Minimise the mean negative log-likelihood; return its minimum, the point, and the trace."""
     trace = [_loss(data, start)]
-    result = minimize(
-        lambda theta: _loss(data, theta), start, jac=lambda theta: _gradient(data, theta), method="L-BFGS-B",
-        bounds=_bounds(data), callback=lambda theta: trace.append(_loss(data, theta)),
-        options={"maxiter": 300, "ftol": 0.0, "gtol": 0.1 * _FLAT},
-    )  # fmt: skip
-    return float(result.fun), np.array(result.x), trace
+    for _ in range(_RESTARTS):
+        result = minimize(
+            lambda theta: _loss(data, theta), start, jac=lambda theta: _gradient(data, theta), method="L-BFGS-B",
+            bounds=_bounds(data), callback=lambda theta: trace.append(_loss(data, theta)),
+            options={"maxiter": 300, "ftol": 0.0, "gtol": 0.1 * _FLAT},
+        )  # fmt: skip
+        start = np.array(result.x)
+        if _is_flat(data, start):
+            break
+    return float(result.fun), start, trace
+
+
+def _pushed(data: Counts, theta: Floats) -> tuple[Floats, NDArray[np.bool]]:
+    """Return the gradient, and the mask of parameters at a bound across which the likelihood still rises."""
+    low, high = np.transpose(_bounds(data))
+    slope = _gradient(data, theta)
+    return slope, ((theta <= low + 1e-9) & (slope > 0)) | ((theta >= high - 1e-9) & (slope < 0))
+
+
+def _is_flat(data: Counts, theta: Floats) -> bool:
+    """Whether the gradient vanishes within the bounds."""
+    slope, pushed = _pushed(data, theta)
+    return bool((np.abs(slope)[~pushed] <= _FLAT).all())
 
 
 def _loss(data: Counts, theta: Floats) -> float:
@@ -131,11 +154,8 @@ def _gradient(data: Counts, theta: Floats) -> Floats:
 
 def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> DiscreteFit:
     low, high = np.transpose(_bounds(data))
-    slope = _gradient(data, theta)
-    # At a bound the likelihood may still rise towards the outside.
     at_low, at_high = theta <= low + 1e-9, theta >= high - 1e-9
-    pushed = (at_low & (slope > 0)) | (at_high & (slope < 0))
-    converged = bool((np.abs(slope)[~pushed] <= _FLAT).all())
+    converged = _is_flat(data, theta)
     errors = _standard_errors(data, theta, ~(at_low | at_high))
     status = "the gradient vanishes" if converged else "the search ended before the gradient vanished"
     ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
@@ -205,12 +225,27 @@ def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dic
         for b, two in enumerate(steps[:a]):
             mixed = loss(one, two) - loss(one, -two) - loss(-one, two) + loss(-one, -two)
             information[a, b] = information[b, a] = mixed / (4 * _SECOND**2)
-    # Without influence of a parameter, differences are rounding errors only.
-    determined = np.diagonal(information) > 1e-8
     errors = np.full(len(theta), np.nan)
-    inner = information[np.ix_(determined, determined)] * data.total
-    if determined.any() and np.linalg.eigvalsh(inner).min() > 0:
-        errors[places[determined]] = np.sqrt(np.diagonal(np.linalg.inv(inner)))
+    errors[places] = _errors(information * data.total)
     causes = _causes(theta)
     scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
     return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}
+
+
+def _errors(information: Floats) -> Floats:
+    """Return (m,) standard errors from the (m, m) information; NaN where a flat direction has a part.
+
+    Other parameters keep their standard errors: the flat directions are those of the matrix scaled to a diagonal of 1.
+    """
+    errors = np.full(len(information), np.nan)
+    # Without influence of a parameter, differences are rounding errors only.
+    places = np.flatnonzero(np.diagonal(information) > 1e-8 * max(float(np.diagonal(information).max(initial=0)), 0))
+    if not len(places):
+        return errors
+    scale = 1 / np.sqrt(np.diagonal(information)[places])
+    size, axes = np.linalg.eigh(information[np.ix_(places, places)] * np.outer(scale, scale))
+    known = size > _FLAT_SHARE * size[-1]
+    for place, factor, row in zip(places, scale, axes, strict=True):
+        if (np.abs(row[~known]) < 1e-3).all():
+            errors[place] = factor * math.sqrt(float((row[known] ** 2 / size[known]).sum()))
+    return errors

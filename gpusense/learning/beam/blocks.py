@@ -1,0 +1,115 @@
+"""Scatter of the likelihood's gradient over blocks of readings, for standard errors of correlated readings.
+
+Errors within a scan and between neighbouring scans are correlated. The inverse of the observed information H then is
+not the covariance of the parameters. With G_b the gradient of the log-likelihood of block b, and blocks independent of
+each other, it is
+
+    H^-1 (sum_b G_b G_b') H^-1,
+
+which is also right if the mixture is not the true distribution. The sum is centred and multiplied by B / (B - 1).
+
+Source: White (1982), "Maximum likelihood estimation of misspecified models"; Liang and Zeger (1986), "Longitudinal data
+analysis using generalized linear models".
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.learning.beam.pairs import Pairs
+from gpusense.learning.beam.point import BIAS, HIT, MAX, RAND, RATE, SHORT, SIGMA, Floats, Point
+from gpusense.learning.beam.problem import Problem
+from gpusense.world.scanner import Reading
+
+# Readings whose gradients are computed at once.
+_PART = 1 << 18
+
+
+def check_blocks(blocks: ArrayLike, shape: tuple[int, ...], pairs: Pairs) -> NDArray[np.intp]:
+    """Return the (n,) blocks of all readings, numbered from 0 in the order of their labels.
+
+    Raises:
+        TypeError: The labels are not integers.
+        ValueError: The shape differs from that of the readings, or fewer than 2 blocks have a reading.
+    """
+    labels = np.asarray(blocks)
+    if labels.dtype.kind not in "iu":
+        raise TypeError(f"blocks: must hold integers, got {checks.show(blocks)}")
+    if labels.shape != shape:
+        text = checks.shape_text(labels.shape)
+        raise ValueError(f"blocks: shape must be that of ranges, {checks.shape_text(shape)}, got {text}")
+    numbers = np.unique(labels.ravel(), return_inverse=True)[1].ravel()
+    count = len(np.unique(numbers[pairs.kinds != Reading.MISSING]))
+    if count < 2:
+        raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {count}")
+    return numbers
+
+
+def count_blocks(pairs: Pairs) -> int:
+    """Return the number of blocks with a reading that is not missing; 0 without blocks."""
+    return 0 if pairs.block is None else len(np.unique(pairs.block[pairs.kinds != Reading.MISSING]))
+
+
+def block_scatter(problem: Problem, point: Point) -> Floats:
+    """Compute the (7, 7) scatter over blocks of the log-likelihood's gradient by the coordinates.
+
+    The scatter is NaN for fewer than 2 blocks.
+    """
+    sums, counts = block_gradients(problem, point)
+    blocks = int(np.count_nonzero(counts))
+    if blocks < 2:
+        return np.full((7, 7), math.nan)
+    off = sums[counts > 0] - sums.sum(axis=0) / blocks
+    return (off.T @ off) * (blocks / (blocks - 1))
+
+
+def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the (B, 7) gradient of each block's log-likelihood and the (B,) numbers of readings."""
+    pairs = problem.pairs
+    assert pairs.block is not None
+    size = int(pairs.block.max(initial=-1)) + 1
+    of_hits, of_max = pairs.block[pairs.places], pairs.block[pairs.kinds == Reading.MAX]
+    counts = np.bincount(of_hits, minlength=size) + np.bincount(of_max, minlength=size)
+    sums = np.zeros((size, 7))
+    sums[:, MAX] = np.bincount(of_max, minlength=size)
+    sums[:, : RAND + 1] -= counts[:, None] * point.weights
+    causes = problem.device.causes(point)
+    for first in range(0, pairs.hits, _PART):
+        part = slice(first, first + _PART)
+        z, expected = (values[part].astype(np.float64) for values in (pairs.reading, pairs.expected))
+        terms = _terms(z, expected, causes[part, 1:], point, pairs.range_max)
+        for place, term in terms.items():
+            sums[:, place] += np.bincount(of_hits[part], term, size)
+    return sums, counts
+
+
+def _terms(z: Floats, expected: Floats, parts: Floats, point: Point, range_max: float) -> dict[int, Floats]:
+    """Return the gradient of each hit's log p by coordinate, without the weights' normalisation.
+
+    Args:
+        z: (m,) readings [m].
+        expected: (m,) expected ranges [m].
+        parts: (m, 3) responsibilities of hit, short and rand.
+        point: The parameters.
+        range_max: Longest range [m].
+    """
+    from scipy.special import ndtr
+
+    hit, short, rand = parts.T
+    mean = np.clip(expected + point.bias, 0, range_max)
+    u, x_0, x_1 = (z - mean) / point.sigma, mean / point.sigma, (range_max - mean) / point.sigma
+    phi_0, phi_1 = (np.exp(-0.5 * x * x) / math.sqrt(2 * math.pi) for x in (x_0, x_1))
+    mass = ndtr(x_1) - ndtr(-x_0)
+    by_sigma = u * u - 1 + (x_0 * phi_0 + x_1 * phi_1) / mass
+    by_bias = np.where(mean == expected + point.bias, u + (phi_1 - phi_0) / mass, 0) / point.sigma
+    x = np.clip(point.rate * expected, 1e-9, 700.0)
+    by_rate = 1 - x / np.expm1(x) - point.rate * z
+    return {
+        HIT: hit, SHORT: short, RAND: rand,
+        SIGMA: np.where(hit > 0, hit * by_sigma, 0.0), BIAS: np.where(hit > 0, hit * by_bias, 0.0),
+        RATE: np.where(short > 0, short * by_rate, 0.0),
+    }  # fmt: skip

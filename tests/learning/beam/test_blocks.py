@@ -1,0 +1,104 @@
+"""Standard errors over blocks of correlated readings."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
+
+import gpusense as gs
+from gpusense.learning.beam.blocks import block_gradients
+
+
+def errors(fit: gs.BeamFit) -> np.ndarray:
+    return np.array(list(fit.standard_errors.values()))
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.3])
+def test_gradients_of_blocks_add_up_to_the_gradient(bias: float, backend: str) -> None:
+    z, expected = draw(TYPICAL, 700, 2, low=0, high=1)
+    problem = problem_of(z, expected, backend=backend)
+    labels = np.arange(700) // 9
+    problem.pairs = dataclasses.replace(problem.pairs, block=labels)
+    at = point(0.6, 0.15, 0.05, 0.2, sigma=1.5, rate=0.4, bias=bias)
+    sums, counts = block_gradients(problem, at)
+    gradient = problem.value(at).gradient
+    assert counts.tolist() == np.bincount(labels).tolist()
+    np.testing.assert_allclose(sums.sum(axis=0), gradient, rtol=1e-9, atol=1e-9 * np.abs(sums).sum())
+    alone = problem_of(z[labels == 5], expected[labels == 5], backend="numpy").value(at).gradient
+    np.testing.assert_allclose(sums[5], alone, rtol=1e-9, atol=1e-9)
+
+
+def test_independent_readings_have_the_same_errors_in_blocks(needs) -> None:
+    """Errors over 2000 blocks are a share of 1 / sqrt(2 * 2000) = 1.6 % of themselves, or more for long tails."""
+    z, expected = draw(TYPICAL, 20_000, 3)
+    fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=needs("opencl"), blocks=np.arange(20_000) // 10)
+    independent = np.array([fit.independent_errors[name] for name in fit.standard_errors])
+    np.testing.assert_allclose(errors(fit), independent, rtol=0.12)
+    assert fit.blocks == 2000 and "if independent" in str(fit) and "over 2000 blocks" in str(fit)
+
+
+def test_repeated_readings_know_no_more_than_one(needs) -> None:
+    """Each reading 9 times in a block: the errors of a single reading each, 3 times as large as independent ones."""
+    backend = needs("opencl")
+    z, expected = draw(TYPICAL, 3000, 4)
+    once = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend, blocks=np.arange(3000))
+    labels = np.repeat(np.arange(3000), 9)
+    fit = gs.fit_beam_parameters(np.repeat(z, 9), np.repeat(expected, 9), RANGE_MAX, backend=backend, blocks=labels)
+    np.testing.assert_allclose(errors(fit), errors(once), rtol=1e-3)
+    plain = gs.fit_beam_parameters(np.repeat(z, 9), np.repeat(expected, 9), RANGE_MAX, backend=backend)
+    np.testing.assert_allclose(errors(plain), [fit.independent_errors[name] for name in fit.standard_errors], rtol=1e-9)
+    assert plain.blocks == 0 and 2.5 < np.median(errors(fit) / errors(plain)) < 3.5
+    assert fit.range_bias_error == pytest.approx(once.range_bias_error, rel=1e-3)
+
+
+def test_errors_over_blocks_are_those_of_repeated_experiments(needs) -> None:
+    """60 scans whose 20 readings share an error: the spread of sigma_hit and z_hit over 60 experiments."""
+    backend = needs("opencl")
+    values, claimed, independent = [], [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        expected = rng.uniform(2, 8, (60, 20))
+        z = expected + rng.normal(0, 1, (60, 1)) * 0.15 + rng.normal(0, 0.05, (60, 20))
+        lost = rng.uniform(size=(60, 20)) < rng.beta(0.5, 2, (60, 1))
+        z[lost] = rng.uniform(0, 10, int(lost.sum()))
+        labels = np.broadcast_to(np.arange(60)[:, None], (60, 20))
+        fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend, blocks=labels)
+        values.append([fit.parameters.z_hit, fit.parameters.sigma_hit])
+        claimed.append([fit.standard_errors[name] for name in ("z_hit", "sigma_hit")])
+        independent.append([fit.independent_errors[name] for name in ("z_hit", "sigma_hit")])
+    spread = np.std(values, axis=0, ddof=1)
+    # The spread of 60 values is known to 9 %.
+    assert (np.abs(np.median(claimed, axis=0) / spread - 1) < 0.3).all()
+    assert (np.median(independent, axis=0) < 0.6 * spread).all()
+
+
+def test_bins_of_incidence_have_errors_over_blocks() -> None:
+    z, expected = draw(TYPICAL, 800, 5)
+    angles = np.random.default_rng(0).uniform(0, 1.5, 800)
+    labels = np.arange(800) // 20
+    fit = gs.fit_incidence_parameters(z, expected, angles, RANGE_MAX, bins=2, backend="numpy", blocks=labels)
+    assert fit.pooled.blocks == 40 and all(own.blocks == 40 for own in fit.fits)
+    alone = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend="numpy", blocks=labels)
+    np.testing.assert_allclose(errors(fit.pooled), errors(alone), rtol=1e-6)
+
+
+def test_few_blocks_are_reported() -> None:
+    z, expected = draw(TYPICAL, 300, 6)
+    fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend="numpy", blocks=np.arange(300) // 100)
+    assert "standard errors are rough, from 3 blocks" in fit.status
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "blocks"),
+    [
+        (TypeError, "blocks: must hold integers", [0.5, 1.0]),
+        (ValueError, "blocks: shape must be that of ranges", [0, 1, 2]),
+        (ValueError, "blocks: must be at least 2 with a reading that is not missing, got 1", [3, 3]),
+    ],
+)
+def test_bad_blocks_are_refused(error: type, message: str, blocks: list) -> None:
+    with pytest.raises(error, match=message):
+        gs.fit_beam_parameters([1.0, 2.0], [1.5, 2.0], 10.0, backend="numpy", blocks=blocks)

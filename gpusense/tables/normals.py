@@ -42,7 +42,7 @@ def surface_normals(grid: OccupancyGrid, *, unknown: str = "free", outside: str 
 
     The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore that
     of a line through up to 17 sides of the wall's cells around it. The line ends at corners, so normals are right up to
-    the cell next to a corner: within 4 cells of one they are off by 2.7 degrees in the mean. Elsewhere on straight
+    the cell next to a corner: within 4 cells of one they are off by 2 degrees in the mean. Elsewhere on straight
     walls they are off by 0.8 degrees at any angle, and by 5 at most. A cell in a corner has the normal of one wall, or
     one between both. Where the outline is not straight, the normal is the direction of least variance (principal
     components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which occupied cells

@@ -37,7 +37,7 @@ class Span:
 # Earlier spans are preferred; among the windows of a span, the least residual. Nearly symmetric windows come first. A
 # window to one side is for corners only: on a bend it would show the direction of another place. A straight strip of
 # cells has residuals up to 0.09. Discs from a radius of 5 cells on pass as bends.
-SPANS = (Span(17, 8, 0.1), Span(11, 5, 0.1), Span(13, 0, 0.07, 2.0), Span(9, 0, 0.05, 1.2), Span(5, 0, 0.01, 0.8))
+SPANS = (Span(17, 8, 0.1), Span(11, 5, 0.1), Span(13, 0, 0.1, 2.0), Span(9, 0, 0.05, 1.2), Span(5, 0, 0.01, 0.8))
 CORNER = 5
 # Farthest side along the outline that a normal depends on.
 REACH = max(span.count - 1 - span.least for span in SPANS) + CORNER

@@ -55,7 +55,7 @@ def test_normals_near_the_corners_of_rooms(turned, thick, record_property):
         for size in ((41.3, 57.9), (33.8, 64.2))
     ]
     errors, corner = np.concatenate(found, axis=1)
-    for low, high, mean in ((1, 2, 5), (2, 4, 3.5), (4, 6, 2), (6, 10, 1.5), (10, math.inf, 1)):
+    for low, high, mean in ((1, 2, 4), (2, 4, 2.5), (4, 6, 2), (6, 10, 1.2), (10, math.inf, 1)):
         each = errors[(low <= corner) & (corner < high)]
         record_property(f"mean error {low} to {high} cells from a corner", float(each.mean()))
         assert len(each) and each.mean() <= mean
@@ -67,7 +67,7 @@ def test_normals_near_the_corners_of_rooms(turned, thick, record_property):
 
 def test_normals_at_the_corners_of_blocks():
     errors, corner = np.concatenate([Room(turn, (41.3, 57.9), block=True).errors() for turn in TURNS], axis=1)
-    for low, high, mean in ((2, 4, 3.5), (4, 6, 2), (6, math.inf, 1)):
+    for low, high, mean in ((2, 4, 2.5), (4, 6, 2), (6, math.inf, 1)):
         assert errors[(low <= corner) & (corner < high)].mean() <= mean
 
 
@@ -82,7 +82,7 @@ def test_bends_are_not_taken_for_corners(radius, solid):
     outwards = (normals * np.stack([x, y], axis=-1)).sum(axis=-1)[known] / far[known]
     error = np.degrees(np.arccos(np.minimum(outwards if solid else -outwards, 1)))
     assert known.sum() >= 5 * radius
-    assert error.mean() <= 3 and error.max() <= 9
+    assert error.mean() <= 3.2 and error.max() <= 9
 
 
 @pytest.mark.parametrize("thick", [1, 2, 3])
@@ -129,7 +129,7 @@ def analytic(scanner: gs.Scanner, poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rays", [3, 9, 33])
-@pytest.mark.parametrize("turn", [0.0, 0.35, math.pi / 4])
+@pytest.mark.parametrize("turn", [0.0, 0.1, 0.35, math.pi / 4])
 def test_sonars_in_a_room_hear_as_geometry_says(turn, rays, record_property):
     """Before outlines 36 % of these cones were without a return, but 28 % in the model, and fewer with more rays."""
     rng = np.random.default_rng(3)
@@ -149,4 +149,4 @@ def test_sonars_in_a_room_hear_as_geometry_says(turn, rays, record_property):
     record_property("without return, analytic", float(truth.mean()))
     assert truth.mean() > 0.3
     assert abs(silent.mean() - truth.mean()) <= (0.002 if turn == 0 else 0.008)
-    assert (silent != truth).mean() <= (0.003 if turn == 0 else 0.015)
+    assert (silent != truth).mean() <= (0.003 if turn == 0 else 0.02)

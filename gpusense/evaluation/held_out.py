@@ -99,14 +99,13 @@ def compare_held_out(
         raise ValueError("holdout: must hold out a reading that is not missing, got none")
     data = data.chosen(known)
     _, place = np.unique(data.block, return_inverse=True)
-    candidates = {"fitted": fitted}
     baseline = log_densities(fitted, data)
+    scored = [("fitted", fitted, baseline)]
     if np.isneginf(baseline).any():
-        candidates["fitted, softened"] = softened(fitted, readings)
-        baseline = log_densities(candidates["fitted, softened"], data)
-    rows = [_row("fitted", fitted, log_densities(fitted, data), baseline, place)]
-    if len(candidates) > 1:
-        rows.append(_row("fitted, softened", candidates["fitted, softened"], baseline, baseline, place))
+        soft = softened(fitted, readings)
+        baseline = log_densities(soft, data)
+        scored.append(("fitted, softened", soft, baseline))
+    rows = [_row(*each, baseline, place) for each in scored]
     if incidence is not None:
         rows += _incidence_rows(incidence, data, baseline, place)
     rows += [

@@ -177,12 +177,9 @@ def _fit(args: argparse.Namespace, data: RangeData) -> Result:
             data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias,
             blocks=blocks,
         )  # fmt: skip
-    bias = fit.range_bias if fit.bias_fitted else 0.0
     compared = []
     if rest is not None:
-        compared = compare_held_out(
-            fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias, incidence=incidence
-        )
+        compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, incidence=incidence)
     return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges))
 
 
@@ -239,18 +236,18 @@ def parameters_yaml(result: Result) -> str:
         "# For gpusense: gs.BeamParameters.from_dict(...) takes the mapping beam_model.",
         yaml.safe_dump({"beam_model": values}, sort_keys=False).rstrip(),
     ]
-    if result.fit.bias_fitted:
-        lines.append(f"# Subtract this from every reading [m].\nrange_bias: {float(result.fit.range_bias)!r}")
     if result.incidence is not None:
         lines.append("# For gpusense: gs.IncidenceParameters.from_dict(...).")
         lines.append(
             yaml.safe_dump({"incidence_model": result.incidence.parameters.to_dict()}, sort_keys=False).rstrip()
         )
-    nav2 = {"laser_model_type": "beam", **values, "laser_max_range": float(result.data.range_max)}
+    own = ("range_bias", "sigma_growth")
+    shared = {name: value for name, value in values.items() if name not in own}
+    nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
     lines += [
         "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
         "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
-        "# to its likelihood field, which this fit does not cover.",
+        "# to its likelihood field, which this fit does not cover. It has no range_bias.",
         yaml.safe_dump({"amcl": {"ros__parameters": nav2}}, sort_keys=False).rstrip(),
     ]
     return "\n".join(lines) + "\n"
@@ -264,13 +261,13 @@ def _write(folder: Path, result: Result) -> list[Path]:
     text = parameters_yaml(result).encode()
     file = folder / "parameters.yaml"
     write_whole(file, lambda stream: stream.write(text))
-    parameters, bias = result.fit.parameters, result.fit.range_bias if result.fit.bias_fitted else 0.0
+    parameters = result.fit.parameters
     distances = fit_plots.distances_of(result.data)
     figures = [
         fit_plots.readings_figure(result.data, distances),
-        fit_plots.density_figure(result.data, parameters, distances, bias),
+        fit_plots.density_figure(result.data, parameters, distances),
         fit_plots.trace_figure(result.fit.trace, result.fit.method),
-        fit_plots.surface_figure(result.data, parameters, bias),
+        fit_plots.surface_figure(result.data, parameters),
     ]
     names = list(_PICTURES)
     if result.incidence is not None:

@@ -77,7 +77,6 @@ def compare_held_out(
     data: RangeData,
     *,
     readings: int,
-    range_bias: float = 0.0,
     incidence: IncidenceFit | None = None,
 ) -> list[HeldOut]:
     """Score held-out readings with fitted parameters and with the defaults of nav2_amcl and Beluga.
@@ -90,7 +89,6 @@ def compare_held_out(
         fitted: Parameters fitted without ``data``.
         data: The held-out readings.
         readings: Number of readings that the parameters were fitted to.
-        range_bias: Fitted offset, subtracted from the readings before they are scored [m].
         incidence: Fit by angles of incidence, or None; ``data`` then has angles.
 
     Raises:
@@ -101,14 +99,13 @@ def compare_held_out(
         raise ValueError("holdout: must hold out a reading that is not missing, got none")
     data = data.chosen(known)
     _, place = np.unique(data.block, return_inverse=True)
-    candidates = {"fitted": fitted}
-    baseline = log_densities(fitted, data, range_bias)
+    baseline = log_densities(fitted, data)
+    scored = [("fitted", fitted, baseline)]
     if np.isneginf(baseline).any():
-        candidates["fitted, softened"] = softened(fitted, readings)
-        baseline = log_densities(candidates["fitted, softened"], data, range_bias)
-    rows = [_row("fitted", fitted, log_densities(fitted, data, range_bias), baseline, place)]
-    if len(candidates) > 1:
-        rows.append(_row("fitted, softened", candidates["fitted, softened"], baseline, baseline, place))
+        soft = softened(fitted, readings)
+        baseline = log_densities(soft, data)
+        scored.append(("fitted, softened", soft, baseline))
+    rows = [_row(*each, baseline, place) for each in scored]
     if incidence is not None:
         rows += _incidence_rows(incidence, data, baseline, place)
     rows += [
@@ -157,21 +154,19 @@ def incidence_log_densities(fit: IncidenceFit, data: RangeData) -> Floats:
     place = np.digitize(data.incidence, edges[1:-1])
     place[np.isnan(data.incidence)] = bins
     sets = [*fit.parameters.parameters, fit.parameters.no_surface or fit.parameters.parameters[0]]
-    fits = [*fit.fits, fit.no_surface or fit.fits[0]]
     log_p = np.zeros(len(data.ranges))
-    for number, (parameters, own) in enumerate(zip(sets, fits, strict=True)):
-        bias = own.range_bias if own.bias_fitted else 0.0
-        log_p[place == number] = log_densities(parameters, data.chosen(place == number), bias)
+    for number, parameters in enumerate(sets):
+        log_p[place == number] = log_densities(parameters, data.chosen(place == number))
     return log_p
 
 
-def log_densities(parameters: BeamParameters, data: RangeData, range_bias: float = 0.0) -> Floats:
+def log_densities(parameters: BeamParameters, data: RangeData) -> Floats:
     """Return (n,) log p of readings that are not missing: densities [1/m] of ranges, probabilities of no return."""
     from gpusense.models.scan.densities import log_mixture  # loads SciPy
 
     z, top = data.ranges, data.range_max
     hit = data.kinds == Reading.HIT
-    z = np.where(hit, np.clip(z - range_bias, 0, np.nextafter(top, 0)), top)
+    z = np.where(hit, np.clip(z, 0, np.nextafter(top, 0)), top)
     log_p = [
         log_mixture(z[first : first + _BLOCK], data.expected[first : first + _BLOCK], range_max=top,
                     **parameters.to_dict())

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.interface import casters
+from gpusense.interface.constants import MIXTURE_TERMS
 from gpusense.interface.structs import STRUCTS
 
 FLAGS = {
@@ -24,6 +25,8 @@ FLAGS = {
     "HIT": "z_hit > 0",
     "SHORT": "z_short > 0",
     "RAND": "z_rand > 0",
+    "BIAS": "range_bias is not 0",
+    "GROWTH": "sigma_hit grows with range",
     "SHARP": "the normal density's peak is so high that exponents need more than the working precision",
     "SINGLE": "the mixture has one continuous component",
     "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
@@ -182,7 +185,7 @@ _FEATURE_RESULT = (
     "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",
 )  # fmt: skip
 _TERMS = (
-    "real terms [10 * tables.incidence_bins]", "real edges [tables.incidence_bins]",
+    f"real terms [{MIXTURE_TERMS} * tables.incidence_bins]", "real edges [tables.incidence_bins]",
     "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
 )  # fmt: skip
 # With SCANS: where the rays or end points of each scan begin, and its constant term.

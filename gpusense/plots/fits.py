@@ -77,26 +77,23 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
     return figure
 
 
-def density_figure(
-    data: RangeData, parameters: BeamParameters, distances: list[float], range_bias: float = 0.0
-) -> Figure:
+def density_figure(data: RangeData, parameters: BeamParameters, distances: list[float]) -> Figure:
     """Draw histograms of readings around some expected ranges, with the fitted density (book figure 6.6).
 
     Args:
         data: The readings.
         parameters: The fitted parameters.
         distances: The expected ranges [m].
-        range_bias: Fitted offset of the readings [m].
     """
     figure = new_figure(5.0 * max(len(distances), 1), 4.2)
     axes = figure.subplots(1, max(len(distances), 1), squeeze=False)[0]
     for ax, distance in zip(axes, distances, strict=False):
-        _density_panel(ax, data, parameters, distance, range_bias)
+        _density_panel(ax, data, parameters, distance)
     axes[0].set_ylabel("density [1/m]")
     return figure
 
 
-def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distance: float, range_bias: float) -> None:
+def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distance: float) -> None:
     """Draw the histogram of the readings around one expected range, with the fitted density."""
     from gpusense.models.scan.densities import log_mixture
 
@@ -112,8 +109,7 @@ def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distan
     z = z[(z >= 0) & (z < min(top, data.range_max))]
     # The density is the mean over the expected ranges of these readings.
     expected = _spaced(data.expected[near], 60)
-    shifted = np.clip(z - range_bias, 0, np.nextafter(data.range_max, 0))
-    log_p = log_mixture(shifted, expected[:, None], range_max=data.range_max, **parameters.to_dict())
+    log_p = log_mixture(z, expected[:, None], range_max=data.range_max, **parameters.to_dict())
     ax.plot(
         z,
         np.exp(log_p).mean(axis=0) if len(expected) else np.zeros_like(z),
@@ -148,13 +144,12 @@ def trace_figure(trace: NDArray[np.float64], method: str) -> Figure:
     return figure
 
 
-def surface_figure(data: RangeData, parameters: BeamParameters, range_bias: float = 0.0) -> Figure:
+def surface_figure(data: RangeData, parameters: BeamParameters) -> Figure:
     """Draw log p(z | z*) over readings and expected ranges; the title has log p of a reading without return.
 
     Args:
         data: The readings, which set the extent.
         parameters: The fitted parameters.
-        range_bias: Fitted offset of the readings [m].
     """
     from gpusense.models.scan.densities import log_mixture
 
@@ -162,8 +157,7 @@ def surface_figure(data: RangeData, parameters: BeamParameters, range_bias: floa
     ax = figure.subplots()
     top = _top(data)
     middle = (np.arange(400) + 0.5) * top / 400
-    z = np.clip(middle - range_bias, 0, np.nextafter(data.range_max, 0))
-    log_p = log_mixture(z[:, None], middle, range_max=data.range_max, **parameters.to_dict())
+    log_p = log_mixture(middle[:, None], middle, range_max=data.range_max, **parameters.to_dict())
     finite = log_p[np.isfinite(log_p)]
     low = float(finite.min()) if len(finite) else -1.0
     low = max(low, float(finite.max()) - 25) if len(finite) else low
@@ -180,12 +174,12 @@ def incidence_figure(fit: IncidenceFit) -> Figure:
     axes = figure.subplots(2, 3).flat
     edges = np.degrees(fit.parameters.edges)
     middle = 0.5 * (edges[1:] + edges[:-1])
-    for ax, (name, pooled) in zip(axes, fit.pooled.parameters.to_dict().items(), strict=True):
+    for ax, name in zip(axes, fit.pooled.standard_errors, strict=True):
         values = [getattr(parameters, name) for parameters in fit.parameters.parameters]
         errors = np.array([bin_fit.standard_errors[name] for bin_fit in fit.fits])
         ax.stairs(values, edges, color=BEAM, baseline=None)
         ax.errorbar(middle, values, np.where(np.isfinite(errors), errors, 0), fmt=".", color=BEAM, capsize=2)
-        ax.axhline(pooled, color=FRAME, ls="--", lw=0.8)
+        ax.axhline(getattr(fit.pooled.parameters, name), color=FRAME, ls="--", lw=0.8)
         ax.set(title=name, xlabel="angle of incidence [deg]", xlim=(0, 90))
     return figure
 

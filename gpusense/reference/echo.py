@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface import structs
+from gpusense.interface.constants import MIXTURE_TERMS
 from gpusense.reference.ranges import BLOCK, caster_of
 from gpusense.reference.ray import Ray, crossed, expected_range, make_ray, off_grid
 
@@ -59,9 +60,9 @@ def hit_normal(
 
 
 def incidence_terms(terms: np.ndarray, edges: np.ndarray, incidence_bins: int, cosine: np.ndarray) -> np.ndarray:
-    """Return (10, ...) terms of the mixture for angles of incidence; edges are cosines of the bins' upper ends."""
+    """Return (14, ...) terms of the mixture for angles of incidence; edges are cosines of the bins' upper ends."""
     bins = (cosine[..., None] <= edges[: incidence_bins - 1]).sum(axis=-1)
-    return np.moveaxis(terms[: 10 * incidence_bins].reshape(incidence_bins, 10)[bins], -1, 0)
+    return np.moveaxis(terms[: MIXTURE_TERMS * incidence_bins].reshape(incidence_bins, MIXTURE_TERMS)[bins], -1, 0)
 
 
 def nearest_echo(

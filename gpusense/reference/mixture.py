@@ -1,8 +1,9 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of
-terms 0 and 1). In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max;
-in the log domain they are the logarithms of these.
+``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of terms
+0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part). In the linear domain hit is z_hit /
+(sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain they are the logarithms of these.
+The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
-from gpusense.reference.error_free import two_product
+from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
 
 TINY = 1e-30
 SMALLEST_RANGE = 1e-37
@@ -22,27 +23,63 @@ def hit_mass(expected: np.ndarray, erf_scale: float, range_max: np.floating) -> 
     return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
 
 
+def mean_range(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return the mean of p_hit."""
+    return np.clip(expected + terms[10], 0, terms[6]) if "BIAS" in flags else expected
+
+
+def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> Pair:
+    """Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel."""
+    off = z - expected
+    none = np.zeros_like(off)
+    if "BIAS" not in flags:
+        return off, none
+    mean = mean_range(flags, expected, terms)
+    high, low = pair_sum(two_sum(z, -expected), (none - terms[10], none - terms[11]))
+    moved = mean == expected + terms[10]
+    return np.where(moved, high, z - mean), np.where(moved, low, none)
+
+
+def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> Pair:
+    """Return sigma_hit / sigma at ranges as a sum of two numbers."""
+    one, none = np.ones_like(expected), np.zeros_like(expected)
+    if "GROWTH" not in flags:
+        return one, none
+    if "SHARP" not in flags:
+        return one / (one + terms[12] * expected), none
+    growth = pair_product((terms[12] + none, terms[13] + none), (expected, none))
+    x = pair_sum((one, none), growth)
+    y = one / x[0]
+    back = two_product(y, x[0])
+    return y, (((one - back[0]) - back[1]) - y * x[1]) * y
+
+
 def hit_exponent(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``(z - z*)^2 / (2 sigma^2)`` as a sum of two numbers.
+    """Return ``(z - mean)^2 / (2 sigma^2)`` as a sum of two numbers.
 
     Where the density's peak is high, exponent and log peak are large and nearly cancel; the second part keeps the
     digits that remain.
     """
-    off = z - expected
+    off, off_low = hit_offset(flags, z, expected, terms)
+    scale = hit_scale(flags, expected, terms)
     if "SHARP" not in flags:
-        return off * (off * terms[1]), np.zeros_like(off)
-    square = two_product(off, off)
-    product = two_product(square[0], terms[1])
-    return product[0], product[1] + (square[1] * terms[1] + square[0] * terms[9])
+        scaled = off * scale[0]
+        return scaled * (scaled * terms[1]), np.zeros_like(off)
+    square, square_low = two_product(off, off)
+    square_low = square_low + 2 * off * off_low
+    product = two_product(square, terms[1])
+    exponent = product[0], product[1] + (square_low * terms[1] + square * terms[9])
+    return pair_product(exponent, pair_product(scale, scale)) if "GROWTH" in flags else exponent
 
 
 def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return ``log(z_hit p_hit(z | z*))``; terms are those of the log domain."""
     exponent = hit_exponent(flags, z, expected, terms)
-    log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1])
-    return log_p - np.log(hit_mass(expected, terms[2], terms[6]))
+    scale = hit_scale(flags, expected, terms)[0]
+    log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1]) + np.log(scale)
+    return log_p - np.log(hit_mass(mean_range(flags, expected, terms), terms[2] * scale, terms[6]))
 
 
 def short_factor(x: np.ndarray) -> np.ndarray:
@@ -74,7 +111,9 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
         p = np.zeros(z.shape, terms.dtype)
         if "HIT" in flags:
             exponent = hit_exponent(flags, z, expected, terms)
-            p += terms[0] * np.exp(-exponent[0]) * (1 - exponent[1]) / hit_mass(expected, terms[2], terms[6])
+            scale = hit_scale(flags, expected, terms)[0]
+            mass = hit_mass(mean_range(flags, expected, terms), terms[2] * scale, terms[6])
+            p += terms[0] * scale * np.exp(-exponent[0]) * (1 - exponent[1]) / mass
         if "SHORT" in flags:
             density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)
             p += np.where((z <= expected) & (expected > 0), density, 0)

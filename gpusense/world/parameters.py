@@ -88,11 +88,22 @@ class BeamParameters(_Parameters):
     """The standard deviation of a correct range, > 0 [m] (equation 6.4)."""
     lambda_short: float = 0.2
     """The rate of unexpected objects along the beam, >= 0 [1/m] (equation 6.6)."""
+    range_bias: float = 0.0
+    """The offset of a correct range [m]: its mean is z* + range_bias, clamped to [0, range_max]."""
+    sigma_growth: float = 0.0
+    """The growth of the standard deviation with range, >= 0 [1]: it is sigma_hit + sigma_growth z*."""
 
     def __post_init__(self) -> None:
         self._check_weights("z_hit", "z_short", "z_max", "z_rand")
         self._check("sigma_hit", above=0)
         self._check("lambda_short", low=0)
+        self._check("range_bias")
+        self._check("sigma_growth", low=0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields by name; range_bias and sigma_growth only where they are not 0."""
+        values = super().to_dict()
+        return {name: value for name, value in values.items() if value or name not in ("range_bias", "sigma_growth")}
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 // incidence lies between the ray and the normal of the surface that it hits. The table of normals has a ring of cells
 // around the map. It holds 0 for free cells and NaN for occupied cells without a normal, at which the cosine counts as
 // 1.
-// requires: caster
+// requires: caster mixture
 
 #if ECHO
 // Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2 is
@@ -47,7 +47,7 @@ global const real *incidence_terms(global const real *terms, global const real *
                                    const real cosine) {
     int bin = 0;
     while (bin + 1 < incidence_bins && cosine <= edges[bin]) ++bin;
-    return terms + 10 * bin;
+    return terms + MIXTURE_TERMS * bin;
 }
 #endif
 

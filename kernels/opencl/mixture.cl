@@ -1,9 +1,11 @@
-// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom. terms[10]
-// = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of terms 0
-// and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in
-// the log domain they are the logarithms of these.
+// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom. terms[14]
+// = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of terms 0 and
+// 1, range_bias and its low part, sigma_growth / sigma_hit and its low part}. In the linear domain hit is z_hit / (sigma
+// sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain they are the logarithms of these. The
+// mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
 // requires: error_free
 
+#define MIXTURE_TERMS 14
 // From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
@@ -21,23 +23,80 @@ real hit_mass(const real expected, const real erf_scale, const real range_max) {
     return (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
 }
 
-// Return (z - z*)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
+// Return the mean of p_hit.
+real mean_range(const real expected, global const real *terms) {
+#if BIAS
+    const real mean = expected + terms[10];
+    return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
+#else
+    return expected;
+#endif
+}
+
+// Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel.
+real2 hit_offset(const real z, const real expected, global const real *terms) {
+#if BIAS
+    const real mean = mean_range(expected, terms);
+    if (mean != expected + terms[10]) return (real2)(z - mean, 0);
+    return pair_sum(two_sum(z, -expected), (real2)(-terms[10], -terms[11]));
+#else
+    return (real2)(z - expected, 0);
+#endif
+}
+
+// Return sigma_hit / sigma at a range as a sum of two numbers.
+real2 hit_scale(const real expected, global const real *terms) {
+#if GROWTH
+#if SHARP
+    const real2 growth = pair_product((real2)(terms[12], terms[13]), (real2)(expected, 0));
+    const real2 x = pair_sum((real2)(1, 0), growth);
+    const real y = 1 / x.x;
+    const real2 back = two_product(y, x.x);
+    return (real2)(y, (((1 - back.x) - back.y) - y * x.y) * y);
+#else
+    return (real2)(1 / (1 + terms[12] * expected), 0);
+#endif
+#else
+    return (real2)(1, 0);
+#endif
+}
+
+// Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
 // large and nearly cancel; the second part keeps the digits that remain.
 real2 hit_exponent(const real z, const real expected, global const real *terms) {
-    const real off = z - expected;
+    const real2 off = hit_offset(z, expected, terms);
 #if SHARP
-    const real2 square = two_product(off, off);
+    real2 square = two_product(off.x, off.x);
+#if BIAS
+    square.y += 2 * off.x * off.y;
+#endif
     const real2 product = two_product(square.x, terms[1]);
-    return (real2)(product.x, product.y + (square.y * terms[1] + square.x * terms[9]));
+    const real2 exponent = (real2)(product.x, product.y + (square.y * terms[1] + square.x * terms[9]));
+#if GROWTH
+    const real2 scale = hit_scale(expected, terms);
+    return pair_product(exponent, pair_product(scale, scale));
 #else
-    return (real2)(off * (off * terms[1]), 0);
+    return exponent;
+#endif
+#else
+#if GROWTH
+    const real scaled = off.x * hit_scale(expected, terms).x;
+    return (real2)(scaled * (scaled * terms[1]), 0);
+#else
+    return (real2)(off.x * (off.x * terms[1]), 0);
+#endif
 #endif
 }
 
 // Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
 real log_hit(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
-    const real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
+    const real scale = hit_scale(expected, terms).x;
+    real log_p = (terms[0] - exponent.x) + (terms[8] - exponent.y);
+#if GROWTH
+    log_p += log(scale);
+#endif
+    const real mass = hit_mass(mean_range(expected, terms), terms[2] * scale, terms[6]);
     return mass == 1 ? log_p : log_p - log(mass);
 }
 #endif
@@ -70,7 +129,9 @@ real log_density(const real z, const real expected, global const real *terms) {
     real p = 0;
 #if HIT
     const real2 exponent = hit_exponent(z, expected, terms);
-    const real hit = terms[0] * exp(-exponent.x) * (1 - exponent.y), mass = hit_mass(expected, terms[2], terms[6]);
+    const real scale = hit_scale(expected, terms).x;
+    const real hit = terms[0] * scale * exp(-exponent.x) * (1 - exponent.y);
+    const real mass = hit_mass(mean_range(expected, terms), terms[2] * scale, terms[6]);
     p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT

@@ -13,6 +13,7 @@ import warp as wp
 
 from . import ray as ray_file
 from . import rectangles as rectangles_file
+from .mixture import MIXTURE_TERMS
 from .prelude import kernel, precision
 from .ranges import caster_of
 
@@ -83,7 +84,7 @@ def functions(flags):
         bin = int(0)
         while bin + 1 < incidence_bins and cosine <= edges[bin]:
             bin += 1
-        return terms[10 * bin :]
+        return terms[MIXTURE_TERMS * bin :]
 
     # Return the nearest return of a cone's rays, which begin at index first. A ray whose angle of incidence has a
     # cosine below critical has none: the surface reflects it like a mirror.

@@ -1,8 +1,9 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-terms[10] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, and the low parts of
-terms 0 and 1}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max;
-in the log domain they are the logarithms of these.
+terms[14] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of terms
+0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part}. In the linear domain hit is z_hit /
+(sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain they are the logarithms of these.
+The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
 """
 
 import functools
@@ -14,21 +15,27 @@ import warp as wp
 from . import error_free
 from .prelude import precision, reader
 
+MIXTURE_TERMS = 14
+
 
 @functools.cache
 def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
-    two_product = error_free.functions(flags).two_product
+    exact = error_free.functions(flags)
+    two_sum, two_product = exact.two_sum, exact.two_product
+    pair_sum, pair_product = exact.pair_sum, exact.pair_product
     SHARP = "SHARP" in flags
+    BIAS = "BIAS" in flags
+    GROWTH = "GROWTH" in flags
     at = reader(real)
     HIT = "HIT" in flags
     LINEAR = "LINEAR" in flags
     SHORT = "SHORT" in flags
     RAND = "RAND" in flags
     SINGLE = "SINGLE" in flags
-    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+    ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
     NEVER = real(-math.inf)
     # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
@@ -54,24 +61,71 @@ def functions(flags):
             rest += wp.erf(nearer)
         return HALF * rest
 
-    # Return (z - z*)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak
+    # Return the mean of p_hit.
+    @wp.func
+    def mean_range(expected: real, terms: wp.array(dtype=real)):
+        mean = expected
+        if BIAS:
+            mean = wp.clamp(expected + at(terms, 10), ZERO, at(terms, 6))
+        return mean
+
+    # Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel.
+    @wp.func
+    def hit_offset(z: real, expected: real, terms: wp.array(dtype=real)):
+        if BIAS:
+            mean = mean_range(expected, terms)
+            off = vec2(z - mean, ZERO)
+            if mean == expected + at(terms, 10):
+                off = pair_sum(two_sum(z, -expected), vec2(-at(terms, 10), -at(terms, 11)))
+            return off
+        else:
+            return vec2(z - expected, ZERO)
+
+    # Return sigma_hit / sigma at a range as a sum of two numbers.
+    @wp.func
+    def hit_scale(expected: real, terms: wp.array(dtype=real)):
+        scale = vec2(ONE, ZERO)
+        if GROWTH:
+            if SHARP:
+                growth = pair_product(vec2(at(terms, 12), at(terms, 13)), vec2(expected, ZERO))
+                x = pair_sum(vec2(ONE, ZERO), growth)
+                y = ONE / x.x
+                back = two_product(y, x.x)
+                scale = vec2(y, (((ONE - back.x) - back.y) - y * x.y) * y)
+            else:
+                scale = vec2(ONE / (ONE + at(terms, 12) * expected), ZERO)
+        return scale
+
+    # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak
     # are large and nearly cancel; the second part keeps the digits that remain.
     @wp.func
     def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
-        off = z - expected
+        off = hit_offset(z, expected, terms)
         if SHARP:
-            square = two_product(off, off)
+            square = two_product(off.x, off.x)
+            if BIAS:
+                square = vec2(square.x, square.y + TWO * off.x * off.y)
             product = two_product(square.x, at(terms, 1))
-            return vec2(product.x, product.y + (square.y * at(terms, 1) + square.x * at(terms, 9)))
+            exponent = vec2(product.x, product.y + (square.y * at(terms, 1) + square.x * at(terms, 9)))
+            if GROWTH:
+                scale = hit_scale(expected, terms)
+                exponent = pair_product(exponent, pair_product(scale, scale))
+            return exponent
         else:
-            return vec2(off * (off * at(terms, 1)), ZERO)
+            scaled = off.x
+            if GROWTH:
+                scaled = off.x * hit_scale(expected, terms).x
+            return vec2(scaled * (scaled * at(terms, 1)), ZERO)
 
     # Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
         exponent = hit_exponent(z, expected, terms)
+        scale = hit_scale(expected, terms).x
         log_p = (at(terms, 0) - exponent.x) + (at(terms, 8) - exponent.y)
-        mass = hit_mass(expected, at(terms, 2), at(terms, 6))
+        if GROWTH:
+            log_p += wp.log(scale)
+        mass = hit_mass(mean_range(expected, terms), at(terms, 2) * scale, at(terms, 6))
         if mass == ONE:
             return log_p
         return log_p - wp.log(mass)
@@ -111,8 +165,9 @@ def functions(flags):
             p = real(0.0)
             if HIT:
                 exponent = hit_exponent(z, expected, terms)
-                hit = at(terms, 0) * wp.exp(-exponent.x) * (ONE - exponent.y)
-                mass = hit_mass(expected, at(terms, 2), at(terms, 6))
+                scale = hit_scale(expected, terms).x
+                hit = at(terms, 0) * scale * wp.exp(-exponent.x) * (ONE - exponent.y)
+                mass = hit_mass(mean_range(expected, terms), at(terms, 2) * scale, at(terms, 6))
                 if mass == ONE:
                     p += hit
                 else:

@@ -95,7 +95,7 @@ class IncidenceFit:
         )
 
     def __str__(self) -> str:
-        names = list(self.pooled.parameters.to_dict())
+        names = [*self.pooled.standard_errors, *(["range_bias"] if self.pooled.bias_fitted else [])]
         lines = [f"{'incidence [deg]':16}{'readings':>10}" + "".join(f"{name:>14}" for name in names)]
         edges = np.degrees(self.parameters.edges)
         bins = [f"{low:.0f} to {high:.0f}" for low, high in pairwise(edges)]
@@ -103,7 +103,7 @@ class IncidenceFit:
         if self.no_surface is not None:
             rows.append(("no surface", self.no_surface_count, self.no_surface))
         for name, count, fit in rows:
-            numbers = "".join(f"{value:14.5g}" for value in fit.parameters.to_dict().values())
+            numbers = "".join(f"{getattr(fit.parameters, parameter):14.5g}" for parameter in names)
             lines.append(f"{name:16}{count:10}{numbers}{'' if fit.converged else '  ' + fit.status}")
         lines.append(
             f"'all' are those with a surface; a prior of {self.strength:g} pseudo-readings like them in each row"
@@ -235,7 +235,7 @@ class _Binned:
         self, device: tuple[Backend, np.dtype], bounds: Bounds, options: Options, pooled: BeamFit, strength: float
     ) -> None:
         self._device, self._bounds, self._options, self._strength = device, bounds, options, strength
-        self._start = Point.of(pooled.parameters, pooled.range_bias if options.range_bias else 0.0)
+        self._start = Point.of(pooled.parameters)
         start = self._start
         self._prior = Prior(strength * start.weights, start.sigma, start.rate, start.bias)
 

@@ -118,8 +118,10 @@ def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds) -> Point:
     """Make the start of a search from a user's parameters, without the causes that no reading can have.
 
     Raises:
-        ValueError: The remaining causes do not explain the readings.
+        ValueError: The remaining causes do not explain the readings, or sigma_hit grows with range.
     """
+    if initial.sigma_growth:
+        raise ValueError(f"initial: sigma_growth must be 0, since it is not learned, got {checks.show(initial)}")
     point = bounds.hold(Point.of(initial))
     weights = np.where(possible_causes(pairs), point.weights, 0)
     if (pairs.hits and not weights[[0, 1, 3]].any()) or (pairs.max_readings and not weights[2]):

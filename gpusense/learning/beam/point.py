@@ -43,16 +43,16 @@ class Point:
     bias: float = 0.0
 
     @classmethod
-    def of(cls, parameters: BeamParameters, bias: float = 0.0) -> Point:
+    def of(cls, parameters: BeamParameters) -> Point:
         """Make the point of a set of parameters, with weights normalised to sum 1."""
         p = parameters
         weights = np.array([p.z_hit, p.z_short, p.z_max, p.z_rand])
-        return cls(weights / weights.sum(), p.sigma_hit, p.lambda_short, bias)
+        return cls(weights / weights.sum(), p.sigma_hit, p.lambda_short, p.range_bias)
 
     def parameters(self) -> BeamParameters:
         """Return the parameters of the model."""
         hit, short, top, rand = self.weights.tolist()
-        return BeamParameters(hit, short, top, rand, self.sigma, self.rate)
+        return BeamParameters(hit, short, top, rand, self.sigma, self.rate, self.bias)
 
     def coordinates(self) -> Floats:
         """Return the (7,) coordinates, see the module's docstring; -inf for a weight of 0."""

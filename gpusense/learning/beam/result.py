@@ -106,8 +106,8 @@ class BeamFit:
         lines = [
             f"{'parameter':14}{'value':>13}{'std. error':>13}{'if independent' if self.blocks else '':>16}".rstrip()
         ]
-        for name, value in self.parameters.to_dict().items():
-            lines.append(self._row(name, value, self.standard_errors[name], self.held.get(name, "")))
+        for name, error in self.standard_errors.items():
+            lines.append(self._row(name, getattr(self.parameters, name), error, self.held.get(name, "")))
         kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
         lines.append(self._row("range_bias", self.range_bias, self.range_bias_error, kind))
         if self.blocks:

@@ -164,7 +164,8 @@ def _next_rate(parts: Floats, z: Floats, x: Floats, rate: Floats, bounds: Bounds
     lengths = (parts * z).sum(axis=0)
     likely = (parts * (1 - x / np.expm1(x))).sum(axis=0)
     known = (lengths > 0) & (likely > 0)
-    return np.where(known, np.clip(likely / np.where(known, lengths, 1.0), *bounds.rate), rate)
+    with np.errstate(over="ignore"):
+        return np.where(known, np.clip(likely / np.where(known, lengths, 1.0), *bounds.rate), rate)
 
 
 def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, rate: Floats, bias: Floats) -> Floats:

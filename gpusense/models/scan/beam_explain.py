@@ -17,6 +17,10 @@ _COSTS = (
     ("z_rand", "1 addition per particle-beam"),
     ("z_max", "max readings altogether"),
 )
+_MOMENTS = (
+    ("BIAS", "range_bias", "2 additions and 2 comparisons per particle-beam"),
+    ("GROWTH", "sigma_growth", "1 division per particle-beam"),
+)
 
 
 def title_and_omissions(
@@ -80,7 +84,7 @@ def title_and_omissions(
 
 
 def _mixture_omissions(pipeline: BeamPipeline, *, discrete: bool) -> list[Omission]:
-    """Return the part of the mixture that a table, or a low peak, makes unnecessary."""
+    """Return the parts of the mixture that a table, parameters of 0, or a low peak make unnecessary."""
     mixture, cells = pipeline.mixture, pipeline.mixture.cells
     if discrete:
         steps = f"{cells + 1} x {cells + 1} steps of readings and expected ranges, no return included"
@@ -88,7 +92,8 @@ def _mixture_omissions(pipeline: BeamPipeline, *, discrete: bool) -> list[Omissi
     if mixture.table is not None:
         why = f"log p is tabulated over {cells} x {cells + 1} bins of readings and expected ranges"
         return [Omission("mixture", why, "all functions of the components, at the error of the bins")]
+    omissions = [Omission(name, f"{name} = 0", cost) for flag, name, cost in _MOMENTS if flag not in mixture.flags]
     if "SHARP" not in mixture.flags:
         why = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
-        return [Omission("exponents in two parts", why, "37 operations")]
-    return []
+        omissions.append(Omission("exponents in two parts", why, "37 operations"))
+    return omissions

@@ -110,6 +110,8 @@ def log_mixture(
     sigma_hit: ArrayLike,
     lambda_short: ArrayLike,
     range_max: ArrayLike,
+    range_bias: ArrayLike = 0.0,
+    sigma_growth: ArrayLike = 0.0,
 ) -> Any:
     """Return log p(z | z*) of the mixture (book equation 6.12); ``**BeamParameters(...).to_dict()`` fits.
 
@@ -127,17 +129,20 @@ def log_mixture(
         sigma_hit: Standard deviation of a correct range [m].
         lambda_short: Rate of unexpected obstacles [1/m].
         range_max: Longest range Z [m].
+        range_bias: Offset of a correct range [m]; its mean is then within [0, Z].
+        sigma_growth: Growth of the standard deviation per metre of z*.
 
     Returns:
         Natural logarithms: of a density [1/m] for z in [0, Z), of the probability z_max for z >= Z, -inf for z < 0.
     """
-    z, expected, hit, short, top, rand, sigma, rate, range_max = _arrays(
-        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max
+    z, expected, hit, short, top, rand, sigma, rate, range_max, bias, growth = _arrays(
+        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max, range_bias, sigma_growth
     )
+    mean, sigma = _moments(expected, bias, sigma, growth, range_max)
     with np.errstate(divide="ignore"):
         parts = np.stack(
             [
-                np.log(hit) + np.where(hit > 0, log_hit(z, expected, sigma, range_max), 0),
+                np.log(hit) + np.where(hit > 0, log_hit(z, mean, sigma, range_max), 0),
                 np.log(short) + np.where(short > 0, log_short(z, np.minimum(expected, range_max), rate), 0),
                 np.log(rand) + np.where(rand > 0, log_rand(z, range_max), 0),
             ]
@@ -180,15 +185,24 @@ def naive_log_mixture(
     sigma_hit: ArrayLike,
     lambda_short: ArrayLike,
     range_max: ArrayLike,
+    range_bias: ArrayLike = 0.0,
+    sigma_growth: ArrayLike = 0.0,
 ) -> Any:
     """Evaluate equation 6.12 as printed, components of weight 0 left out, z_max at z >= Z."""
-    z, expected, hit, short, top, rand, sigma, rate, range_max = _arrays(
-        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max
+    z, expected, hit, short, top, rand, sigma, rate, range_max, bias, growth = _arrays(
+        z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max, range_bias, sigma_growth
     )
+    mean, sigma = _moments(expected, bias, sigma, growth, range_max)
     with np.errstate(all="ignore"):
-        p = np.where(hit > 0, hit * np.exp(naive_log_hit(z, expected, sigma, range_max)), 0)
+        p = np.where(hit > 0, hit * np.exp(naive_log_hit(z, mean, sigma, range_max)), 0)
         p = p + np.where(short > 0, short * np.exp(naive_log_short(z, expected, rate)), 0)
         return _scalar(np.log(np.where(z >= range_max, top, p + rand / range_max)))
+
+
+def _moments(expected: Floats, bias: Floats, sigma: Floats, growth: Floats, range_max: Floats) -> tuple[Floats, Floats]:
+    """Return mean and standard deviation of a correct range; without an offset the mean may be any number."""
+    mean = np.where(bias == 0, expected, np.clip(expected + bias, 0, range_max))
+    return mean, sigma + growth * np.maximum(expected, 0)
 
 
 def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:

@@ -106,6 +106,7 @@ def mixture_of(
     )
     flags = flags_if(
         HIT=hit or everything, SHORT=short or everything, RAND=rand or everything,
+        BIAS=everything or any(p.range_bias for p in kinds), GROWTH=everything or any(p.sigma_growth for p in kinds),
         SINGLE=specialize and hit + short + rand == 1, SHARP=max(peaks) > HIGH_PEAK or everything, LINEAR=linear,
     )  # fmt: skip
     return flags, np.concatenate([_terms(p, range_max, real, linear) for p in kinds])
@@ -119,6 +120,8 @@ def peer_mixture(
     Raises:
         ValueError: a number is beyond what the precision can hold.
     """
+    if p.range_bias or p.sigma_growth:
+        raise ValueError(f"parameters: range_bias and sigma_growth must be 0 with compat, got {p}")
     flags = frozenset({"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}) | flags_if(AMCL=amcl)
     hit = p.z_hit if amcl else _peak(p)
     terms = [hit, *_shape(p), p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
@@ -160,4 +163,14 @@ def _terms(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) ->
         log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
         head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
     terms = [head[0], *_shape(p), head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-    return rounded_terms(terms, real)
+    return np.append(rounded_terms(terms, real), _moments(p, real))
+
+
+def _moments(p: BeamParameters, real: np.dtype) -> np.ndarray:
+    """Return range_bias and sigma_growth / sigma_hit, each as a rounded number and its rounding error."""
+    exact = np.array([p.range_bias, p.sigma_growth / p.sigma_hit])
+    with np.errstate(over="ignore"):
+        rounded = exact.astype(real)
+    if not np.isfinite(rounded).all():
+        raise ValueError(f"parameters: range_bias and sigma_growth / sigma_hit must fit {real.name}, got {p}")
+    return np.stack([rounded, (exact - rounded).astype(real)], axis=1).ravel()

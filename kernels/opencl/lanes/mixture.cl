@@ -9,9 +9,25 @@
 lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms) {
     lanes p = terms[5];
 #if HIT
-    const lanes off = z - expected, hit = terms[0] * exp_lanes(off * (off * -terms[1]));
+#if BIAS
+    const lanes wanted = expected + terms[10], least = wanted < 0 ? (lanes)0 : wanted;
+    const lanes mean = least > terms[6] ? (lanes)terms[6] : least;
+    // z, z* and the bias nearly cancel, so the rounding error of z - z* is added.
+    const lanes apart = z - expected, shift = apart - z, error = (z - (apart - shift)) - (expected + shift);
+    lanes off = mean == wanted ? (apart - terms[10]) + (error - terms[11]) : z - mean;
+#else
+    const lanes mean = expected;
+    lanes off = z - expected;
+#endif
+#if GROWTH
+    const lanes scale = 1 / (1 + terms[12] * expected), erf_scale = terms[2] * scale, peak = terms[0] * scale;
+    off *= scale;
+#else
+    const real erf_scale = terms[2], peak = terms[0];
+#endif
+    const lanes hit = peak * exp_lanes(off * (off * -terms[1]));
     // The normal has all of its mass within the range unless one end is near.
-    const lanes below = expected * terms[2], above = (terms[6] - expected) * terms[2];
+    const lanes below = mean * erf_scale, above = (terms[6] - mean) * erf_scale;
     const lanes nearer = below < above ? below : above;
     if (any_lane(nearer < ERF_ONE))
         p += hit / (0.5f * (erf_lanes(nearer) + erf_lanes(below < above ? above : below)));

@@ -283,6 +283,6 @@ def test_results_report_their_history(capsys: pytest.CaptureFixture[str]) -> Non
     assert "converged" in text and "float64 on numpy" in text
     # No terminal, no bar.
     assert capsys.readouterr() == ("", "")
-    stopped = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend="numpy", max_iterations=2)
+    stopped = gs.fit_beam_parameters(z, expected, RANGE_MAX, initial=EQUAL, backend="numpy", max_iterations=2)
     assert not stopped.converged and "no convergence within 2 iterations" in stopped.status
     assert math.isfinite(stopped.log_likelihood)

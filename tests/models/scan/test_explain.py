@@ -30,7 +30,16 @@ def test_explain_names_what_is_left_out(monkeypatch):
     z[:4] = [NAN, INF, INF, -1.0]
     poses = np.column_stack([grid.cell_centers([200] * 9, range(245, 254)), np.zeros(9)])
     model = make("beam", grid, "numpy", REPEATED, weights=(0.9, 0.0, 0.1, 0.0), mount=(0.0, 0.0, 0.2), beams=12)
-    always = {"short component", "rand component", "mount", "unknown branch", "bounds tests", "float64"}
+    always = {
+        "short component",
+        "rand component",
+        "mount",
+        "unknown branch",
+        "bounds tests",
+        "float64",
+        "range_bias",
+        "sigma_growth",
+    }
     always.add("exponents in two parts")
     assert set(left_out(model)) == always
     model.log_likelihood(poses, z)
@@ -61,7 +70,14 @@ def test_explain_of_a_full_beam_model(backend):
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())
-    needless = {"unknown branch", "bounds tests", "log-domain sum", "exponents in two parts"}
+    needless = {
+        "unknown branch",
+        "bounds tests",
+        "log-domain sum",
+        "exponents in two parts",
+        "range_bias",
+        "sigma_growth",
+    }
     needless |= {"order of particles"} if model.device.kind == "gpu" else set()
     assert set(left_out(model)) == needless | {"reduction of huge headings"}
 

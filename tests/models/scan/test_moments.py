@@ -1,0 +1,179 @@
+"""The offset of correct ranges and the growth of their deviation: densities, models on every backend, the fit."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from mpmath import mp
+
+import gpusense as gs
+from gpusense.evaluation.tolerances import per_beam
+from gpusense.models.scan.densities import log_mixture
+from gpusense.models.scan.mixture import mixture_of
+from gpusense.reference.mixture import log_density
+
+RANGE = 8.0
+SHAPES = {
+    "offset": dict(range_bias=0.07),
+    "offset before the wall": dict(range_bias=-0.6),
+    "offset beyond the range": dict(range_bias=9.5),
+    "growth": dict(sigma_growth=0.03),
+    "both": dict(range_bias=0.03, sigma_growth=0.01),
+}
+MIXTURES = {
+    "book": gs.BeamParameters(),
+    "no rand": gs.BeamParameters(0.9, 0.05, 0.05, 0.0, 0.1, 0.3),
+    "hit alone": gs.BeamParameters(1.0, 0.0, 0.0, 0.0, 0.2),
+    "sharp": gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 1e-3),
+    "sharp without rand": gs.BeamParameters(1.0, 0.0, 0.0, 0.0, 1e-4),
+}
+
+
+def exact_log_mixture(z: float, expected: float, p: gs.BeamParameters) -> mp.mpf:
+    """Return log p by equations 6.4 to 6.12 with 60 digits."""
+    with mp.workdps(60):
+        z, e, top = mp.mpf(z), mp.mpf(expected), mp.mpf(RANGE)
+        mean = min(max(e + mp.mpf(p.range_bias), 0), top)
+        sigma = mp.mpf(p.sigma_hit) + mp.mpf(p.sigma_growth) * e
+        mass = mp.ncdf((top - mean) / sigma) - mp.ncdf(-mean / sigma)
+        density = p.z_hit * mp.npdf(z, mean, sigma) / mass + p.z_rand / top
+        if p.z_short and z <= e and e > 0:
+            rate = mp.mpf(p.lambda_short)
+            density += p.z_short * rate * mp.exp(-rate * z) / (1 - mp.exp(-rate * e))
+        return mp.log(density)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("name", MIXTURES)
+def test_densities_are_those_of_60_digits(name, shape):
+    p = MIXTURES[name].replace(**SHAPES[shape])
+    for expected in (0.0, 0.4, 3.0, 7.9, 8.0):
+        mean, sigma = np.clip(expected + p.range_bias, 0, RANGE), p.sigma_hit + p.sigma_growth * expected
+        for z in np.clip(mean + sigma * np.array([-30, -3, -1, 0, 0.5, 4]), 0, RANGE - 1e-9):
+            truth = exact_log_mixture(z, expected, p)
+            found = log_mixture(z, expected, range_max=RANGE, **p.to_dict())
+            # The mean is a float64.
+            rounding = abs(z - mean) / sigma**2 * np.spacing(max(mean, expected))
+            assert abs(found - truth) <= 1e-11 * (1 + abs(truth)) + rounding
+
+
+def test_a_density_with_offset_and_growth_has_mass_1():
+    p = gs.BeamParameters(range_bias=0.4, sigma_growth=0.05)
+    nodes, weights = np.polynomial.legendre.leggauss(2000)
+    z = RANGE / 2 * (nodes + 1)
+    for expected in (0.3, 2.0, 7.7):
+        # The kink of p_short at z* limits the quadrature.
+        continuous = (np.exp(log_mixture(z, expected, range_max=RANGE, **p.to_dict())) * RANGE / 2 * weights).sum()
+        assert continuous + p.z_max == pytest.approx(1, abs=2e-4)
+
+
+def scene(real):
+    """Return a map, a scanner, poses, and readings around their expected ranges."""
+    rng = np.random.default_rng(3)
+    grid = gs.OccupancyGrid(np.where(rng.random((80, 90)) < 0.02, 100, 0), 0.1)
+    scanner = gs.Scanner.uniform(angle_min=-2, angle_increment=0.1, count=40, range_max=RANGE)
+    poses = rng.uniform((1, 1, -3), (8, 7, 3), (33, 3))
+    expected = gs.RayCaster(grid, RANGE, backend="numpy", precision=real).cast(poses, scanner.bearings)
+    return grid, scanner, poses, expected
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_models_have_the_densities_on_every_backend(shape, real, backend):
+    grid, scanner, poses, expected = scene(real)
+    names = ["book", "sharp without rand"] if backend.startswith("warp") else list(MIXTURES)
+    for name, wide in itertools.product(names, (False, True)):
+        p = MIXTURES[name].replace(**SHAPES[shape])
+        # Readings at several deviations around the expected ranges of one pose.
+        sigma = p.sigma_hit + p.sigma_growth * expected[5]
+        around = np.clip(expected[5] + p.range_bias, 0, RANGE)
+        z = np.clip(around + sigma * np.resize([0, -0.5, 1, 2.5, -3.5, 0.01], 40), 0, np.nextafter(RANGE, 0))
+        z = np.minimum(z.astype(real), np.nextafter(np.dtype(real).type(RANGE), 0))
+        model = gs.BeamModel(grid, scanner, p, backend=backend, precision=real, specialize=not wide)
+        log_p, parts = model.log_likelihood(poses, z, per_beam=True)
+        truth = log_mixture(z.astype(float), expected.astype(float), range_max=RANGE, **p.to_dict())
+        with np.errstate(invalid="ignore"):
+            error = np.where(parts == truth, 0, np.abs(parts - truth))
+        assert (error <= 2 * per_beam(truth, np.dtype(real).type)).all()
+        assert (log_p == model.log_likelihood(poses, z)).all() or backend.startswith("warp:cuda")
+        if backend.startswith("warp"):
+            break
+
+
+def test_parameters_of_0_change_no_bit_and_are_left_out(backend):
+    grid, scanner, poses, expected = scene("float32")
+    plain = gs.BeamModel(grid, scanner, gs.BeamParameters(), backend=backend)
+    moved = gs.BeamModel(grid, scanner, gs.BeamParameters(range_bias=0.1), backend=backend)
+    assert "range_bias = 0" in plain.explain() and "sigma_growth = 0" in plain.explain()
+    assert "range_bias = 0" not in moved.explain()
+    plain.log_likelihood(poses, expected[3])
+    moved.log_likelihood(poses, expected[3])
+    assert not {"BIAS", "GROWTH"} & plain._last.flags and {"BIAS"} == {"BIAS", "GROWTH"} & moved._last.flags
+
+
+@pytest.mark.parametrize("real", ["float32", "float64"])
+@pytest.mark.parametrize("name", MIXTURES)
+def test_the_code_for_them_changes_nothing_where_they_are_0(name, real):
+    flags, terms = mixture_of([MIXTURES[name]], RANGE, np.dtype(real), specialize=True, max_depends=False)
+    *_, expected = scene(real)
+    z = np.roll(expected, 1, axis=1)
+    plain = log_density(flags, z, expected, terms)
+    found = log_density(flags | {"BIAS", "GROWTH"}, z, expected, terms)
+    # Exponents in two parts are normalised once more.
+    eps = np.finfo(real).eps if "SHARP" in flags else 0
+    same = plain == found
+    assert (same | (np.abs(np.where(same, 0, plain) - np.where(same, 0, found)) <= 2 * eps * np.abs(plain))).all()
+
+
+def test_tables_and_angles_of_incidence_have_them(backend):
+    grid, scanner, poses, expected = scene("float32")
+    p = gs.BeamParameters(range_bias=0.3, sigma_growth=0.02)
+    z = np.minimum(expected[5] + np.float32(0.3), np.float32(7.9))
+    tabulated = gs.BeamModel(grid, scanner, p, backend=backend, sensor_table=0.02)
+    assert tabulated.log_likelihood(poses, z).argmax() == 5
+    bins = gs.IncidenceParameters((0, 0.8, np.pi / 2), (p, p))
+    both = [
+        gs.BeamModel(grid, scanner, incidence=bins, backend=backend).log_likelihood(poses, z),
+        gs.BeamModel(grid, scanner, p, backend=backend).log_likelihood(poses, z),
+    ]
+    np.testing.assert_allclose(both[0], both[1], rtol=2e-5, atol=2e-3)
+
+
+def test_a_fit_hands_its_offset_to_the_model():
+    rng = np.random.default_rng(8)
+    expected = rng.uniform(1, 7, 4000)
+    z = np.where(rng.random(4000) < 0.9, expected + 0.12 + rng.normal(0, 0.03, 4000), rng.uniform(0, RANGE, 4000))
+    fit = gs.fit_beam_parameters(np.clip(z, 0, 7.99), expected, RANGE, backend="numpy", range_bias=True)
+    assert fit.parameters.range_bias == fit.range_bias and abs(fit.range_bias - 0.12) < 5 * fit.range_bias_error
+    log_p = log_mixture(np.clip(z, 0, 7.99), expected, range_max=RANGE, **fit.parameters.to_dict()).sum()
+    assert log_p == pytest.approx(fit.log_likelihood, rel=1e-6)
+    assert (
+        gs.fit_beam_parameters(z[:500].clip(0, 7.9), expected[:500], RANGE, backend="numpy").parameters.range_bias == 0
+    )
+
+
+@pytest.mark.parametrize("peer", ["amcl", "beluga"])
+def test_other_programs_have_neither(peer):
+    grid, scanner, *_ = scene("float32")
+    for p in (gs.BeamParameters(range_bias=0.1), gs.BeamParameters(sigma_growth=0.1)):
+        with pytest.raises(ValueError, match="parameters: range_bias and sigma_growth must be 0 with compat"):
+            gs.BeamModel(grid, scanner, p, backend="numpy", compat=peer)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (dict(range_bias=np.nan), "range_bias: must be"), (dict(range_bias="x"), "range_bias: must be"),
+        (dict(sigma_growth=-0.1), "sigma_growth: must be"), (dict(sigma_growth=np.inf), "sigma_growth: must be"),
+    ],
+)  # fmt: skip
+def test_bad_values_are_named(values, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        gs.BeamParameters(**values)
+
+
+def test_a_start_that_grows_with_range_is_refused():
+    with pytest.raises(ValueError, match="initial: sigma_growth must be 0"):
+        gs.fit_beam_parameters([1.0], [1.0], RANGE, initial=gs.BeamParameters(sigma_growth=0.1), backend="numpy")

@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.typing import Space
 from gpusense.tables.outlines import REACH, SPANS, Outlines
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window, whole
@@ -37,7 +38,7 @@ _MARGIN = REACH + 2
 _OPPOSITE = -0.5
 
 
-def surface_normals(grid: OccupancyGrid, *, unknown: str = "free", outside: str = "free") -> np.ndarray:
+def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Space = "free") -> np.ndarray:
     """Compute the normals of a map's walls.
 
     The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore that

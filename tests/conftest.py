@@ -21,6 +21,27 @@ from support.selection import BACKENDS, present, skip_or_fail  # noqa: E402
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
+# Folders and files of the five-minute subset, ``-m quick``; CONTRIBUTING.md says what it covers.
+QUICK = (
+    "commands/test_cli.py", "commands/test_first_hour.py", "commands/test_output.py", "evaluation/test_score.py",
+    "interface", "kernels/test_kernel_casts.py", "kernels/test_kernel_flags.py", "kernels/test_kernel_signatures.py",
+    "kernels/test_three_bodies.py", "localization", "logs", "models/scan/test_closed_forms.py",
+    "models/scan/test_densities.py", "models/scan/test_sonar.py", "models/test_bad_input_models.py",
+    "models/test_repr.py", "project/test_docstring_examples.py",
+    "project/test_docstrings.py", "project/test_layout.py", "project/test_public_names.py", "project/test_types.py",
+    "project/test_words.py", "tables", "world",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of the subset."""
+    for item in items:
+        path = item.path.relative_to(Path(__file__).parent).as_posix()
+        slow = item.get_closest_marker("slow") is not None
+        if not slow and any(path == part or path.startswith(f"{part}/") for part in QUICK):
+            item.add_marker("quick")
+
+
 @pytest.fixture
 def needs() -> Callable[[str], str]:
     """Return a function: ``needs("opencl")`` is the selection string to test; it skips where the backend is absent."""

@@ -1,6 +1,7 @@
 """Compiled kernels and verdicts on drivers, kept on disk: only the first run on a device makes them.
 
-The folder is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else ``~/.cache/gpusense``;
+The folder is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else the system's place for caches:
+``~/.cache/gpusense`` on Linux, ``~/Library/Caches/gpusense`` on macOS, and below ``%LOCALAPPDATA%`` on Windows.
 ``GPUSENSE_CACHE=off`` switches it off. An entry is one file that is named by a hash of its key, written by rename, and
 begins with a checksum of its contents; the oldest go when the folder holds more than it may. Where the folder cannot be
 written, a private temporary folder takes its place and one line of the log names it. A cache never stops a run.
@@ -44,11 +45,16 @@ def cache_folder() -> Path | None:
         return None
     if chosen := os.environ.get("GPUSENSE_CACHE_DIR"):
         return Path(chosen)
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base) / "gpusense"
     try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gpusense"
+        Path.home()
     except RuntimeError:
         # The user has no home folder.
         return temporary_folder()
+    import platformdirs
+
+    return platformdirs.user_cache_path("gpusense", appauthor=False)
 
 
 def temporary_folder() -> Path | None:

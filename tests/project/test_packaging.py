@@ -283,5 +283,5 @@ def test_dependencies_on_linux_x86_64(wheel: Path) -> None:
     needed = [
         item.name.lower() for item in map(Requirement, lines) if item.marker is None or item.marker.evaluate(machine)
     ]
-    expected = "matplotlib numpy pillow pocl-binary-distribution pyopencl pyyaml rich scipy warp-lang"
+    expected = "matplotlib numpy pillow platformdirs pocl-binary-distribution pyopencl pyyaml rich scipy warp-lang"
     assert sorted(needed) == expected.split()

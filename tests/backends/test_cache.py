@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
-import importlib
 import os
 import random
 import shutil
@@ -16,7 +15,6 @@ import sys
 import time
 from pathlib import Path
 
-import platformdirs
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -160,25 +158,6 @@ def test_without_a_home_the_cache_is_temporary(temporary, monkeypatch):
     store_entry("key", b"payload")
     assert load_entry("key") == b"payload"
     assert len(list(temporary.rglob("*.bin"))) == 1
-
-
-@pytest.mark.parametrize(
-    "module, name, place",
-    [
-        ("unix", "Unix", "home/.cache/gpusense"),
-        ("macos", "MacOS", "home/Library/Caches/gpusense"),
-        ("windows", "Windows", "local/gpusense/Cache"),
-    ],
-)
-def test_the_cache_is_where_the_system_has_caches(tmp_path, monkeypatch, module, name, place):
-    for variable in ("GPUSENSE_CACHE_DIR", "GPUSENSE_CACHE", "XDG_CACHE_HOME"):
-        monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    system = importlib.import_module(f"platformdirs.{module}")
-    if module == "windows":
-        monkeypatch.setattr(system, "get_win_folder", lambda _: str(tmp_path / "local"))
-    monkeypatch.setattr(platformdirs, "PlatformDirs", getattr(system, name))
-    assert cache.cache_folder() == tmp_path / place
 
 
 def test_unfinished_files_of_killed_processes_are_removed(folder):

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
-    add("--log", type=Path, metavar="FILE", help="a CARMEN log with corrected poses, plain or .gz; needs --map")
+    add("--log", type=Path, metavar="FILE", help="a log (CARMEN) with corrected poses, plain or .gz; needs --map")
     add("--pairs", type=Path, metavar="CSV", help="readings and expected ranges instead; needs --range-max")
     add("--every", type=whole_number(low=1), default=1, metavar="E",
         help="every E-th scan or pair, from --offset on; '--every 2 --offset 1' are the odd ones")  # fmt: skip

@@ -23,7 +23,7 @@ from gpusense.tables.lookup_files import read_lookup
 from gpusense.tables.rectangles import empty_rectangles, sectors_of
 from gpusense.world import windows
 
-__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March", "choose"]
+__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March"]
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
 # Rays per launch that fills a look-up table, so that a launch takes about a second.
@@ -229,7 +229,8 @@ def _padded_cells(backend: Backend, inputs: CasterInput) -> Table:
     return Table(backend.upload(cells), cells.nbytes)
 
 
-CASTERS: dict[str, type[Caster]] = {caster.name: caster for caster in (Exact, Dda, March, Bresenham, Cddt, Lookup)}
+_ALL: tuple[type[Caster], ...] = (Exact, Dda, March, Bresenham, Cddt, Lookup)
+CASTERS = {caster.name: caster for caster in _ALL}
 
 
 def choose(argument: str, value: object) -> Caster:

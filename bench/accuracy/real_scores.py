@@ -21,7 +21,7 @@ from typing import Any
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation import selftest
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, FIELD_PARAMETERS, ParticleSampler, score_log, summary
+from gpusense.evaluation.scoring import ParticleSampler, score_log, summary
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -78,7 +78,8 @@ def scores(data: Path, name: str, kind: str, arguments: argparse.Namespace) -> d
     some = odd[:: max(-(-len(odd) // arguments.scans), 1)] if arguments.scans else odd
     scanner = some[0][1].scanner
     make, parameters = {
-        "beam": (gs.BeamModel, BEAM_PARAMETERS), "field": (gs.LikelihoodFieldModel, FIELD_PARAMETERS),
+        "beam": (gs.BeamModel, gs.BeamParameters()),
+        "field": (gs.LikelihoodFieldModel, gs.LikelihoodFieldParameters()),
     }[kind]  # fmt: skip
     names = present()
     fast = [backend for backend in names if backend != "numpy"]

@@ -23,7 +23,7 @@ import numpy as np
 import gpusense as gs
 from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
-from gpusense.evaluation.scoring import BEAM_PARAMETERS, ParticleSampler, score_log
+from gpusense.evaluation.scoring import ParticleSampler, score_log
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -43,7 +43,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
     fit = gs.fit_beam_parameters(pairs.ranges, pairs.expected, pairs.range_max, backend=arguments.backend)
     candidates = {
         "fitted": held_out.softened(fit.parameters, fit.hits + fit.max_readings), **held_out.peer_parameters(),
-        "gpusense's defaults": gs.BeamParameters(), "gpusense score's": BEAM_PARAMETERS,
+        "gpusense's defaults": gs.BeamParameters(),
     }  # fmt: skip
     cloud, rows = ParticleSampler(arguments.particles), []
     for origin, parameters in candidates.items():

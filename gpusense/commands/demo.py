@@ -15,6 +15,7 @@ import numpy as np
 from gpusense import plots
 from gpusense._util.files import check_writable
 from gpusense._util.progress import progress
+from gpusense._util.typing import Precision
 from gpusense.backends import Backend, Selection
 from gpusense.commands import arguments, output
 from gpusense.commands.output import grouped
@@ -46,7 +47,8 @@ Exit codes: 0 success, 1 a device failed (the report has its error), 2 bad input
 
 SIZE, BEAMS, FIELD_OF_VIEW, RANGE_MAX, SIGMA_XY, SIGMA_THETA = (30.0, 20.0), 180, 270.0, 15.0, 0.5, 0.3
 BEAM, FIELD = "beam model", "likelihood field"
-PRECISION, LATTICE = "float32", 0.1
+LATTICE = 0.1
+PRECISION: Precision = "float32"
 # Largest number of particles of the reference; total time of repeated calls [s]; largest number of repeated calls.
 REFERENCE_PARTICLES, PATIENCE, REPETITIONS = 10_000, 4.0, 3
 NOTE = "Generated building; scan drawn from the beam model's mixture. Colour scales end at the median of the values."
@@ -180,7 +182,7 @@ def make_scene(seed: int, particles: int, beams: int) -> Scene:
     return Scene(grid, scanner, ranges, np.concatenate([around, anywhere, truth[None]]), beams)
 
 
-def make_model(scene: Scene, name: str, backend: Selection, precision: str = PRECISION) -> Model:
+def make_model(scene: Scene, name: str, backend: Selection, precision: Precision = PRECISION) -> Model:
     """Make a model with its default parameters; ``name`` is ``BEAM`` or ``FIELD``."""
     kind: Any = BeamModel if name == BEAM else LikelihoodFieldModel
     return kind(scene.grid, scene.scanner, backend=backend, precision=precision, beams=scene.beams)

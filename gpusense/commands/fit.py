@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
+from gpusense.commands.fit_so_far import SoFar
 from gpusense.commands.output import print_json, print_table
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -45,7 +46,9 @@ use --every 2 --offset 1.
 --out writes parameters.yaml (for gpusense and for nav2's amcl) and pictures: readings.png, density.png, trace.png,
 surface.png, and incidence.png where angles of incidence are fitted.
 
-Exit codes: 0 success, 1 the fit did not converge, 2 bad input.
+Ctrl-C ends the fit and prints the best parameters so far.
+
+Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted.
 
 example:
   gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --out fitted
@@ -63,7 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
     add("--log", type=Path, metavar="FILE", help="a log (CARMEN) with corrected poses, plain or .gz; needs --map")
-    add("--pairs", type=Path, metavar="CSV", help="readings and expected ranges instead; needs --range-max")
+    add("--pairs", type=Path, metavar="CSV",
+        help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
+        "incidence [rad]; needs --range-max")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E",
         help="every E-th scan or pair, from --offset on; '--every 2 --offset 1' are the odd ones")  # fmt: skip
     add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first one (default: 0)")
@@ -106,9 +111,14 @@ class Result:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit the parameters, print the result and write the files."""
+    """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
-    result = _fit(args, _read(args))
+    data, so_far = _read(args), SoFar()
+    try:
+        result = _fit(args, data, so_far)
+    except KeyboardInterrupt:
+        so_far.print(json=args.json)
+        raise
     files = _write(args.out, result) if args.out is not None else []
     if args.json:
         print_json(_document(args, result, files))
@@ -157,7 +167,7 @@ def _read(args: argparse.Namespace) -> RangeData:
         )  # fmt: skip
 
 
-def _fit(args: argparse.Namespace, data: RangeData) -> Result:
+def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
     from gpusense.evaluation.held_out import compare_held_out
     from gpusense.learning.beam.fit import fit_beam_parameters
     from gpusense.learning.beam.incidence import fit_incidence_parameters
@@ -169,8 +179,9 @@ def _fit(args: argparse.Namespace, data: RangeData) -> Result:
     blocks = data.block if len(set(known.tolist())) > 1 else None
     fit = fit_beam_parameters(
         data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
-        range_bias=args.range_bias, progress=True, blocks=blocks,
+        range_bias=args.range_bias, progress=True, callback=so_far.see, blocks=blocks,
     )  # fmt: skip
+    so_far.fit = fit
     incidence = None
     if data.incidence is not None and args.incidence:
         incidence = fit_incidence_parameters(

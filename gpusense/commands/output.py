@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.progress import is_terminal
@@ -36,14 +37,19 @@ def _plain(value: Any) -> Any:
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
     """Print a table: by rich on a terminal, as plain text elsewhere.
 
+    On a terminal that is too narrow, each row becomes a paragraph of one value a line.
+
     Args:
         columns: Names of the columns.
         rows: Cells of each row.
         right: Names of the columns that are right-aligned.
     """
+    lines = table_lines(columns, rows, right=right)
     if not is_terminal(sys.stdout):
-        for line in table_lines(columns, rows, right=right):
-            print(line)
+        print(*lines, sep="\n")
+        return
+    if max(map(len, lines)) > terminal_width():
+        print(*paragraph_lines(columns, rows), sep="\n")
         return
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -56,6 +62,59 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
     for row in rows:
         table.add_row(*(Text(text) for text in row))
     Console().print(table)
+
+
+class TableStream:
+    """A table that is printed row by row, on terminals with as many columns as fit.
+
+    Attributes:
+        kept: Names of the columns that are printed.
+    """
+
+    def __init__(self, columns: Mapping[str, int], *, left: Sequence[str] = (), optional: Sequence[str] = ()) -> None:
+        """Choose the columns.
+
+        Args:
+            columns: Names of the columns, each with its least width.
+            left: Names of the columns that are left-aligned.
+            optional: Names of the columns that are left out on narrow terminals, the first one first.
+        """
+        self._widths = {name: max(width, len(name)) for name, width in columns.items()}
+        self._left = left
+        for name in optional if is_terminal(sys.stdout) else ():
+            if sum(self._widths.values()) + 2 * (len(self._widths) - 1) > terminal_width():
+                del self._widths[name]
+        self.kept, self._begun = tuple(self._widths), False
+
+    def add(self, row: Mapping[str, str]) -> None:
+        """Print a row, given by the names of all columns."""
+        if not self._begun:
+            self._begun = True
+            self._print({name: name for name in self.kept})
+            self._print({name: "-" * width for name, width in self._widths.items()})
+        self._print(row)
+
+    def _print(self, row: Mapping[str, str]) -> None:
+        cells = (
+            row[name].ljust(width) if name in self._left else row[name].rjust(width)
+            for name, width in self._widths.items()
+        )
+        print("  ".join(cells).rstrip(), flush=True)
+
+
+def terminal_width() -> int:
+    """Return the columns of the terminal."""
+    return shutil.get_terminal_size().columns
+
+
+def paragraph_lines(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Format rows as paragraphs of one value a line, without empty values."""
+    widest = max(map(len, columns))
+    lines = []
+    for row in rows:
+        lines += [f"{name.ljust(widest)}  {text}".strip() for name, text in zip(columns, row, strict=True) if text]
+        lines.append("")
+    return lines
 
 
 def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> list[str]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense._util.progress import progress
+from gpusense._util.progress import is_terminal, progress
 from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
@@ -18,12 +20,13 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import print_json, print_table
+from gpusense.commands.output import TableStream, print_json
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
     from gpusense.evaluation.agreement import Agreement, Model
-    from gpusense.evaluation.scoring import BackendScore
+    from gpusense.evaluation.scoring import BackendScore, LogScoring, ScanScore
+    from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
     from gpusense.world.parameters import BeamParameters
     from gpusense.world.scanner import Scanner
@@ -36,18 +39,24 @@ DIFFERENT = 1
 _EPILOG = """\
 Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
 The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
-weighted mean excludes the logged pose. The default parameters suit a laser and a map with cells of centimetres:
-  beam   z_hit 0.75, z_short 0.1, z_max 0.05, z_rand 0.1, sigma_hit 0.1 m, lambda_short 0.2 1/m
-  field  z_hit 0.9, z_max 0, z_rand 0.1, sigma_hit 0.1 m, max_distance 1 m, nearest
+weighted mean excludes the logged pose. Default parameters are those of BeamParameters and LikelihoodFieldParameters.
 A temperature of 0.1 compensates for beams that are not independent: more particles then share the weight.
 
-Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, 2 bad input.
+A row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
+
+Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, 2 bad input,
+130 interrupted.
 
 example:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
   gpusense score --map map.yaml --log run.log.gz --parameters fitted/parameters.yaml
   gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 --backend opencl --backend numpy --limit 3"""
 
+# Columns of the table, and their widths.
+_COLUMNS = {
+    "scan": 5, "backend": 10, "rank": 7, "percentile": 10, "error [m]": 9, "error [rad]": 11, "effective": 9,
+    "beams": 5,
+}  # fmt: skip
 _SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit")
 _SPECIFIC = {"beam": ("z_short", "lambda_short"), "field": ("max_distance", "interpolation")}
 _MEANING = {
@@ -82,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
     add("--range-max", type=positive_number, metavar="M",
         help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
-    add("--beams", type=whole_number(low=0), metavar="B", help="thin each scan evenly to B beams (default: all)")
+    add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add("--temperature", type=positive_number, default=1.0, metavar="T",
         help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
     group = parser.add_argument_group("parameters of the model")
@@ -98,25 +107,67 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score the scans and print the results."""
-    from gpusense.evaluation.scoring import ParticleSampler, logged_scans, score_log
+    """Score the scans and print the results; after Ctrl-C those so far."""
+    from gpusense.evaluation.scoring import LogScoring, ParticleSampler, logged_scans
     from gpusense.world.map_files import read_map
 
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
     models = make_models(args, grid, scans[0][1].scanner)
-    with progress(len(scans)) as step:
-        scores, agreements = score_log(models, scans, sampler, step)
-    if args.json:
-        print_json(_document(args, models, scores, agreements))
-    else:
-        _print(args, models, scores, agreements)
+    scoring = LogScoring(models, sampler)
+    try:
+        _score(args, models, scans, scoring)
+    except KeyboardInterrupt:
+        scores, agreements = scoring.results()
+        if scores:
+            _report(args, models, scores, agreements, len(scans))
+        raise
+    scores, agreements = scoring.results()
+    _report(args, models, scores, agreements, len(scans))
     if args.plot is not None:
         _draw(args.plot, grid, scores[0])
         if not args.json:
             print(f"drawn: {args.plot}")
     return 0 if all(agreement.same for agreement in agreements) else DIFFERENT
+
+
+def _score(args: argparse.Namespace, models: list[Model], scans: list[tuple[int, Scan]], scoring: LogScoring) -> None:
+    """Score the scans, and print a row for each as it comes."""
+    # Rows on a terminal show the progress.
+    shown = not args.json and is_terminal(sys.stdout)
+    optional = (*(("backend",) if len(models) == 1 else ()), "beams", "effective", "error [rad]")
+    table = TableStream(_COLUMNS, left=("backend",), optional=optional)
+    with contextlib.nullcontext(lambda text: None) if shown else progress(len(scans)) as step:
+        for index, scan in scans:
+            step(f"scan {index}")
+            scores = scoring.add(index, scan)
+            if not args.json:
+                for model, score in zip(models, scores, strict=True):
+                    table.add(_row(model.device.selection, score))
+
+
+def _row(backend: str, scan: ScanScore) -> dict[str, str]:
+    position, heading = (_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading))
+    values = (str(scan.index), backend, f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
+              _text(scan.effective), str(scan.beams))  # fmt: skip
+    return dict(zip(_COLUMNS, values, strict=True))
+
+
+def _report(
+    args: argparse.Namespace,
+    models: list[Model],
+    scores: list[BackendScore],
+    agreements: list[Agreement],
+    chosen: int,
+) -> None:
+    """Print the results of all scans, or of those before an interrupt."""
+    if args.json:
+        print_json(_document(args, models, scores, agreements) | {"scans_chosen": chosen})
+        return
+    _print(args, models, scores, agreements)
+    if len(scores[0].scans) < chosen:
+        print(f"\ninterrupted: results of {len(scores[0].scans)} of {chosen} scans")
 
 
 def _draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
@@ -132,16 +183,16 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner)
     Raises:
         ValueError: a backend is absent, or a parameter breaks its rule or belongs to the other model.
     """
-    from gpusense.evaluation import scoring
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
+    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
     options = {name: getattr(args, name) for name in (*_SHARED, *_SPECIFIC["beam"], *_SPECIFIC["field"])}
     changes = {name: value for name, value in options.items() if value is not None}
     for name in changes:
         if name not in (*_SHARED, *_SPECIFIC[args.model]):
             raise ValueError(f"{_option(name)}: must be a parameter of the {args.model} model, got another model's")
-    beam = scoring.BEAM_PARAMETERS
+    beam = BeamParameters()
     if args.parameters is not None:
         if args.model != "beam":
             raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
@@ -155,7 +206,7 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner)
         if args.model == "beam":
             model = BeamModel(grid, scanner, beam.replace(**changes), **common)
         else:
-            model = LikelihoodFieldModel(grid, scanner, scoring.FIELD_PARAMETERS.replace(**changes), **common)
+            model = LikelihoodFieldModel(grid, scanner, LikelihoodFieldParameters().replace(**changes), **common)
         models.setdefault(model.device.selection, model)
     return list(models.values())
 
@@ -201,15 +252,6 @@ def _print(
 ) -> None:
     from gpusense.evaluation.scoring import summary
 
-    columns = ("scan", "backend", "rank", "percentile", "error [m]", "error [rad]", "effective", "beams")
-    rows = [
-        (str(scan.index), score.device.selection, f"{scan.rank:g}", f"{scan.percentile:.3f}",
-         *(_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading)),
-         _text(scan.effective), str(scan.beams))
-        for scans in zip(*(score.scans for score in scores), strict=True)
-        for score, scan in zip(scores, scans, strict=True)
-    ]  # fmt: skip
-    print_table(columns, rows, right=tuple(set(columns) - {"backend"}))
     values = ", ".join(f"{name} {value}" for name, value in models[0].parameters.to_dict().items())
     print(f"\n{args.model} model, {args.precision}: {values}, range_max {models[0].scanner.range_max} m")
     for score in scores:

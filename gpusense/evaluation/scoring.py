@@ -26,17 +26,11 @@ from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan, read_log
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Reading, classify
 from gpusense.world.sensor_table import SensorTable
 
 Array = NDArray[Any]
 Floats = NDArray[np.float64]
-
-# For a laser and a map of 5 cm cells: end points lie within a cell or two of a wall, except for one reading in five, by
-# people, door frames and grazing incidence.
-BEAM_PARAMETERS = BeamParameters(z_hit=0.75, z_short=0.1, z_max=0.05, z_rand=0.1, sigma_hit=0.1, lambda_short=0.2)
-FIELD_PARAMETERS = LikelihoodFieldParameters(z_hit=0.9, z_max=0.0, z_rand=0.1, sigma_hit=0.1, max_distance=1.0)
 
 
 @dataclass(frozen=True)
@@ -215,6 +209,40 @@ def logged_scans(
     return chosen
 
 
+class LogScoring:
+    """Scores of a log's scans on one backend or several, scan by scan."""
+
+    def __init__(self, models: Sequence[Model], sampler: ParticleSampler) -> None:
+        """Prepare to score the same model on one backend or several, with particles of a sampler."""
+        self._models, self._sampler = models, sampler
+        self._scores: list[tuple[ScanScore, ...]] = []
+        self._pairs = list(itertools.combinations(range(len(models)), 2))
+        self._comparisons = [Comparison(models[a], models[b]) for a, b in self._pairs]
+
+    def add(self, index: int, scan: Scan) -> tuple[ScanScore, ...]:
+        """Score a scan with every model on the same particles, and return a score for each."""
+        assert scan.pose is not None
+        poses = self._sampler.draw(index, scan.pose, self._models[0].grid)
+        beams = evaluated_beams(self._models[0], scan.ranges)
+        log_ps, scores = [], []
+        for model in self._models:
+            begin = time.perf_counter()
+            log_ps.append(model.log_likelihood(poses, scan.ranges))
+            scores.append(score_scan(index, poses, log_ps[-1], beams, time.perf_counter() - begin))
+        for comparison, (a, b) in zip(self._comparisons, self._pairs, strict=True):
+            comparison.add(log_ps[a], log_ps[b])
+        self._scores.append(tuple(scores))
+        return self._scores[-1]
+
+    def results(self) -> tuple[list[BackendScore], list[Agreement]]:
+        """Return the scores of the scans so far, and how the models agree in pairs; empty before the first scan."""
+        if not self._scores:
+            return [], []
+        each = zip(self._models, zip(*self._scores, strict=True), strict=True)
+        scores = [BackendScore(model.device, self._sampler.particles, scans) for model, scans in each]
+        return scores, [comparison.result() for comparison in self._comparisons]
+
+
 def score_log(
     models: Sequence[Model],
     scans: Sequence[tuple[int, Scan]],
@@ -229,25 +257,11 @@ def score_log(
         sampler: Draws the particles of a scan.
         step: Called with a text before each scan.
     """
-    scores: list[list[ScanScore]] = [[] for _ in models]
-    pairs = list(itertools.combinations(range(len(models)), 2))
-    comparisons = [Comparison(models[a], models[b]) for a, b in pairs]
+    scoring = LogScoring(models, sampler)
     for index, scan in scans:
         step(f"scan {index}")
-        assert scan.pose is not None
-        poses = sampler.draw(index, scan.pose, models[0].grid)
-        beams = evaluated_beams(models[0], scan.ranges)
-        log_ps = []
-        for model, scan_scores in zip(models, scores, strict=True):
-            begin = time.perf_counter()
-            log_ps.append(model.log_likelihood(poses, scan.ranges))
-            scan_scores.append(score_scan(index, poses, log_ps[-1], beams, time.perf_counter() - begin))
-        for comparison, (a, b) in zip(comparisons, pairs, strict=True):
-            comparison.add(log_ps[a], log_ps[b])
-    backend_scores = [
-        BackendScore(model.device, sampler.particles, tuple(each)) for model, each in zip(models, scores, strict=True)
-    ]
-    return backend_scores, [comparison.result() for comparison in comparisons]
+        scoring.add(index, scan)
+    return scoring.results()
 
 
 def evaluated_beams(model: Model, ranges: Array) -> int:

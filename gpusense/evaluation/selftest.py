@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense._util.typing import Precision
 from gpusense.backends import Backend, devices, get_backend
 from gpusense.evaluation.replay import Launch, Recorder, replay
 from gpusense.evaluation.tolerances import TOLERANCES, Check, Tolerance, beam_tolerance, scan_tolerance
@@ -146,7 +147,8 @@ def evaluate_backend(backend: Backend, scene: Scene, *, sonar: bool = True) -> t
     """
     results, checks = _tables(backend, scene)
     launches: dict[str, Launch] = {}
-    for precision in ("float32", "float64")[: 1 + backend.info.float64]:
+    precisions: tuple[Precision, ...] = ("float32", "float64")
+    for precision in precisions[: 1 + backend.info.float64]:
         results |= _ranges(backend, scene, precision, sonar=sonar)
         for model in (name for name in _MODELS if sonar or name != _SONAR):
             key = f"{precision} {model}"
@@ -174,7 +176,7 @@ def _tables(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     return results, [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]
 
 
-def _ranges(backend: Backend, scene: Scene, precision: str, *, sonar: bool) -> Results:
+def _ranges(backend: Backend, scene: Scene, precision: Precision, *, sonar: bool) -> Results:
     """Compute expected ranges and, for the ring of sonars, those of cones and angles of incidence."""
     caster = RayCaster(scene.grid, scene.scanner.range_max, backend=backend, precision=precision)
     ranges, angles = TOLERANCES[f"{precision} ranges"], TOLERANCES[f"{precision} angles of incidence"]

@@ -116,10 +116,10 @@ _ALL = (
         "exponents and angles in two numbers; exp, log, log1p and erf add a few eps",
     ),
     Tolerance(
-        "normals of straight walls, mean", 2, "degrees",
-        "the error of the principal direction of a strip of 9 cells of a wall: half a cell of steps at its ends",
+        "normals of straight walls, mean", 1, "degrees",
+        "the error of a line through 17 sides of a wall's cells: half a cell of steps at its ends",
     ),
-    Tolerance("normals of straight walls, largest", 12, "degrees", "a step of a wall that is almost along an axis"),
+    Tolerance("normals of straight walls, largest", 6, "degrees", "a step of a wall that is almost along an axis"),
     Tolerance(
         "float32 angles of incidence", 8, "eps",
         "directions and normals have the same bits everywhere; arc tangents of OpenCL are within 6 ulps",

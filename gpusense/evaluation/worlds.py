@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.evaluation.buildings import building
 from gpusense.models.scan.beam import BeamModel
@@ -144,7 +145,7 @@ def simulate_scan(
         (60,)
     """
     device = get_backend(backend)
-    real = "float64" if device.info.float64 else "float32"
+    real: Precision = "float64" if device.info.float64 else "float32"
     model = BeamModel(grid, scanner, parameters, backend=device, precision=real)
     expected = np.minimum(model.expected_ranges([checks.array("pose", pose, (3,))])[0], scanner.range_max)
     return sample_readings(expected, scanner.range_max, parameters, rng)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray
 
 # Sum of the integer weights; the error of a weight is below one step per particle.
 _STEPS = 1 << 52
@@ -46,7 +47,7 @@ class Weights:
         )
 
 
-def normalize_weights(log_p: object) -> Weights:
+def normalize_weights(log_p: AnyArray) -> Weights:
     """Compute weights proportional to ``exp(log_p)``.
 
     Args:
@@ -77,7 +78,7 @@ def normalize_weights(log_p: object) -> Weights:
     return Weights(weights, largest + float(np.log(total / count)), 1.0 / float(np.sum(weights * weights)), False)
 
 
-def resample(weights: object, count: int, rng: Any = None) -> np.ndarray:
+def resample(weights: AnyArray, count: int, rng: Any = None) -> np.ndarray:
     """Draw a new set of particles by systematic resampling (book table 4.4, the low-variance sampler).
 
     Args:

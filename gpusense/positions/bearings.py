@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import EPS, ROUNDINGS, three_bearings, two_rays
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Floats, Problem, make_problem, subsets
@@ -18,7 +19,7 @@ def triangulate(
     *,
     sigma: ArrayLike | None = None,
     weights: ArrayLike | None = None,
-    loss: str = "linear",
+    loss: Loss = "linear",
     loss_scale: float = 1.0,
 ) -> PositionFix:
     """Compute the position, and the heading if it is unknown, from bearings of beacons.

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import two_circles, wrap
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Floats, Problem, make_problem, subsets
@@ -26,7 +27,7 @@ def locate(
     sigma_range: ArrayLike,
     sigma_bearing: ArrayLike,
     weights: ArrayLike | None = None,
-    loss: str = "linear",
+    loss: Loss = "linear",
     loss_scale: float = 1.0,
 ) -> PositionFix:
     """Compute the pose from ranges and bearings of beacons.

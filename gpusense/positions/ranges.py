@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import two_circles
 from gpusense.positions.fix import PositionFix
 from gpusense.positions.problem import Floats, Problem, make_problem, subsets
@@ -17,7 +18,7 @@ def trilaterate(
     *,
     sigma: ArrayLike | None = None,
     weights: ArrayLike | None = None,
-    loss: str = "linear",
+    loss: Loss = "linear",
     loss_scale: float = 1.0,
 ) -> PositionFix:
     """Compute the position from distances to beacons.

@@ -1,11 +1,14 @@
-"""Normals of a map's walls, by principal components of the occupied cells nearby; for angles of incidence.
+"""Normals of a map's walls, for angles of incidence.
 
-The occupied cells within RADIUS cells of a cell have a mean and a covariance. A wall is long and thin, so its normal is
-the direction of least variance. Where the variance is alike in all directions, at the corner of a thick block or at a
-post, the normal is the direction in which occupied cells become fewer: the gradient of occupancy smoothed by the same
-disc.
+The outline of a wall is followed from side to side of its cells. Where it is straight, the normal is that of a line
+through the sides on the cell's piece of the outline, which ends at corners (``outlines``).
 
-Normals are computed on the host, once per map: less than a second for 2000 x 2000 cells.
+Elsewhere, on tight bends and in clutter, the occupied cells within RADIUS cells of a cell have a mean and a covariance.
+A wall is long and thin, so its normal is the direction of least variance. Where the variance is alike in all
+directions, as at a post, the normal is the direction in which occupied cells become fewer: the gradient of occupancy
+smoothed by the same disc.
+
+Normals are computed on the host, once per map: 0.2 s for a building of 1300 x 1730 cells.
 """
 
 from __future__ import annotations
@@ -15,11 +18,13 @@ import math
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.typing import Space
+from gpusense.tables.outlines import REACH, SPANS, Outlines
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window, whole
 
-# Radius of the disc of cells [cells]. A square has longer diagonals. On slanted walls the mean error is 1.5 degrees; a
-# radius of 3 gives 2.5.
+# Radius of the disc of cells [cells]. A square has longer diagonals. On slanted walls the mean error of a disc's normal
+# is 1.5 degrees; a radius of 3 gives 2.5.
 RADIUS = 4
 # Largest ratio of the smaller variance to the larger one for which a principal direction counts.
 _ROUND = 0.5
@@ -27,17 +32,23 @@ _ROUND = 0.5
 _FEWEST = 3
 # Cells per strip that is computed at once.
 _STRIP = 1 << 21
+# Farthest cell that a normal depends on.
+_MARGIN = REACH + 2
+# Two straight sides of a cell with a smaller cosine between their normals are the two sides of a thin wall.
+_OPPOSITE = -0.5
 
 
-def surface_normals(grid: OccupancyGrid, *, unknown: str = "free", outside: str = "free") -> np.ndarray:
+def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Space = "free") -> np.ndarray:
     """Compute the normals of a map's walls.
 
-    The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore the
-    direction of least variance (principal components) of the occupied cells within 4 cells of it. On straight walls at
-    any angle it is off by 1.6 degrees in the mean and by 11 at most. Without a principal direction, as at the corners
-    of thick blocks and at posts, the normal is the direction in which occupied cells become fewer. A cell has no normal
-    if fewer than two other occupied cells are nearby, if there is no such direction either, or if no free cell touches
-    one of its sides.
+    The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore that
+    of a line through up to 17 sides of the wall's cells around it. The line ends at corners, so normals are right up to
+    the cell next to a corner: within 4 cells of one they are off by 2 degrees in the mean. Elsewhere on straight
+    walls they are off by 0.8 degrees at any angle, and by 5 at most. A cell in a corner has the normal of one wall, or
+    one between both. Where the outline is not straight, the normal is the direction of least variance (principal
+    components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which occupied cells
+    become fewer. A cell has no normal if fewer than two other occupied cells are nearby, if there is no such direction
+    either, or if no free cell touches one of its sides.
 
     Args:
         grid: The map.
@@ -84,9 +95,13 @@ def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.d
     step = max(_STRIP // table.shape[1], 1)
     for first in range(0, len(table), step):
         rows = min(step, len(table) - first)
-        row, col = window.row - 1 + first - RADIUS, window.col - 1 - RADIUS
-        part = Window(row, col, rows + 2 * RADIUS, window.cols + 2 + 2 * RADIUS)
-        table[first : first + rows] = _cell_normals(_surrounded(obstacles, part, outside == "occupied"))
+        row, col = window.row - 1 + first - _MARGIN, window.col - 1 - _MARGIN
+        part = Window(row, col, rows + 2 * _MARGIN, window.cols + 2 + 2 * _MARGIN)
+        surrounded = _surrounded(obstacles, part, outside == "occupied")
+        rest = _MARGIN - RADIUS
+        normals = _disc_normals(surrounded[rest:-rest, rest:-rest])
+        _replace_straight(normals, surrounded)
+        table[first : first + rows] = normals
     return table
 
 
@@ -99,7 +114,7 @@ def _surrounded(obstacles: np.ndarray, part: Window, outside: bool) -> np.ndarra
     return result
 
 
-def _cell_normals(obstacles: np.ndarray) -> np.ndarray:
+def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
     """Compute unit normals of exposed cells: occupied cells with a free cell at one of their sides.
 
     Args:
@@ -131,6 +146,36 @@ def _cell_normals(obstacles: np.ndarray) -> np.ndarray:
     downhill /= np.where(has_gradient, steepness, 1)[:, None]
     normals[row, col] = np.where(flat[:, None], across, np.where(has_gradient[:, None], downhill, np.nan))
     return normals
+
+
+def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
+    """Replace the normals of cells at straight pieces of an obstacle's outline, up to its corners.
+
+    Of a cell's sides those with the longest straight piece count. At the corner of a block these are two, and the
+    normal lies between theirs.
+
+    Args:
+        normals: (H, W, 2) normals.
+        obstacles: (H + 2 MARGIN, W + 2 MARGIN) bool: the map and its surroundings.
+    """
+    outlines = Outlines(obstacles)
+    height, width = normals.shape[:2]
+    row, col = (index - _MARGIN for index in np.divmod(outlines.cell, obstacles.shape[1]))
+    sides = np.nonzero((row >= 0) & (row < height) & (col >= 0) & (col < width))[0]
+    cell = row[sides] * width + col[sides]
+    normal, place = outlines.straight_normals(sides)
+    best = np.full(height * width, len(SPANS))
+    np.minimum.at(best, cell, place)
+    counts = (place == best[cell]) & (place < len(SPANS))
+    cell, normal = cell[counts], normal[counts]
+    # The first of a cell's sides is written last.
+    first, total = np.zeros((2, height * width, 2))
+    first[cell[::-1]] = normal[::-1]
+    opposite = (first[cell] * normal).sum(axis=1) < _OPPOSITE
+    np.add.at(total, cell, np.where(opposite, -1, 1)[:, None] * normal)
+    length = np.hypot(*total.T)
+    known = length > 0
+    normals.reshape(-1, 2)[known] = total[known] / length[known, None]
 
 
 def _moments(obstacles: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense.world.frames import split
@@ -42,7 +43,7 @@ class LandmarkMap:
         3
     """
 
-    def __init__(self, xy: object, signatures: object = None) -> None:
+    def __init__(self, xy: ArrayLike, signatures: ArrayLike | None = None) -> None:
         positions = checks.as_array("xy", xy)
         self.xy = np.zeros((0, 2)) if positions.shape == (0,) else checks.array("xy", positions, ("M", 2)).copy()
         self.xy.flags.writeable = False

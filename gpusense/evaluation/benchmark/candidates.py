@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense._util.typing import Precision
 from gpusense.backends import Backend
 from gpusense.evaluation.benchmark.measure import Runner
 from gpusense.evaluation.benchmark.scenes import Scene
@@ -26,7 +27,7 @@ PROBLEMS = ("ranges", "beam", "field")
 """Expected ranges; log-likelihoods of the beam model; log-likelihoods of the likelihood field."""
 
 # Makes a runner from a scene, a device (None for outside candidates) and a precision.
-Make = Callable[[Scene, Any, str], Runner]
+Make = Callable[[Scene, Any, Any], Runner]
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ class _ModelRunner:
 
 
 def _ranges(caster: Caster) -> Make:
-    def make(scene: Scene, backend: Backend, precision: str) -> Runner:
+    def make(scene: Scene, backend: Backend, precision: Precision) -> Runner:
         limit, bearings = scene.scanner.range_max, scene.scanner.bearings
         ray_caster = RayCaster(scene.grid, limit, caster=caster, backend=backend, precision=precision)
         return _ModelRunner(ray_caster, lambda poses: ray_caster.cast(poses, bearings))
@@ -184,7 +185,7 @@ def _ranges(caster: Caster) -> Make:
 
 
 def _beam(caster: Caster, share: int = 1, **options: Any) -> Make:
-    def make(scene: Scene, backend: Backend, precision: str) -> Runner:
+    def make(scene: Scene, backend: Backend, precision: Precision) -> Runner:
         model = BeamModel(
             scene.grid, scene.scanner, scene.beam, backend=backend, precision=precision, caster=caster,
             beams=_beams(scene, share), **options,
@@ -195,7 +196,7 @@ def _beam(caster: Caster, share: int = 1, **options: Any) -> Make:
 
 
 def _field(share: int = 1, **options: Any) -> Make:
-    def make(scene: Scene, backend: Backend, precision: str) -> Runner:
+    def make(scene: Scene, backend: Backend, precision: Precision) -> Runner:
         model = LikelihoodFieldModel(
             scene.grid, scene.scanner, scene.field, backend=backend, precision=precision, beams=_beams(scene, share),
             **options,

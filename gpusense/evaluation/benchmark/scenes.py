@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.typing import Precision
 from gpusense.backends import Backend
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, sample_readings
 from gpusense.models.scan.caster import RayCaster
@@ -194,7 +195,7 @@ def _true_pose(
         raise ValueError(f"scene {name}: the map must have a place {_CLEARANCE} m away from everything, got none")
     room = OccupancyGrid(np.where(clear, 0, 100).astype(np.int8), grid.resolution, grid.origin)
     poses = cloud_uniform(room, _TRIED_POSES, rng)
-    precision = "float64" if device.info.float64 else "float32"
+    precision: Precision = "float64" if device.info.float64 else "float32"
     caster = RayCaster(grid, scanner.range_max, backend=device, precision=precision)
     expected = np.minimum(caster.cast(poses, scanner.bearings).astype(np.float64), scanner.range_max)
     seen = np.count_nonzero(expected < scanner.range_max, axis=1)

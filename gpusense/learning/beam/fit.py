@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.progress import progress as progress_bar
+from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
 from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.book import climb_book
@@ -34,11 +35,11 @@ def fit_beam_parameters(
     expected: ArrayLike,
     range_max: float,
     *,
-    method: str = "em",
+    method: FitMethod = "em",
     range_min: float = 0.0,
     initial: BeamParameters | None = None,
     backend: Selection = "auto",
-    precision: str | None = None,
+    precision: Precision | None = None,
     max_iterations: int | None = None,
     tolerance: float = 1e-8,
     restarts: int = 0,

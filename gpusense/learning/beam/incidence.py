@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Backend, Selection
 from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.device_sums import DeviceSums
@@ -119,11 +120,11 @@ def fit_incidence_parameters(
     *,
     bins: int | Sequence[float] | NDArray[np.floating] = 6,
     strength: float = 30.0,
-    method: str = "em",
+    method: FitMethod = "em",
     range_min: float = 0.0,
     initial: BeamParameters | None = None,
     backend: Selection = "auto",
-    precision: str | None = None,
+    precision: Precision | None = None,
     max_iterations: int | None = None,
     tolerance: float = 1e-8,
     restarts: int = 0,

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from gpusense._util import checks
 from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
@@ -71,7 +71,7 @@ class DiscreteBeamModel(SensorTable):
             raise TypeError(f"fit: must be a DiscreteFit or None, got {checks.show(self.fit)}")
 
     @classmethod
-    def learn(cls, ranges: object, expected: object, range_max: float, bins: int = 100) -> Self:
+    def learn(cls, ranges: ArrayLike, expected: ArrayLike, range_max: float, bins: int = 100) -> Self:
         """Learn the :class:`DiscreteCauses` of maximum likelihood.
 
         Readings are first counted in a table of ``bins`` times ``bins``, so that the search takes no longer for
@@ -142,7 +142,7 @@ class DiscreteBeamModel(SensorTable):
         table.setflags(write=False)
         return table
 
-    def log_likelihood(self, ranges: object, expected: object) -> NDArray[np.float64]:
+    def log_likelihood(self, ranges: ArrayLike, expected: ArrayLike) -> NDArray[np.float64]:
         """Compute the contribution of each reading to a scan's log-likelihood.
 
         Args:

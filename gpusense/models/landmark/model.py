@@ -7,8 +7,10 @@ import math
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, Association, Precision
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.flags import flags_if
@@ -80,8 +82,8 @@ class LandmarkModel(PointModel):
         parameters: LandmarkParameters | None = None,
         *,
         backend: Selection = "auto",
-        precision: str = "float32",
-        association: str = "nearest",
+        precision: Precision = "float32",
+        association: Association = "nearest",
         negative: bool = False,
         mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
         temperature: float = 1.0,
@@ -119,7 +121,7 @@ class LandmarkModel(PointModel):
         self._tables = upload_tables(self._backend, self._real, landmarks, self._buckets, p, self._sensor)
 
     def log_likelihood(
-        self, poses: object, features: object, correspondence: object = None, *, out: Any = None
+        self, poses: AnyArray, features: ArrayLike, correspondence: ArrayLike | None = None, *, out: Any = None
     ) -> np.ndarray:
         """Return log p(f_1 ... f_F | x, m) for each particle, natural logarithm.
 
@@ -142,7 +144,7 @@ class LandmarkModel(PointModel):
         """
         return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
 
-    def associate(self, poses: object, features: object) -> tuple[np.ndarray, np.ndarray]:
+    def associate(self, poses: AnyArray, features: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the landmark of each feature, for each particle.
 
         With ``association="sum"`` this is the landmark with the largest part of the sum.

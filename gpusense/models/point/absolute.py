@@ -7,8 +7,10 @@ from decimal import Decimal, localcontext
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
@@ -53,7 +55,7 @@ class PositionModel(PointModel):
         parameters: PositionParameters,
         *,
         backend: Selection = "auto",
-        precision: str = "float32",
+        precision: Precision = "float32",
         temperature: float = 1.0,
     ) -> None:
         if not isinstance(parameters, PositionParameters):
@@ -70,7 +72,9 @@ class PositionModel(PointModel):
         elif matrix is not None:
             self._hit = self._gaussian("covariance", (exact(matrix[0][0]), exact(matrix[0][1]), exact(matrix[1][1])))
 
-    def log_likelihood(self, poses: object, fix: object, *, covariance: object = None, out: Any = None) -> np.ndarray:
+    def log_likelihood(
+        self, poses: AnyArray, fix: ArrayLike, *, covariance: ArrayLike | None = None, out: Any = None
+    ) -> np.ndarray:
         """Return log p(z | x) of a fix for each particle, natural logarithm.
 
         Args:
@@ -170,7 +174,7 @@ class HeadingModel(PointModel):
         parameters: HeadingParameters | None = None,
         *,
         backend: Selection = "auto",
-        precision: str = "float32",
+        precision: Precision = "float32",
         temperature: float = 1.0,
     ) -> None:
         self.parameters = HeadingParameters() if parameters is None else parameters
@@ -181,7 +185,7 @@ class HeadingModel(PointModel):
         self._flags |= flags_if(RAND=self.parameters.z_rand > 0)
         self._terms_buffer = self._backend.upload(terms)
 
-    def log_likelihood(self, poses: object, heading: object, *, out: Any = None) -> np.ndarray:
+    def log_likelihood(self, poses: AnyArray, heading: float, *, out: Any = None) -> np.ndarray:
         """Return log p(z | x) of a heading for each particle, natural logarithm.
 
         Args:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.typing import Precision
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.results import Result
@@ -76,9 +77,9 @@ class PointModel(ABC):
         return self._backend.info
 
     @property
-    def precision(self) -> str:
+    def precision(self) -> Precision:
         """``"float32"`` or ``"float64"``."""
-        return self._real.name
+        return cast(Precision, self._real.name)
 
     def explain(self) -> str:
         """Report what this scene leaves out, why, and the saving; readings and poses as of the last call."""

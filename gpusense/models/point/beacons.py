@@ -7,8 +7,10 @@ from decimal import Decimal, localcontext
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import BEACON, BEACON_TERMS, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
@@ -50,11 +52,11 @@ class BeaconModel(PointModel):
 
     def __init__(
         self,
-        xy: object,
+        xy: ArrayLike,
         parameters: BeaconParameters | None = None,
         *,
         backend: Selection = "auto",
-        precision: str = "float32",
+        precision: Precision = "float32",
         temperature: float = 1.0,
     ) -> None:
         self.parameters = BeaconParameters() if parameters is None else parameters
@@ -76,7 +78,9 @@ class BeaconModel(PointModel):
         self._count = len(series)
         self._terms_buffer, self._series_buffer = self._backend.upload(terms), self._backend.upload(series)
 
-    def log_likelihood(self, poses: object, ranges: object, ids: object = None, *, out: Any = None) -> np.ndarray:
+    def log_likelihood(
+        self, poses: AnyArray, ranges: ArrayLike, ids: ArrayLike | None = None, *, out: Any = None
+    ) -> np.ndarray:
         """Return log p(z_1 ... z_F | x) for each particle, natural logarithm.
 
         Args:

@@ -7,8 +7,10 @@ from decimal import localcontext
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, Precision, Space
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import FIELD_RING
@@ -70,14 +72,14 @@ class BumperModel(PointModel):
     def __init__(
         self,
         grid: OccupancyGrid,
-        outline: object,
+        outline: ArrayLike,
         parameters: BumperParameters | None = None,
         *,
-        segments: object = None,
+        segments: ArrayLike | None = None,
         backend: Selection = "auto",
-        precision: str = "float32",
-        unknown: str = "free",
-        outside: str = "free",
+        precision: Precision = "float32",
+        unknown: Space = "free",
+        outside: Space = "free",
         temperature: float = 1.0,
     ) -> None:
         if not isinstance(grid, OccupancyGrid):
@@ -111,7 +113,7 @@ class BumperModel(PointModel):
         self._all_points = [self._backend.upload(each) for each in (high, low)]
         self._terms_buffer = self._backend.upload(self._terms(self._radius))
 
-    def log_likelihood(self, poses: object, pressed: object, *, out: Any = None) -> np.ndarray:
+    def log_likelihood(self, poses: AnyArray, pressed: ArrayLike, *, out: Any = None) -> np.ndarray:
         """Return log p(pressed | x, m) for each particle, natural logarithm.
 
         Args:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, CasterName, Compat, Precision, Space
 from gpusense.backends import Selection
 from gpusense.models.arguments import check_absent, check_discrete
 from gpusense.models.scan.beam_explain import title_and_omissions
@@ -78,14 +81,14 @@ class BeamModel(ScanModel):
         *,
         incidence: IncidenceParameters | None = None,
         backend: Selection = "auto",
-        precision: str = "float32",
-        caster: str | Caster | None = None,
+        precision: Precision = "float32",
+        caster: CasterName | Caster | None = None,
         sensor_table: float | None = None,
-        unknown: str | None = None,
-        outside: str | None = None,
+        unknown: Space | None = None,
+        outside: Space | None = None,
         temperature: float = 1.0,
         beams: Beams = None,
-        compat: str | None = None,
+        compat: Compat | None = None,
         specialize: bool = True,
     ) -> None:
         weights = compat_module.choose(compat)
@@ -157,7 +160,7 @@ class BeamModel(ScanModel):
         """Bytes of the map's table on the device; 0 before the first call."""
         return self._caster.table_bytes
 
-    def update_map(self, cells: object, region: object) -> None:
+    def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.
 
         The exact caster updates only the affected part of its table; see ``RayCaster.update_map``.
@@ -173,7 +176,7 @@ class BeamModel(ScanModel):
         with self._lock:
             self._caster.update(cells, region)
 
-    def expected_ranges(self, poses: object, *, out: Any = None) -> Any:
+    def expected_ranges(self, poses: AnyArray, *, out: Any = None) -> Any:
         """Return z* of every beam of the scanner at each pose; for a cone, the range of the nearest return.
 
         Args:
@@ -189,7 +192,7 @@ class BeamModel(ScanModel):
         with self._lock:
             return self._cast(poses, out, incidence=False)
 
-    def incidence(self, poses: object, *, out: Any = None) -> Any:
+    def incidence(self, poses: AnyArray, *, out: Any = None) -> Any:
         """Return the angle of incidence of every beam of the scanner at each pose; see ``RayCaster.incidence``.
 
         Args:
@@ -215,7 +218,7 @@ class BeamModel(ScanModel):
         )  # fmt: skip
         return str(self._plan(title, omissions))
 
-    def _cast(self, poses: object, out: Any, *, incidence: bool) -> Any:
+    def _cast(self, poses: AnyArray, out: Any, *, incidence: bool) -> Any:
         pipeline = self._beam_pipeline
         cones = dataclasses.replace(pipeline.cones, incidence=incidence)
         return self._caster.cast(poses, pipeline.cone_vectors, out, cones)

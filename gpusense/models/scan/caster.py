@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, CasterName, Precision, Space
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
@@ -52,12 +56,12 @@ class RayCaster:
         grid: OccupancyGrid,
         range_max: float,
         *,
-        caster: str | Caster | None = None,
-        method: str | Caster | None = None,
+        caster: CasterName | Caster | None = None,
+        method: CasterName | Caster | None = None,
         backend: Selection = "auto",
-        precision: str = "float32",
-        unknown: str = "free",
-        outside: str = "free",
+        precision: Precision = "float32",
+        unknown: Space = "free",
+        outside: Space = "free",
     ) -> None:
         self.range_max = checks.real("range_max", range_max, above=0)
         check_scene(grid, self.range_max)
@@ -106,16 +110,16 @@ class RayCaster:
         return self._caster.backend.info
 
     @property
-    def precision(self) -> str:
+    def precision(self) -> Precision:
         """``"float32"`` or ``"float64"``."""
-        return self._caster.real.name
+        return cast(Precision, self._caster.real.name)
 
     @property
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before the first cast."""
         return self._caster.table_bytes
 
-    def prepare(self, poses: object) -> None:
+    def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``cast`` does it otherwise.
 
         Raises:
@@ -124,7 +128,7 @@ class RayCaster:
         """
         self._caster.prepare(Poses(poses, self._caster.backend))
 
-    def update_map(self, cells: object, region: object) -> None:
+    def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; afterwards every range is that of a caster of the changed grid.
 
         The exact caster updates its table where rectangles can hold a changed obstacle, up to 254 cells away. Other
@@ -151,7 +155,7 @@ class RayCaster:
             raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.caster.name!r}")
         self._caster.save(checks.path("path", path), self.caster.bins)
 
-    def cast(self, poses: object, bearings: object, *, out: Any = None) -> Any:
+    def cast(self, poses: AnyArray, bearings: AnyArray, *, out: Any = None) -> Any:
         """Return expected ranges.
 
         Args:
@@ -170,7 +174,7 @@ class RayCaster:
         vectors = ray_vectors(checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
         return self._caster.cast(poses, vectors, out)
 
-    def incidence(self, poses: object, bearings: object, *, out: Any = None) -> Any:
+    def incidence(self, poses: AnyArray, bearings: AnyArray, *, out: Any = None) -> Any:
         """Return angles of incidence, between each ray and the normal of the surface that it hits.
 
         Normals are computed as by ``surface_normals``, in the cell in which the exact ray ends. A cell without a normal

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from numpy.typing import ArrayLike
+
 from gpusense._util import checks
+from gpusense._util.typing import Compat, Precision, Space
 from gpusense.backends import Selection
 from gpusense.interface.plan import Omission, launch_omissions, scene_omissions
 from gpusense.interface.terms import HIGH_PEAK
@@ -56,12 +61,12 @@ class LikelihoodFieldModel(ScanModel):
         parameters: LikelihoodFieldParameters | None = None,
         *,
         backend: Selection = "auto",
-        precision: str = "float32",
-        unknown: str | None = None,
-        outside: str | None = None,
+        precision: Precision = "float32",
+        unknown: Space | None = None,
+        outside: Space | None = None,
         temperature: float = 1.0,
         beams: Beams = None,
-        compat: str | None = None,
+        compat: Compat | None = None,
         specialize: bool = True,
     ) -> None:
         weights = compat_module.choose(compat)
@@ -90,7 +95,7 @@ class LikelihoodFieldModel(ScanModel):
         """Bytes of the map's table on the device; 0 before the first call."""
         return self._field_pipeline.table_bytes
 
-    def update_map(self, cells: object, region: object) -> None:
+    def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.
 
         Only distances within ``max_distance`` of a changed obstacle are computed again.

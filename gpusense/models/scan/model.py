@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from typing import Any, Literal, overload
+from typing import Any, Literal, cast, overload
 
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Omission, Plan, share
@@ -36,12 +37,12 @@ class ScanModel(ABC):
         scanner: Scanner,
         *,
         backend: Selection,
-        precision: str,
+        precision: Precision,
         unknown: str | None,
         outside: str | None,
         temperature: float,
         beams: Beams,
-        compat: str | None,
+        compat: Compat | None,
         specialize: bool,
         z_max: float,
         max_depends: bool,
@@ -105,27 +106,27 @@ class ScanModel(ABC):
         return self._setting.backend.info
 
     @property
-    def precision(self) -> str:
+    def precision(self) -> Precision:
         """``"float32"`` or ``"float64"``."""
-        return self._setting.real.name
+        return cast(Precision, self._setting.real.name)
 
     @overload
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: Literal[False] = ..., out: Any = ...
+        self, poses: AnyArray, ranges: AnyArray, *, per_beam: Literal[False] = ..., out: Any = ...
     ) -> np.ndarray: ...
 
     @overload
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: Literal[True], out: Any = ...
+        self, poses: AnyArray, ranges: AnyArray, *, per_beam: Literal[True], out: Any = ...
     ) -> tuple[np.ndarray, np.ndarray]: ...
 
     @overload
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: bool, out: Any = ...
+        self, poses: AnyArray, ranges: AnyArray, *, per_beam: bool, out: Any = ...
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]: ...
 
     def log_likelihood(
-        self, poses: object, ranges: object, *, per_beam: bool = False, out: Any = None
+        self, poses: AnyArray, ranges: AnyArray, *, per_beam: bool = False, out: Any = None
     ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Return log p(z | x, m) of a scan for each particle, natural logarithm.
 
@@ -188,7 +189,7 @@ class ScanModel(ABC):
     def explain(self) -> str:
         """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
 
-    def prepare(self, poses: object) -> None:
+    def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
 
         Raises:
@@ -201,7 +202,7 @@ class ScanModel(ABC):
                 checked.window(self._pipeline.map, (0, checked.count))
 
     def _request(
-        self, poses: object, ranges: object, out: object, *, per_beam: bool = False, known: Known | None = None
+        self, poses: AnyArray, ranges: AnyArray, out: object, *, per_beam: bool = False, known: Known | None = None
     ) -> Request:
         """Check the arguments of a call."""
         return make_request(

@@ -1,0 +1,33 @@
+"""Types of arguments: names that are one of a few, and arrays of any library."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Protocol, TypeAlias
+
+from numpy.typing import ArrayLike
+
+Precision: TypeAlias = Literal["float32", "float64"]
+Space: TypeAlias = Literal["free", "occupied"]
+Compat: TypeAlias = Literal["amcl", "beluga"]
+CasterName: TypeAlias = Literal["exact", "dda", "march", "bresenham", "cddt", "lookup"]
+FitMethod: TypeAlias = Literal["em", "em-book", "gradient", "hill_climb", "genetic"]
+Association: TypeAlias = Literal["nearest", "sum", "joint"]
+Loss: TypeAlias = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
+
+
+class SupportsDLPack(Protocol):
+    """An array of PyTorch, JAX, CuPy or another library that exports DLPack."""
+
+    def __dlpack__(self, *args: Any, **options: Any) -> Any:
+        """Export the array."""
+
+
+class SupportsCuda(Protocol):
+    """An array on a CUDA device."""
+
+    @property
+    def __cuda_array_interface__(self) -> dict[str, Any]:
+        """The array's place, shape and type."""
+
+
+AnyArray: TypeAlias = ArrayLike | SupportsDLPack | SupportsCuda

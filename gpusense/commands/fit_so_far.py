@@ -1,0 +1,48 @@
+"""Results of ``gpusense fit`` before an interrupt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from gpusense.commands.output import print_json
+
+if TYPE_CHECKING:
+    from gpusense.learning.beam.result import BeamFit
+    from gpusense.world.parameters import BeamParameters
+
+
+@dataclass
+class SoFar:
+    """Results before an interrupt.
+
+    Attributes:
+        iteration, log_likelihood, parameters: The likeliest parameters of the search, None before its first iteration.
+        fit: The fit, once it has ended.
+    """
+
+    iteration: int = 0
+    log_likelihood: float = -math.inf
+    parameters: BeamParameters | None = None
+    fit: BeamFit | None = None
+
+    def see(self, iteration: int, log_likelihood: float, parameters: BeamParameters) -> None:
+        """Note an iteration of the search."""
+        if log_likelihood > self.log_likelihood:
+            self.iteration, self.log_likelihood, self.parameters = iteration, log_likelihood, parameters
+
+    def print(self, *, json: bool) -> None:
+        """Print the results, if there are any."""
+        best = self.parameters if self.fit is None else self.fit.parameters
+        if best is None:
+            return
+        if json:
+            fit = None if self.fit is None else self.fit.to_dict()
+            print_json({"interrupted": True, "parameters": best.to_dict(), "fit": fit})
+        elif self.fit is not None:
+            print(f"{self.fit}\ninterrupted: this fit had ended, the rest had not")
+        else:
+            values = "\n".join(f"  {name:12} {value:.6g}" for name, value in best.to_dict().items())
+            print(f"interrupted: best parameters up to iteration {self.iteration}, before convergence\n{values}")
+            print(f"log-likelihood {self.log_likelihood:.3f}")

@@ -75,9 +75,9 @@ class Bresenham(Caster):
     """Bresenham's line from cell to cell.
 
     Args:
-        lines: None; ``"amcl"`` for the lines of nav2_amcl, which look one cell beyond the ray's end and may be longer than
-            range_max; or ``"beluga"`` for Beluga's, where a line midway between two cells takes the straight one, and
-            rays from outside the grid meet nothing.
+        lines: None; ``"amcl"`` for the lines of nav2_amcl, which look one cell beyond the ray's end and may be longer
+            than range_max; or ``"beluga"`` for Beluga's, where a line midway between two cells takes the straight one,
+            and rays from outside the grid meet nothing.
 
     Raises:
         TypeError, ValueError: ``lines`` is neither None nor one of these words.

@@ -118,7 +118,7 @@ class FieldTable:
         return True
 
     def _values(self, squared: np.ndarray) -> np.ndarray:
-        """Convert squared distances [cells^2] to float64 cell values: log densities, distances [m] or a peer's terms."""
+        """Convert squared distances [cells^2] to float64 cell values: log densities, distances [m], peers' terms."""
         p = self._parameters
         if self._peer is not None:
             return self._peer.terms(self._peer.field_values(squared, p, self._resolution, self._range_max))

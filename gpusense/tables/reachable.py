@@ -15,7 +15,6 @@ from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Corners, Window
 
-
 ObstaclesOf = Callable[[OccupancyGrid, str], np.ndarray]
 """A function of a grid and of the state of unknown cells, which returns an (H, W) mask."""
 

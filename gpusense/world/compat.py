@@ -14,10 +14,10 @@ beluga    likelihood field        ``1 + sum p^3``, the normal density normalised
 beluga    likelihood field, prob  ``product p``, the normal density normalised for an unbounded range
 ========  ======================  =====================================================================
 
-*Readings.* amcl: a reading of at most range_min (-inf too) is a max reading, and NaN is left out. Its beam model scores a
-reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, which is 0 for +inf;
-its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its beam
-model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; to its likelihood field this reading is a range.
+*Readings.* amcl: a reading of at most range_min (-inf too) is a max reading, and NaN is left out. Its beam model scores
+a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, which is 0 for
++inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its
+beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field takes it for a range.
 
 *Cells.* 0 is free, 100 is occupied, and all others, -1 and those of maps in mode ``scale``, are neither: they stop the
 beams of the beam models and are no obstacles of the likelihood fields. ``occupied_threshold`` has no effect.
@@ -27,8 +27,10 @@ ray's end, and distances between cells may exceed range_max; the map's edge stop
 ranges of 0. Beluga's have range_max beyond the map's edge, and at a particle off the map.
 
 *Likelihood fields.* An end point off the map counts as ``max_distance`` for amcl and as a density of ``1 / range_max``
-for Beluga. Cells hold float32 numbers: amcl's distances, Beluga's densities. Errors of the peers' distance transforms are
-not reproduced, distances are exact; nor is amcl's shift of map look-ups by half a cell.
+for Beluga. Cells hold float32 numbers: amcl's distances, Beluga's densities.
+
+*Not reproduced:* errors of the peers' distance transforms; amcl's shift of map look-ups by half a cell, which a grid
+with an origin half a cell lower in x and y has; Beluga's beams from the robot's origin in place of the sensor's.
 
 Versions: nav2_amcl 1.5.0 and Beluga 2.1.1, with the default parameters of their nodes.
 """
@@ -150,7 +152,7 @@ class Amcl(Peer):
 
     def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
         """See Peer.beyond."""
-        return float(_unnormalised(np.float64(p.max_distance), p, range_max))
+        return float(_unnormalised(np.array(p.max_distance), p, range_max))
 
 
 @dataclass(frozen=True)
@@ -233,7 +235,7 @@ class Beluga(Peer):
         return float(np.float32(1 / range_max))
 
     def overlay(self, p: LikelihoodFieldParameters, range_max: float) -> float:
-        """Return the density of OVERLAID cells: that of a squared distance, which is computed from ``1 / range_max``."""
+        """Return the density of OVERLAID cells, that of a squared distance computed from ``1 / range_max``."""
         farthest = np.float32(p.max_distance * p.max_distance)
         share = (1 / range_max - p.z_rand / range_max) / _amplitude(p) if p.z_hit > 0 else 0.0
         # Without a share of the normal density there is no such distance.

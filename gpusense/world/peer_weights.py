@@ -14,7 +14,7 @@ from gpusense.world.scanner import Scanner
 
 @dataclass(frozen=True)
 class BeamWeights(BeamParameters):
-    """Parameters of the peers' beam models, whose weights need not sum to 1; the defaults are those of both nodes.
+    """Parameters of the peers' beam models, whose weights need not sum to 1; the defaults are both nodes'.
 
     Raises:
         TypeError: A value is not a real number.
@@ -33,7 +33,7 @@ class BeamWeights(BeamParameters):
 
 @dataclass(frozen=True)
 class FieldWeights(LikelihoodFieldParameters):
-    """Parameters of the peers' likelihood fields, whose weights need not sum to 1; the defaults are those of both nodes.
+    """Parameters of the peers' likelihood fields, whose weights need not sum to 1; the defaults are both nodes'.
 
     Raises:
         TypeError: A value is not a real number.

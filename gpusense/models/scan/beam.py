@@ -114,8 +114,8 @@ class BeamModel(ScanModel):
             unknown=weights.unknown if unknown is None else unknown,
             outside=weights.outside if outside is None else outside,
             temperature=temperature, beams=beams, compat=compat, cubes=weights.is_peer,
-            specialize=specialize, z_max=max(p.z_max for p in mixtures) if table is None else 1.0, max_depends=max_depends,
-            constant_term=weights.constant_term,
+            specialize=specialize, z_max=max(p.z_max for p in mixtures) if table is None else 1.0,
+            max_depends=max_depends, constant_term=weights.constant_term,
             # Where max readings depend on the pose, the kernel finds impossible ranges.
             possible=max_depends or any(p.z_hit or p.z_short or p.z_rand for p in mixtures),
         )  # fmt: skip

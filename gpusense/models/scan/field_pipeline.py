@@ -68,8 +68,8 @@ class FieldPipeline(ScanPipeline):
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.refresh,
-            obstacles_of=weights.field_obstacles, neighbors=weights.neighbors,
+            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize,
+            self.table.refresh, obstacles_of=weights.field_obstacles, neighbors=weights.neighbors,
         )  # fmt: skip
 
     @property

@@ -209,9 +209,7 @@ class ScanPipeline(ABC):
         """Return the log-likelihood of scans where it is the same at every pose, None elsewhere."""
         if not len(scans.readings):
             setting = self.setting
-            constant = setting.weights.without_readings(
-                scans.constants[0], setting.constant_term, cubes=setting.cubes
-            )
+            constant = setting.weights.without_readings(scans.constants[0], setting.constant_term, cubes=setting.cubes)
             return float(setting.temperature * constant)
         if not self.setting.possible and np.isfinite(scans.readings).any():
             return -np.inf

@@ -72,6 +72,11 @@ class Caster(ABC):
     ring: ClassVar[bool] = True
 
     @property
+    def beyond(self) -> int:
+        """Cells beyond the longest range that matter."""
+        return 0
+
+    @property
     def entry(self) -> CasterEntry:
         """The caster in the registry."""
         return ENTRIES[self.name]

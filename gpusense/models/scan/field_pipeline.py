@@ -54,22 +54,23 @@ class FieldPipeline(ScanPipeline):
         outside: str,
     ) -> None:
         super().__init__(setting)
-        bilinear, compat = parameters.interpolation == "bilinear", setting.weights.cubes
-        self.log_table = (self.specialize or compat) and not bilinear
+        bilinear, weights = parameters.interpolation == "bilinear", setting.weights
+        self.log_table = (self.specialize or weights.is_peer) and not bilinear
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
-        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=compat)
+        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=setting.cubes)
         self._terms = self.backend.upload(terms)
         self._guard = _GUARD * float(np.finfo(self.real).eps)
         range_max = self.scanner.range_max
         self.table = FieldTable(
             self.real, parameters, grid.resolution, range_max, outside=outside,
-            compat=setting.weights.name, log_table=self.log_table, flags=self.components,
+            weights=weights, log_table=self.log_table, flags=self.components,
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.refresh
-        )
+            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize,
+            self.table.refresh, obstacles_of=weights.field_obstacles, neighbors=weights.neighbors,
+        )  # fmt: skip
 
     @property
     def map(self) -> ReachableMap:

@@ -1,5 +1,4 @@
 """Casters: methods for expected ranges, for ``RayCaster(caster=...)`` and ``BeamModel(caster=...)``."""
 
-from gpusense.tables.casters import CASTERS, Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
-
-__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March"]
+from gpusense.tables.casters import *  # noqa: F403
+from gpusense.tables.casters import __all__ as __all__

@@ -10,6 +10,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.evaluation.worlds import building, cloud_around, free_pose
+from gpusense.interface.structs import Caster, Window
 from gpusense.reference import raycast
 from gpusense.tables.rectangles import empty_rectangles, sectors_of
 from gpusense.world.frames import place_poses, ray_vectors
@@ -90,7 +91,7 @@ def count_reads(scene: Scene, backend: Any) -> tuple[float, float]:
     limit = np.float32(RANGE_MAX / size)
     flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
     found = raycast.cast_ray(
-        flags, table, rows, cols, placed.cell, placed.pose, rays, limit, 0, np.float32(0), np.float32(0)
+        flags, table, Window(0, 0, rows, cols), placed.cell, placed.pose, rays, limit, Caster(0, 0.0, 0.0)
     )  # type: ignore[arg-type]
     # The read that finds an obstacle is no step.
     return table.reads / len(poses), (table.reads - np.count_nonzero(found < limit)) / len(poses)

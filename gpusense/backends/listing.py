@@ -17,7 +17,7 @@ class Device:
     """A device of this machine, or one that it could have.
 
     Attributes:
-        backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
+        backend: The name of its backend: ``"numpy"``, ``"opencl"``, ``"warp"`` or a further one of the registry.
         name: The name of the device, or of the absent part.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.

@@ -165,15 +165,15 @@ def _find(selection: str) -> str:
 
 def _choose(entry: Entry, rest: str, present: list[Device], selection: str) -> str:
     """Return the device of a backend that a user's selection means; ``rest`` is what follows the backend's name."""
+    for device in present:
+        if device.selection == selection:
+            return selection
     if not rest:
         real = [device for device in present if device.kind != "simulator"]
         if not real:
             raise ValueError(f"backend: only simulators are present and must be named, got {show(selection)}")
         # Where none is usable, opening the first one says why.
         return (_best(real) or real[0]).selection
-    for device in present:
-        if device.selection == selection:
-            return selection
     if entry.by_name:
         matches = _named(rest, present)
     else:

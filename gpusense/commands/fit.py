@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
-    add("--log", type=Path, metavar="FILE", help="a CARMEN log with corrected poses, plain or .gz; needs --map")
+    add("--log", type=Path, metavar="FILE", help="a log (CARMEN) with corrected poses, plain or .gz; needs --map")
     add("--pairs", type=Path, metavar="CSV",
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip

@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add("--log", required=True, type=Path, metavar="FILE", help="a CARMEN log with corrected poses, plain or .gz")
+    add("--log", required=True, type=Path, metavar="FILE", help="a log (CARMEN) with corrected poses, plain or .gz")
     add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
     add("--backend", action="append", metavar="DEVICE",
         help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip

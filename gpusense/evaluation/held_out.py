@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gpusense.evaluation.range_data import RangeData
 from gpusense.learning.beam.incidence import IncidenceFit
-from gpusense.world.compat import PEERS
+from gpusense.world.compat import Beluga
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
 
@@ -48,10 +48,13 @@ class HeldOut:
 
 
 def peer_parameters() -> dict[str, BeamParameters]:
-    """Return the default parameters of nav2_amcl and Beluga, with weights divided by their sum, which is not 1."""
+    """Return the default parameters of nav2_amcl and Beluga's library, with weights divided by their sum, not 1.
+
+    Beluga's node has the defaults of nav2_amcl.
+    """
     parameters = {}
-    for name, label in (("amcl", "nav2_amcl's defaults"), ("beluga", "Beluga's defaults")):
-        values = PEERS[name].beam.to_dict()
+    for beam, label in ((Beluga.beam, "nav2_amcl's defaults"), (Beluga.library, "Beluga's defaults")):
+        values = beam.to_dict()
         total = sum(values[weight] for weight in ("z_hit", "z_short", "z_max", "z_rand"))
         parameters[label] = BeamParameters.from_dict(
             {key: value / total if key.startswith("z_") else value for key, value in values.items()}

@@ -33,6 +33,8 @@ FLAGS = {
     "SECTORS_2": "empty rectangles are made for 2 sectors of each quadrant's directions",
     "SECTORS_4": "empty rectangles are made for 4 of them",
     **casters.FLAGS,
+    "AMCL_LINES": "Bresenham's lines are nav2_amcl's: they look one cell beyond their end, at ranges beyond range_max",
+    "BELUGA_LINES": "Bresenham's lines are Beluga's: ties go straight on, and rays from outside the grid meet nothing",
     "ECHO": "a sensor hears the nearest of several rays, or its angle of incidence matters",
     "INCIDENCE": "the angle of incidence chooses the mixture's terms, or says whether anything returns",
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",

@@ -25,22 +25,20 @@ front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is ski
 
 from __future__ import annotations
 
-import gzip
 import math
-import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.logs.lines import numbered_lines
 from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 
 _FRONT = (b"FLASER", b"ROBOTLASER1")
 _REAR = (b"RLASER", b"ROBOTLASER2")
 _KNOWN = (*_FRONT, *_REAR, b"ODOM")
-_MAX_LINE = 1 << 24
 _TAIL = 3  # time of measurement, host, logger's time
 
 
@@ -83,23 +81,12 @@ def _messages(path: Path) -> Iterator[tuple[str, list[bytes]]]:
     """
     any_message = False
     number = 0
-    try:
-        with path.open("rb") as plain:
-            compressed = plain.read(2) == b"\x1f\x8b"
-            plain.seek(0)
-            with gzip.open(plain) if compressed else plain as stream:
-                while line := stream.readline(_MAX_LINE):
-                    number += 1
-                    if len(line) == _MAX_LINE:
-                        rule = f"must have lines of less than {_MAX_LINE} bytes"
-                        raise ValueError(f"{path}:{number}: {rule}, got a longer one")
-                    if line.startswith(_KNOWN):
-                        fields = line.split()
-                        if fields[0] in _KNOWN:
-                            any_message = True
-                            yield f"{path}:{number}", fields
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{path}:{number + 1}: must be a whole gzip file, got a broken one: {error}") from error
+    for number, line in numbered_lines(path):
+        if line.startswith(_KNOWN):
+            fields = line.split()
+            if fields[0] in _KNOWN:
+                any_message = True
+                yield f"{path}:{number}", fields
     if not any_message:
         raise ValueError(f"{path}: must hold laser or ODOM messages of CARMEN, got none in {number} lines")
 

@@ -18,19 +18,17 @@ Readings before the first logged pose or after the last are left out.
 
 from __future__ import annotations
 
-import gzip
 import math
 import os
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.logs.lines import numbered_lines
 from gpusense.logs.records import Floats, Integers, LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 
-_MAX_LINE = 10_000
 # Indices of subjects that are no landmark: another robot, and the owner of an unlisted barcode.
 _ROBOT, _UNKNOWN = -1, -2
 
@@ -148,22 +146,13 @@ def _table(path: Path, columns: tuple[str, ...], ordered: bool = False) -> tuple
     file = checks.existing_file(_file(path))
     rows: list[list[float]] = []
     where: list[str] = []
-    number = 0
-    try:
-        with file.open("rb") as plain:
-            packed = plain.read(2) == b"\x1f\x8b"
-            plain.seek(0)
-            with gzip.open(plain) if packed else plain as stream:
-                while line := stream.readline(_MAX_LINE):
-                    number += 1
-                    fields = line.split()
-                    if fields and not fields[0].startswith(b"#"):
-                        where.append(f"{file}:{number}")
-                        rows.append(_row(where[-1], fields, columns))
-                        if ordered and len(rows) > 1 and rows[-1][0] < rows[-2][0]:
-                            raise ValueError(f"{where[-1]}: time must not fall, got {rows[-1][0]:g}")
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{file}:{number + 1}: must be a whole gzip file, got a broken one: {error}") from error
+    for number, line in numbered_lines(file):
+        fields = line.split()
+        if fields and not fields[0].startswith(b"#"):
+            where.append(f"{file}:{number}")
+            rows.append(_row(where[-1], fields, columns))
+            if ordered and len(rows) > 1 and rows[-1][0] < rows[-2][0]:
+                raise ValueError(f"{where[-1]}: time must not fall, got {rows[-1][0]:g}")
     if not rows:
         raise ValueError(f"{file}: must hold rows of {', '.join(columns)}, got none")
     return np.array(rows), where

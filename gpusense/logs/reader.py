@@ -66,8 +66,8 @@ def read_log(
 ) -> Iterator[Scan] | Iterator[Scan | Odometry]:
     """Read a log, one record at a time and in the file's order.
 
-    This version reads CARMEN logs, plain or compressed by gzip; :mod:`gpusense.logs.carmen` describes how messages
-    become records.
+    This version reads CARMEN logs, plain or compressed by gzip. The module of each format describes how messages become
+    records, such as :mod:`gpusense.logs.carmen`.
 
     Args:
         path: The file.

@@ -140,16 +140,16 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
         ValueError: a device pose of the call was not finite.
     """
     flag, dtype = POSE_STATUS
-    states = np.zeros((len(spaces), 2), dtype)
+    states = [np.zeros(2, dtype) for _ in spaces]
     for (space, on_device), state in zip(spaces, states, strict=True):
         if on_device:
             space.download(space.empty(flag, 2, dtype, zero=True), state)
     for space, _ in spaces:
         # The first wait already covers all work on the device.
         space.wait()
-    for (space, _), state in zip(spaces, states, strict=True):
-        if state[0]:
-            space.upload(flag, np.zeros(2, dtype))
-            space.wait()
-    if states[:, 0].any():
+    bad = [space for (space, _), state in zip(spaces, states, strict=True) if state[0]]
+    for space in bad:
+        space.upload(flag, np.zeros(2, dtype))
+        space.wait()
+    if bad:
         raise ValueError(f"{name}: must be finite, got a pose on the device that is not")

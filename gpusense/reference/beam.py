@@ -96,7 +96,7 @@ def score_beams(
                 flags, map_table, normals, window, pose_cell[begin:end], pose[begin:end], ray, rays, cone, scale.limit,
                 caster,
             )  # fmt: skip
-            ranges = expected_range(t, scale)
+            ranges = expected_range(flags, t, scale)
             if "INCIDENCE" in flags:
                 cosine = cosine.reshape(end - begin, rays)[:, ray_of]
                 bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine)

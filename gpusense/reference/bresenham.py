@@ -2,6 +2,9 @@
 
 nav2_amcl and Beluga cast in this manner. Distances are from cell centre to cell centre, and a line may pass between two
 cells that touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+
+A line midway between two cells takes the one aside, with BELUGA_LINES the straight one. With AMCL_LINES a line goes on
+for a cell beyond its end.
 """
 
 from __future__ import annotations
@@ -9,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface import structs
-from gpusense.reference.ray import make_ray, start_casts
+from gpusense.reference.ray import make_ray, off_grid, start_casts
 from gpusense.reference.rectangles import padded
 
 
@@ -41,7 +44,10 @@ def cast_ray(
     end = origin + np.floor(pose[:, :2].T + limit * r.direction).astype(np.int64)
     far = np.abs(end - first)
     longer, shorter = far.max(axis=0), far.min(axis=0)
-    sign = np.where(end >= first, 1, -1)
+    sign = np.where(end > first, 1, -1)
+    if "BELUGA_LINES" in flags:
+        active = active[~off_grid(origin[:, active], window.rows, window.cols)]
+    last = longer + 1 if "AMCL_LINES" in flags else longer
     flat = far[0] >= far[1]
     aside, error, along = np.zeros(len(cell), np.int64), np.zeros(len(cell), np.int64), 0
     while len(active):
@@ -54,9 +60,10 @@ def cast_ray(
         ranges[active[hit]] = t[active[hit]] + np.sqrt(i * i + j * j)
         active = active[state == 0]
         error[active] += shorter[active]
-        over = active[2 * error[active] >= longer[active]]
+        twice = 2 * error[active]
+        over = active[twice > longer[active] if "BELUGA_LINES" in flags else twice >= longer[active]]
         aside[over] += 1
         error[over] -= longer[over]
         along += 1
-        active = active[along <= longer[active]]
+        active = active[along <= last[active]]
     return ranges

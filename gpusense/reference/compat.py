@@ -14,7 +14,7 @@ from gpusense.reference.mixture import hit_mass, short_factor
 def compat_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1).
 
-    A reading of range_max is a max reading.
+    A reading of range_max is a max reading; amcl's longer readings are neither random nor max readings.
     """
     off = z - expected
     p = terms[0] * np.exp(-(off * (off * terms[1])))
@@ -24,4 +24,5 @@ def compat_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, t
         p = p / hit_mass(expected, terms[2], terms[6])
         short = terms[3] * short_factor(terms[4] * expected) * np.exp(-terms[4] * z) / expected
     p = p + np.where(z < expected, short, 0)
-    return (p + np.where(z >= terms[6], terms[7], terms[5])).astype(terms.dtype)
+    at_max = np.where(z > terms[6], 0, terms[7]) if "AMCL" in flags else terms[7]
+    return (p + np.where(z >= terms[6], at_max, terms[5])).astype(terms.dtype)

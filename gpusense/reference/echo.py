@@ -139,7 +139,7 @@ def cast_echoes(
         t, cosine, sine = echoes(
             flags, map_table, normals, window, pose_cell[part], pose[part], ray, rays, cone, scale.limit, caster
         )  # fmt: skip
-        ranges[entries] = expected_range(t, scale)
+        ranges[entries] = expected_range(flags, t, scale)
         if "INCIDENCE" in flags:
             incidence[entries] = np.where(t < scale.limit, np.arctan2(sine, cosine), np.nan)
 

@@ -41,7 +41,7 @@ def cast_ranges(
         lanes = (np.repeat(pose_cell[part], rays, axis=0), np.repeat(pose[part], rays, axis=0))
         beams = np.tile(ray[:rays], (count, 1))
         t = cast_ray(flags, map_table, window, *lanes, beams, scale.limit, caster)
-        ranges[first * rays : part.stop * rays] = expected_range(t, scale)
+        ranges[first * rays : part.stop * rays] = expected_range(flags, t, scale)
 
 
 def cast_tiles(

@@ -141,6 +141,8 @@ def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
     return np.where(index >= bins, index - bins, index)
 
 
-def expected_range(t: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
-    """Convert a distance in cells to metres, exactly range_max where nothing is nearer."""
+def expected_range(flags: frozenset[str], t: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
+    """Convert a distance in cells to metres, exactly range_max where nothing is nearer, or met with AMCL_LINES."""
+    if "AMCL_LINES" in flags:
+        return np.where(t == scale.limit, scale.range_max, t * scale.resolution)
     return np.where(t >= scale.limit, scale.range_max, np.minimum(t * scale.resolution, scale.range_max))

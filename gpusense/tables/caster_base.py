@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.backends.registry import BY_NAME
 from gpusense.interface import structs
 from gpusense.interface.casters import ENTRIES, CasterEntry
 from gpusense.world.windows import Window
@@ -66,9 +67,14 @@ class Caster(ABC):
     memory: ClassVar[str]
     precomputation: ClassVar[str]
     knobs: ClassVar[str] = "none"
-    backends: ClassVar[tuple[str, ...]] = ("numpy", "opencl", "warp")
+    backends: ClassVar[tuple[str, ...]] = tuple(BY_NAME)
     whole: ClassVar[bool] = False
     ring: ClassVar[bool] = True
+
+    @property
+    def beyond(self) -> int:
+        """Cells beyond the longest range that matter."""
+        return 0
 
     @property
     def entry(self) -> CasterEntry:

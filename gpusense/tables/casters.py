@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,13 @@ from gpusense.tables.lookup_files import read_lookup
 from gpusense.tables.rectangles import empty_rectangles, sectors_of
 from gpusense.world import windows
 
-__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March", "choose"]
+__all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March"]
 
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
 # Rays per launch that fills a look-up table, so that a launch takes about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
+# Flags of the lines of other programs.
+_LINES = {"amcl": "AMCL_LINES", "beluga": "BELUGA_LINES"}
 
 
 @dataclass(frozen=True)
@@ -70,16 +72,41 @@ class Dda(Caster):
 
 @dataclass(frozen=True)
 class Bresenham(Caster):
-    """Bresenham's line from cell to cell, as in nav2_amcl and Beluga."""
+    """Bresenham's line from cell to cell.
+
+    Args:
+        lines: None; ``"amcl"`` for the lines of nav2_amcl, which look one cell beyond the ray's end and may be longer
+            than range_max; or ``"beluga"`` for Beluga's, where a line midway between two cells takes the straight one,
+            and rays from outside the grid meet nothing.
+
+    Raises:
+        TypeError, ValueError: ``lines`` is neither None nor one of these words.
+    """
+
+    lines: str | None = None
 
     name = "bresenham"
     error = "about a cell, from centre to centre; lines slip between walls that touch at a corner"
     memory = "1 byte per cell of the reachable map"
     precomputation = "none"
+    knobs = "lines (None, 'amcl', 'beluga')"
+
+    def __post_init__(self) -> None:
+        if self.lines is not None:
+            checks.choice("lines", self.lines, tuple(_LINES))
+
+    def __repr__(self) -> str:
+        return "Bresenham()" if self.lines is None else f"Bresenham(lines={self.lines!r})"
+
+    @property
+    def beyond(self) -> int:
+        """See Caster."""
+        return 2 if self.lines == "amcl" else 0
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        return _padded_cells(backend, inputs)
+        table = _padded_cells(backend, inputs)
+        return table if self.lines is None else replace(table, flags=frozenset({_LINES[self.lines]}))
 
 
 @dataclass(frozen=True)
@@ -229,11 +256,12 @@ def _padded_cells(backend: Backend, inputs: CasterInput) -> Table:
     return Table(backend.upload(cells), cells.nbytes)
 
 
-CASTERS: dict[str, type[Caster]] = {caster.name: caster for caster in (Exact, Dda, March, Bresenham, Cddt, Lookup)}
+_ALL: tuple[type[Caster], ...] = (Exact, Dda, March, Bresenham, Cddt, Lookup)
+CASTERS = {caster.name: caster for caster in _ALL}
 
 
-def choose(argument: str, value: object) -> Caster:
-    """Return a caster by its name; a caster is returned as it is.
+def choose(argument: str, value: object, lines: str | None = None) -> Caster:
+    """Return a caster by its name, Bresenham's with some program's lines; a caster is returned as it is.
 
     Raises:
         TypeError: The value is neither a name nor a caster.
@@ -241,4 +269,5 @@ def choose(argument: str, value: object) -> Caster:
     """
     if isinstance(value, Caster):
         return value
-    return CASTERS[checks.choice(argument, value, tuple(CASTERS))]()
+    caster = CASTERS[checks.choice(argument, value, tuple(CASTERS))]
+    return Bresenham(lines) if caster is Bresenham else caster()

@@ -11,7 +11,9 @@ from gpusense.backends.base import Buffer
 from gpusense.interface.terms import log_weight
 from gpusense.tables.cells import check_size
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
+from gpusense.world.compat import OVERLAID, Beluga, Peer
 from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.peer_weights import Likelihood
 from gpusense.world.windows import Window
 
 # Width of the ring around the window whose cells stand for space outside the grid [cells].
@@ -31,8 +33,8 @@ class FieldTable:
         resolution: Side of a cell [m].
         range_max: Longest range [m].
         outside: ``"free"`` or ``"occupied"``: state of space outside the grid.
-        compat: Peer whose cubes of densities the cells hold; None for log densities or distances.
-        log_table: Whether cells hold log densities, not distances [m].
+        weights: The book's likelihood, or the peer whose terms the cells hold.
+        log_table: Whether cells hold terms of the sum, not distances [m].
         flags: Flags of the model's kernel, so that both kernels are in one program.
     """
 
@@ -44,25 +46,32 @@ class FieldTable:
         range_max: float,
         *,
         outside: str,
-        compat: str | None,
+        weights: Likelihood,
         log_table: bool,
         flags: frozenset[str],
     ) -> None:
         self._real, self._parameters, self._resolution, self._range_max = real, parameters, resolution, range_max
-        self._compat, self._log_table, self._flags = compat, log_table, flags
+        self._log_table, self._flags = log_table, flags
+        self._peer = weights if isinstance(weights, Peer) else None
+        # Cells of a fixed density have this term.
+        self._overlay: float | None = None
+        if isinstance(weights, Beluga) and weights.overlaid:
+            self._overlay = float(weights.terms(weights.overlay(parameters, range_max)))
         # Space outside the grid is an obstacle for the cells inside, or has no effect on them.
         self._margin = RING if outside == "occupied" else 0
         outside_value = self._values(np.array([0.0 if self._margin else np.inf]))
-        if compat == "beluga" and not self._margin:
-            outside_value[:] = 1 / range_max**3
+        if self._peer is not None and not self._margin:
+            outside_value = self._peer.terms(np.array([self._peer.beyond(parameters, range_max)]))
         self._outside_value = outside_value.astype(real)[0]
         self._density: np.ndarray | None = None
 
     def make(self, backend: Backend, obstacles: np.ndarray) -> Buffer:
-        """Make the padded table of a window from its (rows, cols) obstacles; the ring stands for space outside."""
+        """Make the padded table of a window from its (rows, cols) mask; the ring stands for space outside."""
         rows, cols = obstacles.shape
         check_size(rows, cols)
-        density = self._density_of(rows, cols)
+        overlaid = None if self._overlay is None else obstacles == OVERLAID
+        obstacles = obstacles if overlaid is None else obstacles == 1
+        density = None if overlaid is not None else self._density_of(rows, cols)
         margin = self._margin
         walled = _walled(obstacles, margin, Window(0, 0, rows + 2 * margin, cols + 2 * margin))
         size = (rows + 2 * RING, cols + 2 * RING)
@@ -71,6 +80,8 @@ class FieldTable:
             table = np.full(size, self._outside_value)
             inside = slice(RING - margin, -(RING - margin) or None)
             table[inside, inside] = self._values(_with_infinity(distances))
+            if overlaid is not None:
+                table[RING:-RING, RING:-RING][overlaid] = self._overlay
             return backend.upload(table)
         table = backend.empty(size[0] * size[1], self._real)
         everything = Window(margin - RING, margin - RING, *size)
@@ -82,7 +93,7 @@ class FieldTable:
 
         Args:
             backend: The device.
-            obstacles: (rows, cols) bool of the window after the change.
+            obstacles: (rows, cols) mask of the window after the change.
             table: Its table before the change.
             changed: Part of the window that holds all changed obstacles.
 
@@ -90,7 +101,7 @@ class FieldTable:
             False if making the table again is faster.
         """
         rows, cols = obstacles.shape
-        density = self._density_of(rows, cols)
+        density = None if self._overlay is not None else self._density_of(rows, cols)
         if density is None:
             return False
         margin, reach = self._margin, math.isqrt(len(density) - 2)
@@ -107,19 +118,12 @@ class FieldTable:
         return True
 
     def _values(self, squared: np.ndarray) -> np.ndarray:
-        """Convert squared distances [cells^2] to float64 cell values: log densities, distances [m] or cubes."""
+        """Convert squared distances [cells^2] to float64 cell values: log densities, distances [m], peers' terms."""
         p = self._parameters
+        if self._peer is not None:
+            return self._peer.terms(self._peer.field_values(squared, p, self._resolution, self._range_max))
         distance = np.minimum(np.sqrt(squared) * self._resolution, p.max_distance)
-        if self._compat is not None:
-            return self._cubes(distance)
         return self._log_density(distance) if self._log_table else distance
-
-    def _cubes(self, distance: np.ndarray) -> np.ndarray:
-        """Return the cube of the peer's density at distances [m]: the term of its sum."""
-        p, amcl = self._parameters, self._compat == "amcl"
-        hit = p.z_hit if amcl else p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-        density = hit * np.exp(-0.5 * (distance / p.sigma_hit) ** 2) + p.z_rand / self._range_max
-        return np.asarray(density**3)
 
     def _log_density(self, distance: np.ndarray) -> np.ndarray:
         p = self._parameters

@@ -15,6 +15,14 @@ from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Corners, Window
 
+ObstaclesOf = Callable[[OccupancyGrid, str], np.ndarray]
+"""A function of a grid and of the state of unknown cells, which returns an (H, W) mask."""
+
+
+def obstacles_of(grid: OccupancyGrid, unknown: str) -> np.ndarray:
+    """Return the (H, W) mask of the cells that stop a beam; do not write to it."""
+    return grid.obstacles("occupied" if unknown == "occupied" else "free")
+
 
 class TableMemoryError(MemoryError):
     """Error of a device that cannot hold a map's table; smaller pieces of a cloud would not help."""
@@ -26,7 +34,7 @@ class _State:
 
     Attributes:
         grid: The map.
-        obstacles: (H, W) bool of the map; None where an update that was interrupted may have written them.
+        obstacles: (H, W) mask of the map; None where an update that was interrupted may have written them.
         shared: Whether the array of obstacles belongs to the grid and is read-only.
         table: The table; None without one.
         window: The table's window.
@@ -58,6 +66,8 @@ class ReachableMap:
         crop: Whether to prepare the reachable window only; False prepares the whole map.
         refresh: Function that updates a table in place after obstacles changed in a part of its window, and returns
             whether it did; after False the table is made again.
+        obstacles_of: Function that returns the mask of a grid's obstacles, from the grid and ``unknown``.
+        neighbors: Cells around a cell on which its state in the mask depends.
     """
 
     def __init__(
@@ -70,9 +80,13 @@ class ReachableMap:
         prepare: Callable[[Backend, np.ndarray], Buffer],
         crop: bool,
         refresh: Callable[[Backend, np.ndarray, Buffer, Window], bool],
+        *,
+        obstacles_of: ObstaclesOf = obstacles_of,
+        neighbors: int = 0,
     ) -> None:
         self._backend, self._mount, self._reach, self._crop = backend, mount, reach, crop
         self._prepare, self._refresh, self._unknown = prepare, refresh, unknown
+        self._mask_of, self._neighbors = obstacles_of, neighbors
         self._state = _State(grid, self._obstacles_of(grid))
 
     @property
@@ -82,7 +96,7 @@ class ReachableMap:
 
     @property
     def obstacles(self) -> np.ndarray:
-        """(H, W) bool, of the whole map."""
+        """(H, W) mask, of the whole map."""
         obstacles = self._state.obstacles
         if obstacles is None:
             obstacles = self._obstacles_of(self._state.grid)
@@ -147,8 +161,7 @@ class ReachableMap:
         """
         grid = self.grid.with_cells(cells, place)  # type: ignore[arg-type]
         row, col = np.asarray(place).tolist()
-        patch = OccupancyGrid(cells, occupied_threshold=grid.occupied_threshold)  # type: ignore[arg-type]
-        patched, part = self._obstacles_of(patch), Window(row, col, *patch.shape)
+        patched, part = self._patched(grid, Window(row, col, *np.asarray(cells).shape))
         changed = windows.box(part.cut(self.obstacles) != patched)
         if changed is None:
             self._state = replace(self._state, grid=grid, version=self.version + 1)
@@ -158,7 +171,7 @@ class ReachableMap:
         # The old map without obstacles and table: both are written in place, and an interrupt would leave them half so.
         self._state = replace(self._state, obstacles=None, table=None, version=self.version + 1)
         part.cut(obstacles)[...] = patched
-        table = self._refreshed(table, obstacles, changed.moved(row, col))
+        table = self._refreshed(table, obstacles, changed.moved(part.row, part.col))
         self._state = replace(self._state, grid=grid, obstacles=obstacles, shared=False, table=table)
         return grid
 
@@ -173,8 +186,15 @@ class ReachableMap:
             current = False
         return table if current else None
 
+    def _patched(self, grid: OccupancyGrid, changed: Window) -> tuple[np.ndarray, Window]:
+        """Return the mask of all cells that depend on cells of a window, and the window that they fill."""
+        part = changed.grown(self._neighbors, grid.shape)
+        around = part.grown(self._neighbors, grid.shape)
+        patch = OccupancyGrid(around.cut(grid.cells), occupied_threshold=grid.occupied_threshold)
+        return part.moved(-around.row, -around.col).cut(self._obstacles_of(patch)), part
+
     def _obstacles_of(self, grid: OccupancyGrid) -> np.ndarray:
-        return grid.obstacles("occupied" if self._unknown == "occupied" else "free")
+        return self._mask_of(grid, self._unknown)
 
     def omission(self, bytes_per_cell: float) -> Omission | None:
         """Describe the part of the map outside the window; None if there is none, or no cloud has come yet."""

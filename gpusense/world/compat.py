@@ -1,4 +1,4 @@
-"""Parameters and reading rules of nav2_amcl and Beluga, for ``compat="amcl"`` and ``compat="beluga"``.
+"""The weights of nav2_amcl and Beluga, for ``compat="amcl"`` and ``compat="beluga"``.
 
 ``BeamModel(..., compat="amcl")`` and ``LikelihoodFieldModel(..., compat="beluga")`` return the logarithm of the factor
 by which these programs multiply a particle's weight. These factors are no likelihoods:
@@ -8,135 +8,126 @@ peer      model                   weight
 ========  ======================  =====================================================================
 amcl      beam                    ``1 + sum p^3``, the normal and the exponential density not normalised
 amcl      likelihood field        ``1 + sum p^3``, the normal density not normalised
+amcl      likelihood field, prob  ``product p``, the normal density not normalised
 beluga    beam                    ``sum p^3``, book table 6.1 with both normalisers
 beluga    likelihood field        ``1 + sum p^3``, the normal density normalised for an unbounded range
+beluga    likelihood field, prob  ``product p``, the normal density normalised for an unbounded range
 ========  ======================  =====================================================================
 
-Readings are classed as the peer does. amcl: a reading of at most range_min (-inf too) counts as a max reading, and NaN
-is left out. Its beam model scores a max reading as ``z_hit exp(...) + z_max``; its likelihood field leaves it out.
-Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its beam model scores a reading of exactly
-range_max as ``z_hit p_hit + z_max``; to its likelihood field this reading is a range.
+*Readings.* amcl: a reading of at most range_min (-inf too) is a max reading, and NaN is left out. Its beam model scores
+a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, which is 0 for
++inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its
+beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field takes it for a range.
 
-Beams of the beam models follow Bresenham's lines. Unknown cells stop them and, for amcl, so does the map's edge. An end
-point outside the map counts as ``max_distance`` for amcl and as a density of ``1 / range_max`` for Beluga. Errors of
-the peers' map look-ups are not reproduced: distances are exact, and cells are not shifted by half a cell.
+*Cells.* 0 is free, 100 is occupied, and all others, -1 and those of maps in mode ``scale``, are neither: they stop the
+beams of the beam models and are no obstacles of the likelihood fields. ``occupied_threshold`` has no effect.
 
-Source: nav2_amcl (``sensors/laser``) and Beluga (``sensor/beam_model.hpp``, ``likelihood_field_model_base.hpp``).
+*Beams* of the beam models follow Bresenham's lines, see ``gpusense.casters.Bresenham``. amcl's look one cell beyond the
+ray's end, and distances between cells may exceed range_max; the map's edge stops them, and a particle off the map has
+ranges of 0. Beluga's have range_max beyond the map's edge, and at a particle off the map.
+
+*Likelihood fields.* An end point off the map counts as ``max_distance`` for amcl and as a density of ``1 / range_max``
+for Beluga. Cells hold float32 numbers: amcl's distances, Beluga's densities.
+
+*Not reproduced:* errors of the peers' distance transforms; amcl's shift of map look-ups by half a cell, which a grid
+with an origin half a cell lower in x and y has; Beluga's beams from the robot's origin in place of the sensor's.
+
+Versions: nav2_amcl 1.5.0 and Beluga 2.1.1, with the default parameters of their nodes.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.world.peer_weights import BeamWeights, FieldWeights, Likelihood
 from gpusense.world.scanner import Scanner
 
-
-@dataclass(frozen=True)
-class BeamWeights(BeamParameters):
-    """Parameters of the peers' beam models, whose weights need not sum to 1; the defaults are nav2_amcl's.
-
-    Raises:
-        TypeError: A value is not a real number.
-        ValueError: A value breaks its field's rule.
-    """
-
-    z_hit: float = 0.5
-    z_short: float = 0.05
-    z_max: float = 0.05
-    z_rand: float = 0.5
-    sigma_hit: float = 0.2
-    lambda_short: float = 0.1
-
-    _sum_is_one: ClassVar[bool] = False
+_OCCUPIED, _UNKNOWN = 100, -1
+# In a likelihood field's mask: a cell of a fixed density.
+OVERLAID = 2
 
 
-@dataclass(frozen=True)
-class FieldWeights(LikelihoodFieldParameters):
-    """Parameters of the peers' likelihood fields, whose weights need not sum to 1; the defaults are nav2_amcl's.
-
-    Raises:
-        TypeError: A value is not a real number.
-        ValueError: A value breaks its field's rule.
-    """
-
-    z_hit: float = 0.5
-    z_max: float = 0.0
-    z_rand: float = 0.5
-    sigma_hit: float = 0.2
-    max_distance: float = 2.0
-
-    _sum_is_one: ClassVar[bool] = False
-
-
-@dataclass(frozen=True)
-class Likelihood:
-    """The book's likelihoods: the rules of models without ``compat``.
-
-    Attributes:
-        name: None.
-        beam: Default parameters of the beam model.
-        field: Default parameters of the likelihood field.
-        constant_term: First term of the beam model's sum over readings.
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
-        cubes: Whether weights are sums of cubes, in place of products of densities.
-        field_constant: First term of the likelihood field's sum over readings.
-        caster: Default caster of the beam model.
-        unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
-    """
-
-    name: str | None
-    beam: BeamParameters
-    field: LikelihoodFieldParameters
-    constant_term: float
-    outside: str
-
-    cubes: ClassVar[bool] = False
-    field_constant: ClassVar[float] = 0.0
-    caster: ClassVar[str] = "exact"
-    unknown: ClassVar[str] = "free"
-
-    def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Return readings as they are."""
-        return ranges
-
-    def without_readings(self, constant: float, first: float) -> float:
-        """Return the sum of a scan without evaluated readings, from its constant term and the first term of sums."""
-        return constant
+def _check_bool(name: str, value: object) -> None:
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}: must be True or False, got {checks.show(value)}")
 
 
 @dataclass(frozen=True)
 class Peer(Likelihood):
     """A program whose weights ``compat`` reproduces.
 
-    Attributes:
-        name: ``"amcl"`` or ``"beluga"``.
-        beam: Default parameters of the peer's beam model.
-        field: Default parameters of the peer's likelihood field.
-        constant_term: First term of the beam model's sum over readings.
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
+    Args:
+        prob: Whether the likelihood field is the peer's ``likelihood_field_prob``, a product of densities.
     """
 
-    name: str
-    beam: BeamWeights
-    field: FieldWeights
+    prob: bool = False
 
-    cubes = True
-    field_constant = 1.0
-    caster = "bresenham"
+    beam: ClassVar[BeamWeights] = BeamWeights()
+    field: ClassVar[FieldWeights] = FieldWeights()
     unknown = "occupied"
+    caster = "bresenham"
+    is_peer = True
 
-    def without_readings(self, constant: float, first: float) -> float:
-        """See Likelihood.without_readings; a sum of cubes has no constant terms."""
+    def __post_init__(self) -> None:
+        _check_bool("prob", self.prob)
+
+    @property
+    def cubes(self) -> bool:
+        """See Likelihood."""
+        return not self.prob
+
+    def obstacles(self, grid: OccupancyGrid, unknown: str) -> np.ndarray:
+        """See Likelihood.obstacles; cells that are neither free nor occupied are unknown."""
+        return grid.cells != 0 if unknown == "occupied" else grid.cells == _OCCUPIED
+
+    def field_values(
+        self, squared: np.ndarray, p: LikelihoodFieldParameters, resolution: float, range_max: float
+    ) -> np.ndarray:
+        """Return the densities of cells at squared distances [cells^2] from the nearest obstacle."""
+        raise NotImplementedError
+
+    def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
+        """Return the density of end points off the map."""
+        raise NotImplementedError
+
+    def terms(self, density: np.ndarray | float) -> np.ndarray:
+        """Return the terms of the likelihood field's sum."""
         with np.errstate(divide="ignore"):
-            return float(np.log(first))
+            return np.log(density) if self.prob else np.asarray(density) ** 3
+
+
+@dataclass(frozen=True)
+class Amcl(Peer):
+    """The weights of nav2_amcl 1.5.0.
+
+    Args:
+        prob: Whether the likelihood field is ``likelihood_field_prob`` without beam skipping, a product of densities.
+
+    Raises:
+        TypeError: ``prob`` is neither True nor False.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+        >>> weights = gs.compat.Amcl(prob=True)
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], range_max=4.0), compat=weights, backend="numpy")
+        >>> round(float(model.log_likelihood([(0.05, 0.05, 0.0)], [2.0])[0]), 3)
+        -0.47
+    """
+
+    name = "amcl"
+    constant_term = 1.0
+    outside = "occupied"
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Convert readings to the peer's classes: NaN is left out, +inf is a max reading, all others are ranges.
+        """Convert readings to the peer's classes: NaN and inf are left out, all others are ranges.
 
         Args:
             ranges: Readings of any shape and value [m].
@@ -146,30 +137,125 @@ class Peer(Likelihood):
         Returns:
             float64 readings of the same shape.
         """
-        z = ranges.astype(np.float64)
-        top = scanner.range_max
-        if self.name == "amcl":
-            z[z <= scanner.range_min] = np.inf
-            return np.where(z >= top, np.inf if field else top, z)
-        return np.where((z >= scanner.range_min) & (z <= top), z, np.nan)
+        nearest, farthest = _limits(scanner, ranges.dtype)
+        max_reading = (ranges <= nearest) | (ranges == farthest)
+        z = np.where(max_reading, scanner.range_max, ranges.astype(np.float64))
+        return np.where(z >= scanner.range_max, np.inf, z) if field else z
+
+    def field_values(
+        self, squared: np.ndarray, p: LikelihoodFieldParameters, resolution: float, range_max: float
+    ) -> np.ndarray:
+        """See Peer.field_values; distances are float32 numbers, of at most max_distance in whole cells."""
+        cells = np.sqrt(squared)
+        distance = np.where(cells > int(p.max_distance / resolution), p.max_distance, cells * resolution)
+        return _unnormalised(distance.astype(np.float32).astype(np.float64), p, range_max)
+
+    def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
+        """See Peer.beyond."""
+        return float(_unnormalised(np.array(p.max_distance), p, range_max))
 
 
-PEERS = {
-    "amcl": Peer("amcl", BeamWeights(), FieldWeights(), 1.0, "occupied"),
-    "beluga": Peer("beluga", BeamWeights(z_short=0.5, z_rand=0.05), FieldWeights(max_distance=100.0), 0.0, "free"),
-}
+@dataclass(frozen=True)
+class Beluga(Peer):
+    """The weights of Beluga 2.1.1 with the defaults of its node ``beluga_amcl``.
+
+    Args:
+        prob: Whether the likelihood field is ``likelihood_field_prob``, a product of densities.
+        model_unknown_space: Whether unknown cells have the density ``1 / range_max`` in the likelihood field, if that
+            is more than a cell at ``max_distance`` has; with ``only_obstacle_boundaries`` also occupied cells without a
+            free neighbour.
+        only_obstacle_boundaries: Whether only occupied cells beside a free cell are obstacles of the likelihood field.
+            None is the node's default: True, but False with ``prob``, to which the node does not hand it.
+
+    Raises:
+        TypeError: An option has the wrong type.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0] * 20 + [-1]], resolution=0.1)
+        >>> weights = gs.compat.Beluga(model_unknown_space=True)
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], range_max=4.0), compat=weights, backend="numpy")
+        >>> round(float(model.log_likelihood([(0.05, 0.05, 0.0)], [2.0])[0]), 4)
+        0.0155
+    """
+
+    model_unknown_space: bool = False
+    only_obstacle_boundaries: bool | None = None
+
+    name = "beluga"
+    # The defaults of the library's headers, which the node overrides.
+    library: ClassVar[BeamWeights] = BeamWeights(z_short=0.5, z_rand=0.05)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_bool("model_unknown_space", self.model_unknown_space)
+        if self.only_obstacle_boundaries is not None:
+            _check_bool("only_obstacle_boundaries", self.only_obstacle_boundaries)
+
+    @property
+    def boundaries(self) -> bool:
+        """Whether only occupied cells beside a free cell are obstacles of the likelihood field."""
+        return not self.prob if self.only_obstacle_boundaries is None else self.only_obstacle_boundaries
+
+    @property
+    def overlaid(self) -> bool:
+        """See Likelihood."""
+        return self.model_unknown_space
+
+    @property
+    def neighbors(self) -> int:
+        """See Likelihood."""
+        return int(self.boundaries)
+
+    def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
+        """See Amcl.readings; readings outside [range_min, range_max] are left out."""
+        nearest, farthest = _limits(scanner, ranges.dtype)
+        inside = (ranges >= nearest) & (ranges <= farthest)
+        z = np.where(ranges == farthest, scanner.range_max, ranges.astype(np.float64))
+        return np.where(inside, z, np.nan)
+
+    def field_obstacles(self, grid: OccupancyGrid, unknown: str) -> np.ndarray:
+        """See Likelihood.field_obstacles; with model_unknown_space OVERLAID marks the cells of a fixed density."""
+        occupied = self.obstacles(grid, unknown)
+        obstacles = occupied & _beside(grid.cells == 0) if self.boundaries else occupied
+        if not self.model_unknown_space:
+            return obstacles
+        overlaid = (grid.cells == _UNKNOWN) | (occupied & ~obstacles)
+        return np.where(overlaid, np.uint8(OVERLAID), obstacles.astype(np.uint8))
+
+    def field_values(
+        self, squared: np.ndarray, p: LikelihoodFieldParameters, resolution: float, range_max: float
+    ) -> np.ndarray:
+        """See Peer.field_values; squared distances and densities are float32 numbers."""
+        farthest = np.float32(p.max_distance * p.max_distance)
+        return _normalised(np.minimum((squared * resolution * resolution).astype(np.float32), farthest), p, range_max)
+
+    def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
+        """See Peer.beyond."""
+        return float(np.float32(1 / range_max))
+
+    def overlay(self, p: LikelihoodFieldParameters, range_max: float) -> float:
+        """Return the density of OVERLAID cells, that of a squared distance computed from ``1 / range_max``."""
+        farthest = np.float32(p.max_distance * p.max_distance)
+        share = (1 / range_max - p.z_rand / range_max) / _amplitude(p) if p.z_hit > 0 else 0.0
+        # Without a share of the normal density there is no such distance.
+        background = np.float32(-2 * p.sigma_hit * p.sigma_hit * math.log(share)) if share > 0 else farthest
+        return float(_normalised(np.minimum(background, farthest), p, range_max))
 
 
-LIKELIHOOD = Likelihood(None, BeamParameters(), LikelihoodFieldParameters(), 0.0, "free")
+PEERS: dict[str, Peer] = {"amcl": Amcl(), "beluga": Beluga()}
+LIKELIHOOD = Likelihood()
 
 
 def choose(compat: object) -> Likelihood:
-    """Return the peer that ``compat`` names; the book's likelihood for None.
+    """Return the peer that ``compat`` is or names; the book's likelihood for None.
 
     Raises:
-        TypeError: ``compat`` is neither None nor a string.
+        TypeError: ``compat`` is neither None, a string nor a peer.
         ValueError: ``compat`` names no peer.
     """
+    if isinstance(compat, (Amcl, Beluga)):
+        return compat
     return LIKELIHOOD if compat is None else PEERS[checks.choice("compat", compat, tuple(PEERS))]
 
 
@@ -181,3 +267,36 @@ def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat
     """
     if compat is None and isinstance(parameters, (BeamWeights, FieldWeights)):
         raise ValueError(f"parameters: weights must sum to 1 unless compat is given, got {checks.show(parameters)}")
+
+
+def _limits(scanner: Scanner, kind: np.dtype) -> tuple[np.floating, np.floating]:
+    """Return the scanner's limits, rounded to the type of the readings."""
+    real = kind.type if kind.kind == "f" else np.float64
+    with np.errstate(over="ignore"):
+        return real(scanner.range_min), real(scanner.range_max)
+
+
+def _beside(free: np.ndarray) -> np.ndarray:
+    """Return the mask of cells with one of four neighbours in a mask."""
+    near = np.zeros_like(free)
+    near[1:] |= free[:-1]
+    near[:-1] |= free[1:]
+    near[:, 1:] |= free[:, :-1]
+    near[:, :-1] |= free[:, 1:]
+    return near
+
+
+def _unnormalised(distance: np.ndarray, p: LikelihoodFieldParameters, range_max: float) -> np.ndarray:
+    """Return nav2_amcl's density at distances [m]."""
+    normal = np.exp(-(distance * distance) / (2 * p.sigma_hit * p.sigma_hit))
+    return np.asarray(p.z_hit * normal + p.z_rand / range_max)
+
+
+def _amplitude(p: LikelihoodFieldParameters) -> float:
+    return p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+
+
+def _normalised(squared: np.ndarray, p: LikelihoodFieldParameters, range_max: float) -> np.ndarray:
+    """Return Beluga's density at squared distances [m^2], rounded to float32."""
+    normal = np.exp(-np.asarray(squared, np.float64) / (2 * p.sigma_hit * p.sigma_hit))
+    return np.asarray((_amplitude(p) * normal + p.z_rand / range_max).astype(np.float32), np.float64)

@@ -112,8 +112,12 @@ int angle_bin(const real2 direction, const int bins) {
     return bin >= bins ? bin - bins : bin;
 }
 
-// Convert a distance in cells to metres, exactly range_max where nothing is nearer.
+// Convert a distance in cells to metres, exactly range_max where nothing is nearer, or met with AMCL_LINES.
 real expected_range(const real t, const RangeScale scale) {
     const real range = t * scale.resolution;
+#if AMCL_LINES
+    return t == scale.limit ? scale.range_max : range;
+#else
     return t >= scale.limit || range > scale.range_max ? scale.range_max : range;
+#endif
 }

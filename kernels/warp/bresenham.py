@@ -2,6 +2,9 @@
 
 nav2_amcl and Beluga cast in this manner. Distances are from cell centre to cell centre, and a line may pass between two
 cells that touch at a corner. The table holds 1 for occupied cells in a ring of twos.
+
+A line midway between two cells takes the one aside, with BELUGA_LINES the straight one. With AMCL_LINES a line goes on
+for a cell beyond its end.
 """
 
 import functools
@@ -26,6 +29,8 @@ def functions(flags):
     padded = rectangles_file.functions(flags).padded
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
+    AMCL_LINES = "AMCL_LINES" in flags
+    BELUGA_LINES = "BELUGA_LINES" in flags
     ZERO = real(0.0)
 
     # Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
@@ -43,6 +48,9 @@ def functions(flags):
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
             if off_grid(cell.x, cell.y, window.rows, window.cols):
                 return ZERO
+        if ORIGINS_OUTSIDE and BELUGA_LINES:
+            if off_grid(cell.x, cell.y, window.rows, window.cols):
+                return limit
         start = start_walk(r, cell, window, limit)
         if start.t >= limit:
             return limit
@@ -54,12 +62,15 @@ def functions(flags):
         far_y = wp.abs(end_row - row)
         longer = wp.max(far_x, far_y)
         shorter = wp.min(far_x, far_y)
-        right = wp.where(end_col >= col, 1, -1)
-        up = wp.where(end_row >= row, 1, -1)
+        right = wp.where(end_col > col, 1, -1)
+        up = wp.where(end_row > row, 1, -1)
+        last = longer
+        if AMCL_LINES:
+            last = longer + 1
         along = int(0)
         aside = int(0)
         error = int(0)
-        while along <= longer:
+        while along <= last:
             x = wp.where(far_x >= far_y, along, aside)
             y = wp.where(far_x >= far_y, aside, along)
             state = int(map_table[padded(row + up * y, col + right * x, window.cols)])
@@ -70,7 +81,10 @@ def functions(flags):
                     return limit
                 return start.t + wp.sqrt(real(x) * real(x) + real(y) * real(y))
             error += shorter
-            if 2 * error >= longer:
+            over = 2 * error >= longer
+            if BELUGA_LINES:
+                over = 2 * error > longer
+            if over:
                 aside += 1
                 error -= longer
             along += 1

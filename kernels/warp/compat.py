@@ -22,7 +22,7 @@ def functions(flags):
     AMCL = "AMCL" in flags
 
     # Return the density to be cubed: amcl's without normalisers, Beluga's with both (book table 6.1). A reading of
-    # range_max is a max reading.
+    # range_max is a max reading; amcl's longer readings are neither random nor max readings.
     @wp.func
     def compat_density(z: real, expected: real, terms: wp.array(dtype=real)):
         off = z - expected
@@ -30,6 +30,8 @@ def functions(flags):
         if AMCL:
             if z < expected:
                 p += terms[3] * terms[4] * wp.exp(-terms[4] * z)
+            if z > terms[6]:
+                return p
         else:
             p /= hit_mass(expected, terms[2], terms[6])
             if z < expected:

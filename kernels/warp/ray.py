@@ -23,6 +23,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
+    AMCL_LINES = "AMCL_LINES" in flags
     ZERO, ONE, MINUS_ONE = real(0.0), real(1.0), real(-1.0)
     QUARTER, HALF = real(0.25), real(0.5)
     # Abramowitz and Stegun 4.4.49 for the arc tangent, in turns.
@@ -151,9 +152,11 @@ def functions(flags):
         index = int(turn_of(direction) * real(bins) + HALF)
         return wp.where(index >= bins, index - bins, index)
 
-    # Convert a distance in cells to metres, exactly range_max where nothing is nearer.
+    # Convert a distance in cells to metres, exactly range_max where nothing is nearer, or met with AMCL_LINES.
     @wp.func
     def expected_range(t: real, scale: types.RangeScale):
+        if AMCL_LINES:
+            return wp.where(t == scale.limit, scale.range_max, t * scale.resolution)
         return wp.where(t >= scale.limit, scale.range_max, wp.min(t * scale.resolution, scale.range_max))
 
     return SimpleNamespace(

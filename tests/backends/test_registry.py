@@ -69,7 +69,7 @@ def metal(monkeypatch):
 
 
 def test_every_entry_has_its_folder_and_its_words():
-    assert [entry.name for entry in ENTRIES] == list(BY_NAME) == ["numpy", "opencl", "warp"]
+    assert [entry.name for entry in ENTRIES] == list(BY_NAME) and {"numpy", "opencl", "warp"} <= set(BY_NAME)
     for entry in ENTRIES:
         assert entry.module == f"gpusense.backends.{entry.name}.library"
         assert entry.install.startswith("pip install ") and all(entry.name in one for one in entry.selections)
@@ -78,9 +78,10 @@ def test_every_entry_has_its_folder_and_its_words():
 
 
 def test_speed_classes_are_the_ranks_of_entries():
-    assert SPEED_CLASSES == (("opencl", "gpu"), ("warp", "gpu"), ("opencl", "cpu"), ("warp", "cpu"), ("numpy", "cpu"))
-    ranks = [rank for entry in ENTRIES for rank in entry.speed.values()]
-    assert sorted(ranks) == list(range(len(ranks)))
+    ranks = {rank: (entry.name, kind) for entry in ENTRIES for kind, rank in entry.speed.items()}
+    assert tuple(ranks[rank] for rank in range(len(SPEED_CLASSES))) == SPEED_CLASSES
+    order = [SPEED_CLASSES.index(row) for row in (("opencl", "gpu"), ("opencl", "cpu"), ("warp", "cpu"))]
+    assert order == sorted(order)
 
 
 def test_a_new_backend_is_listed_and_selected(metal):
@@ -95,7 +96,7 @@ def test_a_new_backend_is_listed_and_selected(metal):
     assert get_backend("metal").info == dataclasses.replace(INFO, lanes=4)
     with pytest.raises(ValueError, match=r"must be a device that is present \(metal:0 \(Some GPU\)\), got 'metal:7'"):
         get_backend("metal:7")
-    with pytest.raises(ValueError, match=r"backend: must be 'auto', .*'warp:cuda:<n>' or 'metal:<n>', got 'metl'"):
+    with pytest.raises(ValueError, match=r"backend: must be 'auto', .*'warp:cuda:<n>'.* or 'metal:<n>', got 'metl'"):
         get_backend("metl")
 
 
@@ -115,6 +116,14 @@ def test_devices_anew_renews_all_verdicts(metal, monkeypatch):
     seen.clear()
     gs.devices(anew=True)
     assert seen.index("library") < seen.index("list") and False not in seen
+
+
+def test_a_simulator_that_is_its_backend_alone_is_selected_by_name(metal, monkeypatch):
+    info = dataclasses.replace(INFO, selection="metal")
+    monkeypatch.setattr(metal, "list_devices", lambda: [(info, "handle")])
+    monkeypatch.setattr(metal, "is_simulator", lambda one: True)
+    assert get_backend("metal").info == info
+    assert get_backend("auto").info != info
 
 
 def test_a_queue_of_a_new_backend_selects_it(metal):

@@ -10,6 +10,7 @@ from support.bench_world import ERRORS, TIMES, made_report
 
 from gpusense.commands import cli
 from gpusense.evaluation.benchmark import candidates, report, scenes
+from gpusense.interface.casters import ENTRIES
 from gpusense.plots import benchmark as diagrams
 
 pytestmark = pytest.mark.usefixtures("no_data")
@@ -85,7 +86,7 @@ def test_table_on_the_terminal(capsys):
     ("argv", "message"),
     [
         (["--scene", "moon"], "scene: must be one of building, clutter, got 'moon'"),
-        (["--method", "magic"], "--method: must be one of exact, dda, march, bresenham, cddt, lookup, field"),
+        (["--method", "magic"], f"--method: must be one of {', '.join(ENTRIES)}, field"),
         (["--backend", "cuda"], "backend: must be 'auto', 'numpy'"),
         (["--problem", "sonar"], "argument --problem: invalid choice: 'sonar'"),
         (["--particles", "0"], "argument --particles: must be an integer >= 1, got 0"),

@@ -42,6 +42,10 @@ def models(backend: str, precision: str = "float32", **options: float) -> dict[s
     }
 
 
+# A missing measurement of each sensor.
+MISSING: dict[str, Any] = {"position": (NAN, 3.0), "heading": NAN, "beacons": [NAN, NAN], "bumper": [None, NAN]}
+
+
 def assert_close(found: np.ndarray, truth: object, precision: str, terms: np.ndarray | None = None) -> None:
     """Check results to within 16 eps (1 + |log p|) of each reading; infinite where the truth is."""
     truth = np.array(truth, float)

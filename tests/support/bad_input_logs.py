@@ -8,6 +8,7 @@ from typing import Any
 from support.bad_input_files import Action, put
 
 from gpusense.logs import read_log
+from gpusense.logs.reader import FORMATS
 
 GOOD_LINE = "FLASER 3 1.0 2.0 3.0 1 2 3 4 5 6 12.5 robot 0.5"
 
@@ -18,6 +19,7 @@ def log_with(*lines: str, name: str = "run.log", **options: Any) -> Action:
 
 
 LOG = "{tmp}/input/run.log"
+KNOWN = " or ".join(form.name for form in FORMATS)
 
 
 def bad_lines(name: str, message: str, *lines: str, **options: Any) -> tuple[str, Action, type[Exception], str]:
@@ -37,7 +39,7 @@ LOG_CASES = [
             f"log-{suffix}",
             log_with("data", name=f"run.{suffix}"),
             ValueError,
-            f"{{tmp}}/input/run.{suffix}: must be a CARMEN log, which is all that this version reads, got {what}",
+            f"{{tmp}}/input/run.{suffix}: must be {KNOWN}, which is all that this version reads, got {what}",
         )
         for suffix, what in [("bag", "a ROS 1 bag"), ("db3", "a ROS 2 bag"), ("mcap", "an MCAP file")]
     ],
@@ -45,7 +47,7 @@ LOG_CASES = [
         "log-rosbag2",
         lambda tmp: read_log(put(tmp, "metadata.yaml", "").parent),
         ValueError,
-        "{tmp}/input: must be a CARMEN log, which is all that this version reads, got a ROS 2 bag",
+        f"{{tmp}}/input: must be {KNOWN}, which is all that this version reads, got a ROS 2 bag",
     ),
     (
         "log-range-max",

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
 
 import gpusense as gs
-from gpusense.tables.casters import Caster
+from gpusense.tables.casters import CASTERS, Caster
 
 RANGE = 3.0
 
 
 def by_name(kind: object) -> str:
     return repr(kind).replace(" ", "") if isinstance(kind, Caster) else str(kind)
+
+
+def each_caster(bins: int) -> list[Caster]:
+    """Return one of each caster, with default knobs but for angle bins, of which tests want few."""
+    options = {name: {knob.name for knob in dataclasses.fields(kind)} for name, kind in CASTERS.items()}
+    return [kind(**({"bins": bins} if "bins" in options[name] else {})) for name, kind in CASTERS.items()]
 
 
 def same_bits(found: np.ndarray, expected: np.ndarray) -> None:

@@ -13,6 +13,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, differing
 from gpusense.interface.structs import Caster, Cone, RangeScale, Window
+from gpusense.tables.casters import CASTERS
 from gpusense.tables.rectangles import empty_rectangles
 from gpusense.world import windows
 
@@ -263,7 +264,7 @@ def test_a_cropped_or_changed_map_has_the_angles_of_a_new_one(backend, monkeypat
     assert differing(anew, found) > 20
 
 
-@pytest.mark.parametrize("method", ["march", "bresenham", "cddt", "lookup"])
+@pytest.mark.parametrize("method", [name for name, kind in CASTERS.items() if not kind.exact])
 def test_casters_that_are_not_exact_have_no_angles(method):
     grid, poses, bearings = place()
     with pytest.raises(ValueError, match="method: must be an exact one where angles of incidence matter"):

@@ -30,9 +30,9 @@ class OpenCLRecording(Recording):
 
     def __init__(self, queue: cl.CommandQueue, launches: list[BoundLaunch], count: Callable[[int], None]) -> None:
         self._queue, self._launches, self._count = queue, launches, count
+        self._lock = threading.Lock()
         # Queues of users on which they were started since the last wait.
         self._used: list[cl.CommandQueue] = []
-        self._lock = threading.Lock()
 
     def __call__(self, stream: Any = None) -> None:
         """See Recording.__call__."""
@@ -51,7 +51,8 @@ class OpenCLRecording(Recording):
 
     def __del__(self) -> None:
         # Memory that is shared with the host must not go while a queue works on it.
-        if self._used:
+        # An interrupt may come before there is one.
+        if getattr(self, "_used", None):
             self.wait()
 
     def wait(self) -> None:

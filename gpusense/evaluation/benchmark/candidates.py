@@ -96,8 +96,9 @@ _VARIED = (
     Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, ()),
     Curve("lookup", "", "bins", (27, 54, 108), {}, (1,)),
 )
-_WITH_KNOBS = {curve.method for curve in _VARIED}
-CURVES = (*(Curve(name) for name in ENTRIES if name not in _WITH_KNOBS), *_VARIED)
+CURVES = tuple(
+    curve for name in ENTRIES for curve in [each for each in _VARIED if each.method == name] or [Curve(name)]
+)
 """The casters, for ranges and for the beam model."""
 
 BIN_WIDTHS = (0.5, 0.2, 0.1, 0.05, 0.02)

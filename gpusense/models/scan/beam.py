@@ -22,7 +22,7 @@ from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
-from gpusense.world import compat as compat_module
+from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Scanner
@@ -54,8 +54,8 @@ class BeamModel(ScanModel):
         temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
             independent. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
-        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults of
-            parameters, caster, unknown and outside; see ``gpusense.compat``.
+        compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults of
+            parameters, caster, unknown and outside; or their options, see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:
@@ -88,10 +88,10 @@ class BeamModel(ScanModel):
         outside: Space | None = None,
         temperature: float = 1.0,
         beams: Beams = None,
-        compat: Compat | None = None,
+        compat: Compat | Peer | None = None,
         specialize: bool = True,
     ) -> None:
-        weights = compat_module.choose(compat)
+        weights = choose(compat)
         table = parameters if isinstance(parameters, SensorTable) else None
         if table is not None:
             check_discrete(table, scanner, compat, sensor_table)
@@ -106,18 +106,19 @@ class BeamModel(ScanModel):
         if incidence is not None:
             _check_incidence(incidence, parameters=parameters, sensor_table=sensor_table, compat=compat)
             mixtures, cosines = bins_of(incidence)
-        compat_module.check_weights(mixture, compat)
-        if weights.cubes:
+        check_weights(mixture, compat)
+        if isinstance(weights, Peer):
             check_absent("with compat", sensor_table=sensor_table)
-        method = casters.choose("caster", weights.caster if caster is None else caster)
+            _check_peer(weights)
+        method = casters.choose("caster", weights.caster if caster is None else caster, lines=weights.name)
         max_depends = table is not None or len({p.z_max for p in mixtures}) > 1
         super().__init__(
             grid, scanner, backend=backend, precision=precision,
             unknown=weights.unknown if unknown is None else unknown,
             outside=weights.outside if outside is None else outside,
-            temperature=temperature, beams=beams, compat=compat, specialize=specialize,
-            z_max=max(p.z_max for p in mixtures) if table is None else 1.0, max_depends=max_depends,
-            constant_term=weights.constant_term,
+            temperature=temperature, beams=beams, compat=compat, cubes=weights.is_peer,
+            specialize=specialize, z_max=max(p.z_max for p in mixtures) if table is None else 1.0,
+            max_depends=max_depends, constant_term=weights.constant_term,
             # Where max readings depend on the pose, the kernel finds impossible ranges.
             possible=max_depends or any(p.z_hit or p.z_short or p.z_rand for p in mixtures),
         )  # fmt: skip
@@ -126,12 +127,12 @@ class BeamModel(ScanModel):
         self._mixtures, self.incidence_parameters, self.sensor_table = mixtures, incidence, sensor_table
         self._caster = MapCaster(
             setting.backend, setting.real, grid, scanner.mount, scanner.range_max, method, unknown=self.unknown,
-            outside=self.outside, crop=specialize,
+            outside=self.outside, crop=specialize, obstacles_of=weights.obstacles,
         )  # fmt: skip
         self._beam_pipeline = BeamPipeline(
             setting, self._caster, cones_of(scanner, method, incidence=incidence is not None),
             mixture_on_device(
-                mixtures, cosines, table, scanner.range_max, setting.real, width=sensor_table, compat=compat,
+                mixtures, cosines, table, scanner.range_max, setting.real, width=sensor_table, compat=weights.name,
                 specialize=specialize, max_depends=max_depends,
             ),
             max_evaluated=max_depends and table is None,
@@ -222,6 +223,16 @@ class BeamModel(ScanModel):
         pipeline = self._beam_pipeline
         cones = dataclasses.replace(pipeline.cones, incidence=incidence)
         return self._caster.cast(poses, pipeline.cone_vectors, out, cones)
+
+
+def _check_peer(peer: Peer) -> None:
+    """Refuse options that only the likelihood field has.
+
+    Raises:
+        ValueError: such an option is set.
+    """
+    if peer.prob:
+        raise ValueError(f"compat: prob must be False for a beam model, got {checks.show(peer)}")
 
 
 def _check_incidence(incidence: object, **others: object) -> None:

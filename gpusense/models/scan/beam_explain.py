@@ -66,7 +66,7 @@ def title_and_omissions(
         omissions.append(
             Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
         )
-    if weights.cubes:
+    if weights.is_peer:
         omissions.append(Omission("normalised density", f"compat='{weights.name}' sums cubes", "the likelihood"))
     else:
         omissions += _mixture_omissions(pipeline, discrete=discrete)

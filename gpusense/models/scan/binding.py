@@ -69,7 +69,7 @@ def bind(
 
 def _host_task(pipeline: ScanPipeline) -> str:
     """Return the preparation of a scan that only the host can do; empty where the device can do all of it."""
-    if pipeline.setting.weights.cubes:
+    if pipeline.setting.weights.is_peer:
         return "the host classes the readings for another program's weights"
     if not pipeline.backend.info.float64:
         return "the host places the poses, as the device has no float64"

@@ -89,8 +89,8 @@ class RayCaster:
 
         Example:
             >>> import gpusense as gs
-            >>> [method.name for method in gs.RayCaster.methods()]
-            ['exact', 'dda', 'march', 'bresenham', 'cddt', 'lookup']
+            >>> [method.name for method in gs.RayCaster.methods() if method.knobs == "none"]
+            ['exact', 'dda', 'bresenham']
         """
         return tuple(casters.CASTERS.values())
 

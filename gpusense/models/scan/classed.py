@@ -157,7 +157,7 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     """Class, choose and group the readings of (S, K) scans, S > 0."""
     hit, far = hits_and_max(ranges, rules.scanner)
     if rules.max_is_range:
-        finite, ranges = np.isfinite(ranges), np.minimum(ranges, rules.scanner.range_max)
+        finite = np.isfinite(ranges)
         hit, far = hit | (far & finite), far & ~finite
     used, used_max = rules.choice.among(hit, far if rules.z_max > 0 else np.zeros_like(far))
     if rules.max_is_constant:

@@ -14,7 +14,7 @@ from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
-from gpusense.world import compat as compat_module
+from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -37,8 +37,8 @@ class LikelihoodFieldModel(ScanModel):
         outside: ``"free"`` (the default), or ``"occupied"`` for an obstacle at distance 0 everywhere outside the grid.
         temperature: In (0, 1]: multiplies the sum over beams. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
-        compat: None, or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default
-            parameters; see ``gpusense.compat``.
+        compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default
+            parameters; or their options, see ``gpusense.compat``.
         specialize: False leaves nothing out: same numbers, slower.
 
     Raises:
@@ -66,20 +66,20 @@ class LikelihoodFieldModel(ScanModel):
         outside: Space | None = None,
         temperature: float = 1.0,
         beams: Beams = None,
-        compat: Compat | None = None,
+        compat: Compat | Peer | None = None,
         specialize: bool = True,
     ) -> None:
-        weights = compat_module.choose(compat)
+        weights = choose(compat)
         self.parameters = weights.field if parameters is None else parameters
         if not isinstance(self.parameters, LikelihoodFieldParameters):
             raise TypeError(f"parameters: must be LikelihoodFieldParameters, got {checks.show(parameters)}")
-        compat_module.check_weights(self.parameters, compat)
-        if weights.cubes:
+        check_weights(self.parameters, compat)
+        if weights.is_peer:
             checks.choice("interpolation", self.parameters.interpolation, ("nearest",))
         super().__init__(
             grid, scanner, backend=backend, precision=precision, unknown=unknown, outside=outside,
-            temperature=temperature, beams=beams, compat=compat, specialize=specialize, z_max=self.parameters.z_max,
-            max_depends=False, constant_term=weights.field_constant,
+            temperature=temperature, beams=beams, compat=compat, cubes=weights.cubes, specialize=specialize,
+            z_max=self.parameters.z_max, max_depends=False, constant_term=weights.field_constant,
             possible=self.parameters.z_hit > 0 or self.parameters.z_rand > 0,
         )  # fmt: skip
         self._field_pipeline = FieldPipeline(

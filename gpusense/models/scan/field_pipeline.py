@@ -54,22 +54,23 @@ class FieldPipeline(ScanPipeline):
         outside: str,
     ) -> None:
         super().__init__(setting)
-        bilinear, compat = parameters.interpolation == "bilinear", setting.weights.cubes
-        self.log_table = (self.specialize or compat) and not bilinear
+        bilinear, weights = parameters.interpolation == "bilinear", setting.weights
+        self.log_table = (self.specialize or weights.is_peer) and not bilinear
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
-        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=compat)
+        self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=setting.cubes)
         self._terms = self.backend.upload(terms)
         self._guard = _GUARD * float(np.finfo(self.real).eps)
         range_max = self.scanner.range_max
         self.table = FieldTable(
             self.real, parameters, grid.resolution, range_max, outside=outside,
-            compat=setting.weights.name, log_table=self.log_table, flags=self.components,
+            weights=weights, log_table=self.log_table, flags=self.components,
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
         self._map = ReachableMap(
-            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize, self.table.refresh
-        )
+            self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize,
+            self.table.refresh, obstacles_of=weights.field_obstacles, neighbors=weights.neighbors,
+        )  # fmt: skip
 
     @property
     def map(self) -> ReachableMap:
@@ -117,10 +118,10 @@ class FieldPipeline(ScanPipeline):
         high, low = split(scans.vectors * lengths[:, None], self.real)
         if not self.specialize:
             high[~finite] = cells[~finite, None]
-        longest = float(np.maximum.reduce(lengths))
+        longest = self._longest_of_blocks(lengths, scans)
         arrays = dict(point=high, point_low=low)
         if self.backend.info.kind == "gpu":
-            arrays["guard"] = (self._guard * (self._longest_of_blocks(lengths, scans) + 2)).astype(self.real)
+            arrays["guard"] = (self._guard * (longest + 2)).astype(self.real)
         several = scans.scans > 1
         if several:
             arrays["constant_terms"] = (scans.constants + self.setting.constant_term).astype(self.real)
@@ -135,14 +136,14 @@ class FieldPipeline(ScanPipeline):
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
             float(scans.constants[0]) + self.setting.constant_term,
-            (scans.scans, scans.most_readings, len(scans.readings)), longest + 2,
+            (scans.scans, scans.most_readings, len(scans.readings)), float(longest.max()) + 2,
         )  # fmt: skip
 
     def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:
         """Return the longest reading of each block, in cells; every scan has as many blocks as the longest scan."""
-        blocks = -(-scans.most_readings // BLOCK_TERMS)
         if scans.scans == 1:
             return np.maximum.reduceat(lengths, np.arange(0, len(lengths), BLOCK_TERMS))
+        blocks = -(-scans.most_readings // BLOCK_TERMS)
         padded = np.zeros((scans.scans, blocks * BLOCK_TERMS))
         padded[np.arange(padded.shape[1]) < scans.counts[:, None]] = lengths
         return padded.reshape(scans.scans, blocks, BLOCK_TERMS).max(axis=2)

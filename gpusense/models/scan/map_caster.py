@@ -26,7 +26,7 @@ from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
 from gpusense.tables.normals import normal_table
-from gpusense.tables.reachable import ReachableMap, TableMemoryError
+from gpusense.tables.reachable import ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window
@@ -45,6 +45,7 @@ class MapCaster:
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
         outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
         crop: False prepares the whole map at once.
+        obstacles_of: Function that returns the mask of a grid's cells that stop a beam, from the grid and ``unknown``.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class MapCaster:
         unknown: str,
         outside: str,
         crop: bool,
+        obstacles_of: ObstaclesOf = obstacles_of,
     ) -> None:
         self.backend, self.real, self.mount, self.range_max = backend, real, mount, range_max
         self.limit = range_max / grid.resolution
@@ -67,8 +69,9 @@ class MapCaster:
         self._normals: tuple[Window, Buffer, int] | None = None
         self._no_normals = backend.upload(np.zeros(2, real))
         self.map = ReachableMap(
-            backend, grid, unknown, mount, self.limit, self._prepare, crop and not method.whole, self._refresh
-        )
+            backend, grid, unknown, mount, self.limit + method.beyond, self._prepare, crop and not method.whole,
+            self._refresh, obstacles_of=obstacles_of,
+        )  # fmt: skip
         # The exact caster has no flag.
         caster = {method.entry.flag: method.entry.flag != ""}
         self._fixed_flags = flags_if(OUTSIDE_OCCUPIED=outside == "occupied", **caster)

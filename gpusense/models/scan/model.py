@@ -22,7 +22,7 @@ from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
 from gpusense.models.scan.rules import Beams, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
-from gpusense.world import compat as compat_module
+from gpusense.world.compat import Peer, choose
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -42,7 +42,8 @@ class ScanModel(ABC):
         outside: str | None,
         temperature: float,
         beams: Beams,
-        compat: Compat | None,
+        compat: Compat | Peer | None,
+        cubes: bool,
         specialize: bool,
         z_max: float,
         max_depends: bool,
@@ -53,7 +54,7 @@ class ScanModel(ABC):
             raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         check_scene(grid, scanner.range_max)
         self.scanner = scanner
-        weights = compat_module.choose(compat)
+        weights = choose(compat)
         self.compat = compat
         self.unknown = checks.choice("unknown", "free" if unknown is None else unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", "free" if outside is None else outside, ("free", "occupied"))
@@ -63,12 +64,12 @@ class ScanModel(ABC):
             raise TypeError(f"specialize: must be True or False, got {checks.show(specialize)}")
         device = get_backend(backend)
         rules = Rules(
-            scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.cubes else z_max, self.beams,
-            specialize, max_is_range=weights.cubes, max_depends=max_depends,
+            scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.is_peer else z_max, self.beams,
+            specialize, max_is_range=weights.is_peer, max_depends=max_depends,
         )  # fmt: skip
         self._setting = Setting(
-            device, real_dtype(precision, device), rules, weights, self.temperature, constant_term,
-            possible or weights.cubes,
+            device, real_dtype(precision, device), rules, weights, cubes, self.temperature, constant_term,
+            possible or cubes,
         )  # fmt: skip
         self._workspace = Workspace(device)
         # Threads may share a model: its buffers serve one call at a time.
@@ -146,7 +147,7 @@ class ScanModel(ABC):
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for
             each max reading. With ``per_beam`` also (N, K) or (S, N, K) parts; left-out readings have 0. With
-            ``compat`` the logarithm of a particle's weight, and the cubes that it sums.
+            ``compat`` the logarithm of a particle's weight, and the cubes or logarithms that it sums.
 
         Raises:
             TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
@@ -211,7 +212,7 @@ class ScanModel(ABC):
         )  # fmt: skip
 
     def _weights_note(self) -> str:
-        return "" if self.compat is None else f" with the weights of {self.compat} (no likelihood)"
+        return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"
 
     def _plan(self, title: str, omissions: list[Omission]) -> Plan:
         """Return the plan as of the last call."""

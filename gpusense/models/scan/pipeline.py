@@ -27,8 +27,8 @@ from gpusense.models.scan.request import Request
 from gpusense.models.scan.rules import Rules
 from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
-from gpusense.world.compat import Likelihood
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.peer_weights import Likelihood
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
 # launches fill the device for longer than it takes to start them.
@@ -44,6 +44,7 @@ class Setting:
         real: Precision.
         rules: How readings are classed; they hold the scanner.
         weights: The book's likelihood, or the program whose weights are reproduced.
+        cubes: Whether the model sums cubes of densities, in place of logarithms.
         temperature: Multiplies the sum over readings.
         constant_term: The first term of that sum.
         possible: Whether some range is possible at some pose.
@@ -53,6 +54,7 @@ class Setting:
     real: np.dtype
     rules: Rules
     weights: Likelihood
+    cubes: bool
     temperature: float
     constant_term: float
     possible: bool
@@ -206,8 +208,9 @@ class ScanPipeline(ABC):
     def value(self, scans: ClassedScans) -> float | None:
         """Return the log-likelihood of scans where it is the same at every pose, None elsewhere."""
         if not len(scans.readings):
-            constant = self.setting.weights.without_readings(scans.constants[0], self.setting.constant_term)
-            return float(self.setting.temperature * constant)
+            setting = self.setting
+            constant = setting.weights.without_readings(scans.constants[0], setting.constant_term, cubes=setting.cubes)
+            return float(setting.temperature * constant)
         if not self.setting.possible and np.isfinite(scans.readings).any():
             return -np.inf
         return None

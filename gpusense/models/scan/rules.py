@@ -64,7 +64,7 @@ class Rules:
         z_max: Probability of a max reading; 0 makes it missing.
         beams: The beams that are used.
         specialize: False keeps readings without information, and casts equal bearings one by one.
-        max_is_range: Evaluate finite max readings like ranges, at range_max.
+        max_is_range: Evaluate finite max readings like ranges.
         max_depends: The probability of a max reading depends on the pose, so such readings are evaluated.
     """
 

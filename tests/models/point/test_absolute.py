@@ -8,7 +8,17 @@ import runpy
 import numpy as np
 import pytest
 from support import absolute_oracle as oracle
-from support.absolute_scenes import CELLS, GRID, NAN, SQUARE, assert_close, each_precision, models, poses_around
+from support.absolute_scenes import (
+    CELLS,
+    GRID,
+    MISSING,
+    NAN,
+    SQUARE,
+    assert_close,
+    each_precision,
+    models,
+    poses_around,
+)
 from support.bad_input_absolute import CASES
 from support.kernel_scenes import squared_distances
 from support.paths import ROOT
@@ -123,13 +133,12 @@ def test_an_empty_and_a_full_map(backend: str) -> None:
 
 @each_precision
 def test_missing_readings_and_no_particles(backend: str, precision: str) -> None:
-    missing = {"position": (NAN, 3.0), "heading": NAN, "beacons": [NAN, NAN], "bumper": [None, NAN]}
     poses = poses_around(GRID)
     for name, (model, measured) in models(backend, precision).items():
-        found = model.log_likelihood(poses, missing[name])
+        found = model.log_likelihood(poses, MISSING[name])
         assert found.dtype == precision and found.shape == (len(poses),)
         np.testing.assert_array_equal(found, 0)
-        for reading in (measured[0], missing[name]):
+        for reading in (measured[0], MISSING[name]):
             assert model.log_likelihood(np.zeros((0, 3)), reading).shape == (0,)
     none = gs.BeaconModel([], backend=backend, precision=precision)
     np.testing.assert_array_equal(none.log_likelihood(poses, []), 0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.world.compat import PEERS, BeamWeights, FieldWeights
+from gpusense.compat import PEERS, BeamWeights, FieldWeights
 
 NAN, INF = math.nan, math.inf
 # A wall 8 m east of the grid's corner, an unknown cell to the north-east, and free cells of 1 m.
@@ -34,7 +34,9 @@ def beam_density(peer: str, p: BeamWeights, z: float, expected: float) -> float:
         mass = (math.erf((TOP - expected) / root) - math.erf(-expected / root)) / 2
         hit /= p.sigma_hit * math.sqrt(2 * math.pi) * mass
         short /= 1 - math.exp(-p.lambda_short * expected)
-    return hit + short + (p.z_max if z >= TOP else p.z_rand / TOP)
+    if z > TOP:
+        return hit + short
+    return hit + short + (p.z_max if z == TOP else p.z_rand / TOP)
 
 
 def weight(lead: float, cubes: list[float]) -> float:
@@ -51,8 +53,9 @@ def close(precision: str) -> dict[str, float]:
     ("peer", "readings", "kept"),
     [
         ("amcl", (5.5, 3.0, 2.9, 1.0), (5.5, 3.0, 2.9, 1.0)),
-        # Too close, +inf and beyond range_max are all max readings; NaN is left out.
-        ("amcl", (0.5, INF, 13.0, NAN), (TOP, TOP, TOP, None)),
+        # Too close is a max reading; +inf adds 0, beyond range_max the hit alone; NaN is left out.
+        ("amcl", (0.5, INF, 13.0, NAN), (TOP, None, 13.0, None)),
+        ("amcl", (12.5, INF, 13.0, 3.2), (12.5, None, 13.0, 3.2)),
         ("amcl", (-INF, TOP, 6.0, 6.0), (TOP, TOP, 6.0, 6.0)),
         ("beluga", (5.5, 3.0, 2.9, 1.0), (5.5, 3.0, 2.9, 1.0)),
         # Only what is in [range_min, range_max] is looked at.
@@ -75,11 +78,11 @@ def test_a_literal_of_each_peer():
     # amcl: 0.5 exp(-0.5^2 / (2 * 0.04)) + 0.05 * 0.1 exp(-0.55) + 0.5 / 12 at z = 5.5, z* = 6.
     amcl = gs.BeamModel(GRID, gs.Scanner([0.0], TOP), compat="amcl", backend="numpy", precision="float64")
     assert amcl.log_likelihood(POSE, [5.5])[0] == pytest.approx(math.log1p(0.06651988253**3), rel=1e-6)
-    # Beluga: 0.5 * 1.994711402 * 0.0439369336 + 0.5 * 0.1 exp(-0.55) / (1 - exp(-0.6)) + 0.05 / 12.
+    # Beluga: 0.5 * 1.994711402 * 0.0439369336 + 0.05 * 0.1 exp(-0.55) / (1 - exp(-0.6)) + 0.5 / 12.
     beluga = gs.BeamModel(GRID, gs.Scanner([0.0], TOP), compat="beluga", backend="numpy", precision="float64")
-    assert beluga.log_likelihood(POSE, [5.5])[0] == pytest.approx(3 * math.log(0.1119241078), rel=1e-6)
+    assert beluga.log_likelihood(POSE, [5.5])[0] == pytest.approx(3 * math.log(0.0918810869), rel=1e-6)
     # amcl's field: 2 cells short of the wall, d = 2 = max_distance; beluga's: 0.5 N(2; 0, 0.2) + 0.5 / 12.
-    for peer, density in (("amcl", 0.5 * math.exp(-50) + 0.5 / 12), ("beluga", 0.5 / 12 + 1.9236e-22)):
+    for peer, density in (("amcl", 0.5 * math.exp(-50) + 0.5 / 12), ("beluga", float(np.float32(0.5 / 12)))):
         field = gs.LikelihoodFieldModel(GRID, gs.Scanner([0.0], TOP), compat=peer, backend="numpy", precision="float64")
         assert field.log_likelihood(POSE, [4.0])[0] == pytest.approx(math.log1p(density**3), rel=1e-9)
 
@@ -96,9 +99,11 @@ def test_field_weights_by_hand(peer, precision, backend):
     rand = p.z_rand / TOP
 
     def cube(distance: float) -> float:
-        return (hit * math.exp(-(min(distance, p.max_distance) ** 2) / (2 * p.sigma_hit**2)) + rand) ** 3
+        density = hit * math.exp(-(min(distance, p.max_distance) ** 2) / (2 * p.sigma_hit**2)) + rand
+        # Beluga's cells hold float32 numbers.
+        return (density if peer == "amcl" else float(np.float32(density))) ** 3
 
-    outside = cube(INF) if peer == "amcl" else (1 / TOP) ** 3
+    outside = cube(INF) if peer == "amcl" else float(np.float32(1 / TOP)) ** 3
     cubes = [cube(0), cube(5), outside, 0.0 if peer == "amcl" else outside]
     log_p, parts = model.log_likelihood(POSE, readings, per_beam=True)
     assert parts[0] == pytest.approx(cubes, **close(precision))

@@ -18,7 +18,7 @@ from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.evaluation.worlds import simulate_scan
 from gpusense.models.scan import tiles
 from gpusense.models.scan.densities import log_mixture
-from gpusense.tables.casters import Lookup
+from gpusense.tables.casters import CASTERS, Lookup
 
 RANGE = 5.0
 RING = np.arange(8) * math.pi / 4 + 0.1
@@ -79,7 +79,7 @@ def test_a_sonar_hears_the_nearest_ray_that_returns(name, backend):
 
 
 @on_every_backend(
-    on_warp=lambda caster: caster in ("bresenham", "lookup"), caster=["dda", "march", "bresenham", "cddt", "lookup"]
+    on_warp=lambda caster: caster in ("bresenham", "lookup"), caster=[name for name in CASTERS if name != "exact"]
 )
 def test_cones_of_every_caster(caster, backend):
     if caster == "lookup":

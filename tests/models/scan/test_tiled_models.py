@@ -18,6 +18,7 @@ import gpusense as gs
 from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.models import run
 from gpusense.models.scan import tiles
+from gpusense.tables.casters import CASTERS
 
 RANGE, BEAMS, COUNT = 5.0, 53, 150
 BEAM = {
@@ -117,7 +118,7 @@ def test_a_table_of_densities(ordered, as_gpu):
 
 
 @on_every_backend(
-    method=("exact", "dda", "march", "bresenham", "cddt", "lookup"), kind=("all over", "inside"),
+    method=tuple(CASTERS), kind=("all over", "inside"),
     on_warp=lambda method, kind: (kind, method) in (("all over", "exact"), ("inside", "lookup")),
 )  # fmt: skip
 def test_casters(method, kind, ordered, as_gpu):

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.caster_world import by_name, each_caster
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -15,7 +16,6 @@ from gpusense.world import windows
 RESOLUTION, RANGE_MAX = 0.1, 4.0
 BEARINGS = np.linspace(-3, 3, 9)
 SCANNER = gs.Scanner(BEARINGS, RANGE_MAX, mount=(0.1, 0.05, 0.3))
-METHODS = ["exact", "dda", "march", "bresenham", casters.Cddt(16), casters.Lookup(12)]
 FIELDS = {
     "nearest": {"max_distance": 0.72},
     "bilinear": {"max_distance": 0.72, "interpolation": "bilinear"},
@@ -70,7 +70,7 @@ def check_edits(make, result, grid, rng, count=7):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("method", METHODS, ids=str)
+@pytest.mark.parametrize("method", each_caster(16), ids=by_name)
 def test_casters_follow(method, precision, device):
     rng = np.random.default_rng(1)
     for shape, outside, unknown in (((60, 75), "free", "occupied"), ((1, 90), "occupied", "free")):

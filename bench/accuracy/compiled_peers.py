@@ -1,0 +1,116 @@
+"""nav2_amcl and Beluga as compiled from copies of their sources, which the user gives; for ``peers.py``."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+import gpusense as gs
+
+CODE = Path(__file__).resolve().parent / "peer_code"
+MODELS = {"beam": 0, "field": 1, "field, prob": 2}
+_FLAGS = ("-std=c++17", "-O2", "-DNDEBUG", "-fPIC", "-shared")
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A peer in a shared library, see the files in ``peer_code``."""
+
+    name: str
+    library: ctypes.CDLL
+
+    def score(
+        self,
+        grid: gs.OccupancyGrid,
+        scanner: gs.Scanner,
+        parameters: Sequence[float],
+        model: str,
+        options: int,
+        poses: np.ndarray,
+        ranges: np.ndarray,
+        nearest: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weight of each pose, and the cells of the likelihood field: distances [m], or densities.
+
+        Args:
+            grid: The map.
+            scanner: The scanner, without a mount.
+            parameters: z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance.
+            model: A key of MODELS.
+            options: For Beluga, 1 for model_unknown_space and 2 for only_obstacle_boundaries.
+            poses: (N, 3) poses.
+            ranges: (K,) readings [m].
+            nearest: Index of the nearest obstacle of each cell, or -1; None for the peer's own distances.
+        """
+        rows, cols = grid.shape
+        weights, field = np.empty(len(poses)), np.zeros(grid.shape, np.float32)
+        cells = np.ascontiguousarray(grid.cells)
+        geometry = np.array([grid.resolution, *grid.origin])
+        kept = [np.ascontiguousarray(array, np.float64) for array in (parameters, poses, ranges, scanner.bearings)]
+        given = None if nearest is None else np.ascontiguousarray(nearest, np.int64)
+        self.library.score(
+            _pointer(cells), rows, cols, _pointer(geometry), _pointer(kept[0]), MODELS[model], options,
+            _pointer(kept[1]), len(poses), _pointer(kept[2]), _pointer(kept[3]), len(ranges),
+            ctypes.c_double(scanner.range_min), ctypes.c_double(scanner.range_max),
+            None if given is None else _pointer(given), _pointer(weights), _pointer(field),
+        )  # fmt: skip
+        return weights, field
+
+    def cast(self, grid: gs.OccupancyGrid, scanner: gs.Scanner, poses: np.ndarray) -> np.ndarray:
+        """Return (N, K) ranges of the map."""
+        ranges = np.empty((len(poses), scanner.count))
+        cells, geometry = np.ascontiguousarray(grid.cells), np.array([grid.resolution, *grid.origin])
+        kept = [np.ascontiguousarray(array, np.float64) for array in (poses, scanner.bearings)]
+        self.library.cast(
+            _pointer(cells), *grid.shape, _pointer(geometry), _pointer(kept[0]), len(poses), _pointer(kept[1]),
+            scanner.count, ctypes.c_double(scanner.range_max), _pointer(ranges),
+        )  # fmt: skip
+        return ranges
+
+
+def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Compiled:
+    """Compile a peer.
+
+    Args:
+        name: ``"amcl"`` or ``"beluga"``.
+        source: A copy of navigation2, or of Beluga.
+        include: Folders of headers: Sophus for Beluga, Eigen and range-v3 where the compiler does not find them.
+        folder: Place of the library.
+    """
+    library = folder / f"{name}.so"
+    if name == "amcl":
+        root = source / "nav2_amcl"
+        objects = []
+        for file in ("map/map.c", "map/map_range.c", "pf/pf_vector.c", "pf/eig3.c"):
+            objects.append(str(folder / f"{Path(file).stem}.o"))
+            _run("gcc", "-O2", "-fPIC", "-c", f"-I{root / 'include'}", str(root / "src" / file), "-o", objects[-1])
+        models = [str(path) for path in sorted((root / "src" / "sensors" / "laser").glob("*.cpp"))]
+        _run("g++", *_FLAGS, f"-I{root}", f"-I{root / 'include'}", "-o", str(library), str(CODE / "nav2.cpp"), *models,
+             *objects)  # fmt: skip
+    else:
+        headers = [f"-I{path}" for path in (source / "beluga" / "include", *include)]
+        _run("g++", *_FLAGS, *headers, "-DSOPHUS_USE_BASIC_LOGGING", "-o", str(library), str(CODE / "beluga.cpp"),
+             "-ltbb")  # fmt: skip
+    return Compiled(name, ctypes.CDLL(str(library)))
+
+
+def nearest_obstacles(mask: np.ndarray) -> np.ndarray:
+    """Return the index of the nearest obstacle of each cell of a mask by SciPy, -1 without an obstacle."""
+    if not mask.any():
+        return np.full(mask.shape, -1)
+    row, col = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    return np.asarray(row.astype(np.int64) * mask.shape[1] + col)
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _run(*command: str) -> None:
+    subprocess.run(command, check=True)

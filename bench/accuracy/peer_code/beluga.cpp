@@ -1,0 +1,117 @@
+// Beluga's laser models as one C function; peers.py compiles it against a copy of Beluga.
+// Its distance transform is renamed, so that exact distances can take its place.
+#define nearest_obstacle_distance_map inexact_distance_map
+#include <beluga/algorithm/distance_map.hpp>
+#undef nearest_obstacle_distance_map
+
+#include <type_traits>
+#include <vector>
+
+namespace {
+// The index of the nearest obstacle of each cell, -1 without one; null for Beluga's transform.
+const long *nearest_obstacle;
+}  // namespace
+
+namespace beluga {
+template <class Range, class Distance, class Neighbors>
+auto nearest_obstacle_distance_map(Range &&mask, Distance &&distance, Neighbors &&neighbors,
+                                   std::invoke_result_t<Distance, std::size_t, std::size_t> most) {
+    if (!nearest_obstacle) return inexact_distance_map(mask, distance, neighbors, most);
+    std::vector<std::invoke_result_t<Distance, std::size_t, std::size_t>> map(ranges::size(mask), most);
+    for (std::size_t i = 0; i < map.size(); ++i)
+        if (nearest_obstacle[i] >= 0) map[i] = std::min(most, distance(nearest_obstacle[i], i));
+    return map;
+}
+}  // namespace beluga
+
+#include <beluga/sensor/beam_model.hpp>
+#include <beluga/sensor/data/laser_scan.hpp>
+#include <beluga/sensor/likelihood_field_model.hpp>
+#include <beluga/sensor/likelihood_field_prob_model.hpp>
+
+namespace {
+
+struct Grid : beluga::BaseOccupancyGrid2<Grid> {
+    // The values of beluga_ros::OccupancyGrid.
+    struct Traits {
+        static bool is_free(signed char value) { return value == 0; }
+        static bool is_unknown(signed char value) { return value == -1; }
+        static bool is_occupied(signed char value) { return value == 100; }
+    };
+    Grid(const signed char *cells, int rows, int cols, const double *geometry)
+        : data_(cells, cells + rows * cols), cols_(cols), resolution_(geometry[0]),
+          origin_(Sophus::SO2d{geometry[3]}, Eigen::Vector2d{geometry[1], geometry[2]}) {}
+    const Sophus::SE2d &origin() const { return origin_; }
+    std::size_t size() const { return data_.size(); }
+    const auto &data() const { return data_; }
+    std::size_t width() const { return cols_; }
+    std::size_t height() const { return data_.size() / cols_; }
+    double resolution() const { return resolution_; }
+    static auto value_traits() { return Traits{}; }
+
+   private:
+    std::vector<signed char> data_;
+    std::size_t cols_;
+    double resolution_;
+    Sophus::SE2d origin_;
+};
+
+struct Scan : beluga::BaseLaserScan<Scan> {
+    using Scalar = double;
+    std::vector<double> ranges_, angles_;
+    double least, most;
+    const auto &ranges() const { return ranges_; }
+    const auto &angles() const { return angles_; }
+    double min_range() const { return least; }
+    double max_range() const { return most; }
+};
+
+Sophus::SE2d state(const double *pose) { return {Sophus::SO2d{pose[2]}, Eigen::Vector2d{pose[0], pose[1]}}; }
+
+template <class Model, class Points>
+void weigh(const Model &model, Points points, const double *poses, int n, double *weights) {
+    const auto weight = model(std::move(points));
+    for (int j = 0; j < n; ++j) weights[j] = weight(state(poses + 3 * j));
+}
+
+}  // namespace
+
+// Score n poses with a scan of k readings; see nav2.cpp. options: 1 model_unknown_space, 2 only_obstacle_boundaries.
+extern "C" void score(const signed char *cells, int rows, int cols, const double *geometry, const double *p, int model,
+                      int options, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, const long *nearest, double *weights, float *field) {
+    nearest_obstacle = nearest;
+    const Grid grid{cells, rows, cols, geometry};
+    Scan scan;
+    scan.ranges_.assign(ranges, ranges + k);
+    scan.angles_.assign(bearings, bearings + k);
+    scan.least = range_min;
+    scan.most = range_max;
+    std::vector<std::pair<double, double>> points;
+    for (const auto &point : scan.points_in_cartesian_coordinates()) points.emplace_back(point.x(), point.y());
+    if (model == 0) {
+        const beluga::BeamModelParam param{p[0], p[1], p[2], p[3], p[4], p[5], range_max};
+        weigh(beluga::BeamSensorModel<Grid>{param, grid}, points, poses, n, weights);
+        return;
+    }
+    const beluga::LikelihoodFieldModelParam param{p[6],  range_max,        p[0],              p[3],
+                                                  p[4], (options & 1) != 0, (options & 2) != 0};
+    const auto with = [&](const auto &made) {
+        for (int i = 0; field && i < rows * cols; ++i) field[i] = made.likelihood_field().data()[i];
+        weigh(made, points, poses, n, weights);
+    };
+    if (model == 1)
+        with(beluga::LikelihoodFieldModel<Grid>{param, grid});
+    else
+        with(beluga::LikelihoodFieldProbModel<Grid>{param, grid});
+}
+
+// Return the range of the map alone, range_max without a hit.
+extern "C" void cast(const signed char *cells, int rows, int cols, const double *geometry, const double *poses, int n,
+                     const double *bearings, int k, double range_max, double *expected) {
+    const Grid grid{cells, rows, cols, geometry};
+    for (int j = 0; j < n; ++j) {
+        const beluga::Ray2d ray{grid, state(poses + 3 * j), range_max};
+        for (int i = 0; i < k; ++i) expected[j * k + i] = ray.cast(Sophus::SO2d{bearings[i]}).value_or(range_max);
+    }
+}

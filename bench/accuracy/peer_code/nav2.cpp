@@ -1,0 +1,98 @@
+// nav2_amcl's laser models as one C function; peers.py compiles it against a copy of navigation2.
+// The brushfire of map_cspace.cpp is included, so that its table of distances is at hand.
+#include <cmath>
+#include <cstdlib>
+
+#include "src/map/map_cspace.cpp"
+#include "nav2_amcl/sensors/laser/laser.hpp"
+
+namespace {
+double *result;
+}
+
+// In place of the particle filter's: one sample at a time, of weight 1.
+extern "C" void pf_update_sensor(pf_t *, pf_sensor_model_fn_t sensor_fn, void *data) {
+    pf_sample_set_t *set = reinterpret_cast<pf_sample_set_t *>(result);
+    sensor_fn(data, set);
+}
+
+// Score n poses with a scan of k readings. model: 0 beam, 1 likelihood field, 2 its product form. p = {z_hit, z_short,
+// z_max, z_rand, sigma_hit, lambda_short, max_occ_dist}. With nearest (the index of the nearest obstacle of each cell,
+// -1 without one) distances are exact; field takes the distances.
+extern "C" void score(const signed char *cells, int rows, int cols, const double *geometry, const double *p, int model,
+                      int, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, const long *nearest, double *weights, float *field) {
+    map_t *map = map_alloc();
+    map->size_x = cols;
+    map->size_y = rows;
+    map->scale = geometry[0];
+    map->origin_x = geometry[1] + (cols / 2) * map->scale;
+    map->origin_y = geometry[2] + (rows / 2) * map->scale;
+    map->cells = static_cast<map_cell_t *>(std::malloc(sizeof(map_cell_t) * rows * cols));
+    // The rule of AmclNode::convertMap.
+    for (int i = 0; i < rows * cols; ++i) map->cells[i].occ_state = cells[i] == 0 ? -1 : cells[i] == 100 ? 1 : 0;
+    nav2_amcl::Laser *laser;
+    if (model == 0) {
+        laser = new nav2_amcl::BeamModel(p[0], p[1], p[2], p[3], p[4], p[5], 0, k, map);
+    } else if (model == 1) {
+        laser = new nav2_amcl::LikelihoodFieldModel(p[0], p[3], p[4], p[6], k, map);
+    } else {
+        laser = new nav2_amcl::LikelihoodFieldModelProb(p[0], p[3], p[4], p[6], false, 0.5, 0.3, 0.9, k, map);
+    }
+    if (model != 0) {
+        CachedDistanceMap *table = get_distance_map(map->scale, map->max_occ_dist);
+        for (int i = 0; nearest && i < rows * cols; ++i) {
+            map->cells[i].occ_dist = map->max_occ_dist;
+            if (nearest[i] < 0) continue;
+            const int across = std::abs(int(nearest[i] % cols) - i % cols), up = std::abs(int(nearest[i] / cols) - i / cols);
+            if (std::max(across, up) > table->cell_radius_ + 1) continue;
+            const double distance = table->distances_[across][up];
+            if (distance <= table->cell_radius_) map->cells[i].occ_dist = distance * map->scale;
+        }
+        for (int i = 0; field && i < rows * cols; ++i) field[i] = map->cells[i].occ_dist;
+    }
+    pf_vector_t nowhere = pf_vector_zero();
+    laser->SetLaserPose(nowhere);
+    nav2_amcl::LaserData data;
+    data.laser = laser;
+    data.range_count = k;
+    data.range_max = range_max;
+    data.ranges = new double[k][2];
+    for (int i = 0; i < k; ++i) {
+        // The rule of AmclNode::updateFilter.
+        data.ranges[i][0] = ranges[i] <= range_min ? range_max : ranges[i];
+        data.ranges[i][1] = bearings[i];
+    }
+    pf_sample_t *samples = new pf_sample_t[n];
+    for (int j = 0; j < n; ++j) {
+        samples[j].weight = 1;
+        for (int i = 0; i < 3; ++i) samples[j].pose.v[i] = poses[3 * j + i];
+    }
+    pf_sample_set_t set = {};
+    set.sample_count = n;
+    set.samples = samples;
+    result = reinterpret_cast<double *>(&set);
+    laser->sensorUpdate(nullptr, &data);
+    for (int j = 0; j < n; ++j) weights[j] = samples[j].weight;
+    delete[] samples;
+    delete laser;
+    map_free(map);
+}
+
+// Return the range of the map alone.
+extern "C" void cast(const signed char *cells, int rows, int cols, const double *geometry, const double *poses, int n,
+                     const double *bearings, int k, double range_max, double *expected) {
+    map_t *map = map_alloc();
+    map->size_x = cols;
+    map->size_y = rows;
+    map->scale = geometry[0];
+    map->origin_x = geometry[1] + (cols / 2) * map->scale;
+    map->origin_y = geometry[2] + (rows / 2) * map->scale;
+    map->cells = static_cast<map_cell_t *>(std::malloc(sizeof(map_cell_t) * rows * cols));
+    for (int i = 0; i < rows * cols; ++i) map->cells[i].occ_state = cells[i] == 0 ? -1 : cells[i] == 100 ? 1 : 0;
+    for (int j = 0; j < n; ++j)
+        for (int i = 0; i < k; ++i)
+            expected[j * k + i] =
+                map_calc_range(map, poses[3 * j], poses[3 * j + 1], poses[3 * j + 2] + bearings[i], range_max);
+    map_free(map);
+}

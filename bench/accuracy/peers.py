@@ -6,8 +6,8 @@
 Poses are on the map's free cells, anywhere on it and off it; some cells are in mode scale. Readings are NaN, infinite,
 too short, at range_max and beyond for a part of the beams. Weights of likelihood fields are compared with exact
 distances in the peers' code; *inexact* is the share of cells that differ with the peers' distances. nav2_amcl rounds
-where others truncate, so it is compared on a grid whose origin is half a cell lower. ``--write`` stores weights in small
-scenes, as in ``tests/models/scan/peer_weights.json``. Needs g++ with C++17, Sophus, Eigen, range-v3 and TBB.
+where others truncate, so it is compared on a grid whose origin is half a cell lower. ``--write`` stores weights in
+small scenes, as in ``tests/models/scan/peer_weights.json``. Needs g++ with C++17, Sophus, Eigen, range-v3 and TBB.
 """
 
 from __future__ import annotations

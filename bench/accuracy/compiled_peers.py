@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,6 +99,12 @@ def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Com
         _run("g++", *_FLAGS, *headers, "-DSOPHUS_USE_BASIC_LOGGING", "-o", str(library), str(CODE / "beluga.cpp"),
              "-ltbb")  # fmt: skip
     return Compiled(name, ctypes.CDLL(str(library)))
+
+
+def version(source: Path, package: str) -> str:
+    """Return the version that a package of a copy states."""
+    found = re.search(r"<version>(.*?)</version>", (source / package / "package.xml").read_text(encoding="utf-8"))
+    return f"{package} {found[1] if found else 'unknown'}"
 
 
 def nearest_obstacles(mask: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ from gpusense.world.compat import Beluga, Peer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from accuracy.compiled_peers import Compiled, build, nearest_obstacles
+from accuracy.compiled_peers import Compiled, build, nearest_obstacles, version
 from common import make_parser, note, parse, publish, table
 
 MAPS = {
@@ -233,7 +233,9 @@ def main() -> int:
     columns = ("map", "peer", "model", "poses", "weights", "ranges", "beyond", "inexact")
     lines = [[f"{row.get(name, ''):.2g}" if isinstance(row.get(name), float) else row.get(name, "") for name in columns]
              for row in rows]  # fmt: skip
-    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+    versions = [version(arguments.nav2, "nav2_amcl"), version(arguments.beluga, "beluga")]
+    text = f"{', '.join(versions)}. Largest relative differences of weights, and differences of ranges [m].\n\n"
+    publish(__file__, arguments, text + table(columns, lines), {"versions": versions, "rows": rows})
     return int(any(row["weights"] > BOUND or row["lost"] for row in rows))
 
 

@@ -159,12 +159,11 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
         range_bias=name.removesuffix("-transfer") in BIASED,
     )  # fmt: skip
     seconds = time.perf_counter() - begin
-    bias = fit.range_bias if fit.bias_fitted else 0.0
     rows = [
         {"name": row.name, "parameters": row.parameters.to_dict(), **{key: finite(getattr(row, key)) for key in
          ("per_beam", "error", "gain", "gain_error", "impossible")}}
         for row in held_out.compare_held_out(
-            fit.parameters, rest, readings=fit.hits + fit.max_readings, range_bias=bias
+            fit.parameters, rest, readings=fit.hits + fit.max_readings
         )
     ]  # fmt: skip
     report = {
@@ -173,7 +172,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
         "held_out_blocks": len(np.unique(rest.block)), "held_out": rows,
     }  # fmt: skip
     if arguments.discrete:
-        report["discrete"] = discrete(half, rest, fit.parameters, bias, arguments.discrete)
+        report["discrete"] = discrete(half, rest, fit.parameters, arguments.discrete)
     if arguments.incidence and half.incidence is not None:
         report["incidence"] = by_incidence(half, rest, fit.parameters, arguments.incidence, arguments.backend)
     return report
@@ -199,23 +198,20 @@ def by_incidence(
     return {"fit": fit.to_dict(), "gain": finite(mean), "gain_error": finite(error)}
 
 
-def discrete(
-    half: RangeData, rest: RangeData, parameters: gs.BeamParameters, bias: float, width: float
-) -> dict[str, Any]:
+def discrete(half: RangeData, rest: RangeData, parameters: gs.BeamParameters, width: float) -> dict[str, Any]:
     """Learn the discrete model on one half, and compare with the fitted mixture in the same steps on the other."""
     bins = min(max(round(half.range_max / width), 1), 4096)
 
     def moved(data: RangeData) -> RangeData:
-        return fitting.without_missing(
-            RangeData(np.where(data.ranges < data.range_max, np.maximum(data.ranges - bias, 0), data.ranges),
-                      data.expected, None, data.block, data.range_max)
-        )  # fmt: skip
+        nearer = np.maximum(data.ranges - parameters.range_bias, 0)
+        ranges = np.where(data.ranges < data.range_max, nearer, data.ranges)
+        return fitting.without_missing(RangeData(ranges, data.expected, None, data.block, data.range_max))
 
     own, other = moved(half), moved(rest)
     begin = time.perf_counter()
     learned = gs.DiscreteBeamModel.learn(own.ranges, own.expected, half.range_max, bins)
     seconds = time.perf_counter() - begin
-    soft = held_out.softened(parameters, len(own.ranges))
+    soft = held_out.softened(parameters.replace(range_bias=0.0), len(own.ranges))
     mixture = gs.DiscreteBeamModel(soft, half.range_max, bins)
     gain = learned.log_likelihood(other.ranges, other.expected) - mixture.log_likelihood(other.ranges, other.expected)
     _, block = np.unique(other.block, return_inverse=True)

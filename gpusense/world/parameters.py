@@ -61,7 +61,7 @@ class _Parameters:
             raise ValueError(f"{' + '.join(names)}: {rule}, got {total}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BeamParameters(_Parameters):
     """Parameters of the beam model, *Probabilistic Robotics* section 6.3.
 
@@ -104,6 +104,9 @@ class BeamParameters(_Parameters):
         """Return the fields by name; range_bias and sigma_growth only where they are not 0."""
         values = super().to_dict()
         return {name: value for name, value in values.items() if value or name not in ("range_bias", "sigma_growth")}
+
+    def __repr__(self) -> str:
+        return f"BeamParameters({', '.join(f'{name}={value!r}' for name, value in self.to_dict().items())})"
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 import pytest
 
 from gpusense.interface.launches import Launch, flags_of, launch
 from gpusense.interface.signatures import KERNELS
+from gpusense.interface.structs import STRUCTS, dtypes, fields, layout, rounded
 
 KERNEL = "fill_field"
 BUFFER = object()
@@ -18,6 +21,11 @@ VALUES = dict(
 
 def bind(**changes) -> Launch:
     return launch(KERNEL, ("FLOAT64",), (2, 3), **{**VALUES, **changes})
+
+
+def struct_of(name: str) -> tuple:
+    """Return a struct of ones."""
+    return STRUCTS[name](*[1] * len(fields(name)))
 
 
 def test_arguments_are_in_the_order_of_the_row_whatever_their_order():
@@ -37,7 +45,7 @@ def test_named_is_the_inverse():
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_every_kernel_takes_the_names_of_its_row(kernel):
     row = KERNELS[kernel].arguments
-    values = {one.name: BUFFER if one.shape is not None else 1 for one in row}
+    values = {one.name: BUFFER if one.shape is not None else struct_of(one.type) if one.is_struct else 1 for one in row}
     assert launch(kernel, (), (1,), **values).named() == values
 
 
@@ -86,3 +94,26 @@ def test_flags_of_a_program_are_those_of_all_launches():
     first, second = bind(), launch(KERNEL, ("LINEAR", "LOG_TABLE"), (1, 1), **VALUES)
     assert flags_of((first, second)) == {"FLOAT64", "LINEAR", "LOG_TABLE"}
     assert flags_of(()) == frozenset()
+
+
+def test_a_struct_is_no_number_and_no_other_struct():
+    row = KERNELS["place_poses"].arguments
+    values = {one.name: BUFFER if one.shape is not None else struct_of(one.type) if one.is_struct else 1 for one in row}
+    for wrong in (1, (1, 2, 3, 4), struct_of("Caster"), BUFFER):
+        with pytest.raises(TypeError, match="^place_poses: window must be a Window, got a "):
+            launch("place_poses", (), (1,), **{**values, "window": wrong})
+    with pytest.raises(TypeError, match="^place_poses: poses must be a buffer, got a Window"):
+        launch("place_poses", (), (1,), **{**values, "poses": struct_of("Window")})
+
+
+@pytest.mark.parametrize("name", STRUCTS)
+def test_structs_have_the_memory_of_c(name):
+    """NumPy's aligned record types are laid out as C compilers do."""
+    for real in (np.dtype(np.float32), np.dtype(np.float64)):
+        kinds = dtypes(name, real)
+        aligned = np.dtype([(field, kind) for field, kind in zip(fields(name), kinds, strict=True)], align=True)
+        values = tuple(range(3, 3 + len(kinds)))
+        packed = struct.pack(layout(name, real), *values)
+        assert len(packed) == aligned.itemsize
+        assert np.frombuffer(packed, aligned)[0].tolist() == values
+        assert rounded(values, name, real) == values

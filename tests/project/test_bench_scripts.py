@@ -352,3 +352,17 @@ def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
     for row in rows:
         assert row["breaches"] == 0 and "float32 beam model, scans" in row["differences"]
     assert str(data_dir) not in str(report)
+
+
+def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The script that compiled the peers makes the maps, readings and options whose weights the tests have."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    script = importlib.import_module("accuracy.peers")
+    stored = json.loads((ROOT / "tests/models/scan/peer_weights.json").read_text(encoding="utf-8"))
+    made = list(script.small_scenes())
+    assert len(made) == len(stored) == 3
+    for (grid, scene), one in zip(made, stored, strict=True):
+        assert grid.cells.tolist() == one["cells"] and scene["poses"].shape == (len(one["poses"]), 3)
+        cases = [case for peer in ("amcl", "beluga") for case in script.cases(peer)]
+        assert [(case.model, case.peer.name) for case in cases] == [(s["model"], s["peer"]) for s in one["scores"]]
+        assert [case.field.to_dict() for case in cases] == [s["field"] for s in one["scores"]]

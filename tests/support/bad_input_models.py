@@ -105,7 +105,7 @@ MODEL_CASES = [
         field(parameters=gs.BeamParameters()),
         TypeError,
         "parameters: must be LikelihoodFieldParameters, got BeamParameters(z_hit=0.7, z_short=0.1, z_max=0.1, "
-        "z_rand=0.1, sigma_hit=0.05, lambda_short=0.2, range_bias=0.0, sigma_growth=0.0)",
+        "z_rand=0.1, sigma_hit=0.05, lambda_short=0.2)",
     ),
     (
         "beam-weights-of-0.9",

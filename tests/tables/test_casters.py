@@ -30,7 +30,16 @@ from gpusense.world import windows
 DOCS = ROOT / "docs" / "casters.md"
 KINDS = [
     *(make() for name, make in casters.CASTERS.items() if name != "lookup"),
-    *(March(0.02), March(1.5, "centre"), Cddt(36, pruned=False), Cddt(7), Lookup(24), Lookup(5)),
+    *(
+        Bresenham("amcl"),
+        Bresenham("beluga"),
+        March(0.02),
+        March(1.5, "centre"),
+        Cddt(36, pruned=False),
+        Cddt(7),
+        Lookup(24),
+        Lookup(5),
+    ),
 ]
 CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
@@ -113,7 +122,7 @@ def test_dda_is_the_exact_caster_to_the_bit(family, backend):
 # ------------------------------------------------------------------------------------------- models, memory, words
 
 
-@pytest.mark.parametrize("kind", each_caster(36), ids=by_name)
+@pytest.mark.parametrize("kind", [*each_caster(36), Bresenham("beluga")], ids=by_name)
 def test_beam_model_is_the_mixture_at_the_casters_ranges(kind, backend):
     grid, poses, bearings = place()
     z = np.random.default_rng(5).uniform(0, RANGE, len(bearings))

@@ -25,6 +25,7 @@ from gpusense.tables.casters import Caster
 from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
+from gpusense.world.peer_weights import Likelihood
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_table import SensorTable
 
@@ -108,9 +109,8 @@ class BeamModel(ScanModel):
             mixtures, cosines = bins_of(incidence)
         check_weights(mixture, compat)
         if isinstance(weights, Peer):
-            check_absent("with compat", sensor_table=sensor_table)
-            _check_peer(weights)
-        method = casters.choose("caster", weights.caster if caster is None else caster, lines=weights.name)
+            _check_peer(weights, sensor_table)
+        method = _method_of(caster, weights)
         max_depends = table is not None or len({p.z_max for p in mixtures}) > 1
         super().__init__(
             grid, scanner, backend=backend, precision=precision,
@@ -225,12 +225,25 @@ class BeamModel(ScanModel):
         return self._caster.cast(poses, pipeline.cone_vectors, out, cones)
 
 
-def _check_peer(peer: Peer) -> None:
-    """Refuse options that only the likelihood field has.
+def _method_of(caster: object, weights: Likelihood) -> Caster:
+    """Return the caster that a user chose, or the default; ranges beyond range_max are for a peer's weights alone.
+
+    Raises:
+        TypeError, ValueError: no caster, or one whose ranges do not fit the model.
+    """
+    method = casters.choose("caster", weights.caster if caster is None else caster, lines=weights.name)
+    if method.beyond and not weights.is_peer:
+        raise ValueError(f"caster: must have ranges of at most range_max without compat, got {method}")
+    return method
+
+
+def _check_peer(peer: Peer, sensor_table: object) -> None:
+    """Refuse options that a beam model with ``compat`` does not have.
 
     Raises:
         ValueError: such an option is set.
     """
+    check_absent("with compat", sensor_table=sensor_table)
     if peer.prob:
         raise ValueError(f"compat: prob must be False for a beam model, got {checks.show(peer)}")
 

@@ -90,7 +90,7 @@ class RayCaster:
         Example:
             >>> import gpusense as gs
             >>> [method.name for method in gs.RayCaster.methods() if method.knobs == "none"]
-            ['exact', 'dda', 'bresenham']
+            ['exact', 'dda']
         """
         return tuple(casters.CASTERS.values())
 

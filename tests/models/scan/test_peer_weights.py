@@ -177,6 +177,8 @@ def test_options_and_their_refusals():
     assert "caster=Bresenham()" in repr(plain)
     with pytest.raises(ValueError, match=r"compat: prob must be False for a beam model, got Amcl\(prob=True\)"):
         gs.BeamModel(grid, scanner, compat=Amcl(prob=True), backend="numpy")
+    with pytest.raises(ValueError, match="caster: must have ranges of at most range_max without compat, got Bres"):
+        gs.BeamModel(grid, scanner, caster=gs.casters.Bresenham("amcl"), backend="numpy")
     with pytest.raises(TypeError, match="prob: must be True or False, got 1"):
         Amcl(prob=1)
     with pytest.raises(TypeError, match="model_unknown_space: must be True or False, got None"):

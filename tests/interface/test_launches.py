@@ -100,9 +100,9 @@ def test_a_struct_is_no_number_and_no_other_struct():
     row = KERNELS["place_poses"].arguments
     values = {one.name: BUFFER if one.shape is not None else struct_of(one.type) if one.is_struct else 1 for one in row}
     for wrong in (1, (1, 2, 3, 4), struct_of("Caster"), BUFFER):
-        with pytest.raises(TypeError, match="^place_poses: window must be a Window, got a "):
+        with pytest.raises(TypeError, match=r"^place_poses: window must be a Window, got a "):
             launch("place_poses", (), (1,), **{**values, "window": wrong})
-    with pytest.raises(TypeError, match="^place_poses: poses must be a buffer, got a Window"):
+    with pytest.raises(TypeError, match=r"^place_poses: poses must be a buffer, got a Window"):
         launch("place_poses", (), (1,), **{**values, "poses": struct_of("Window")})
 
 

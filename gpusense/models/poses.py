@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -117,8 +117,7 @@ class Poses:
         return low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """The frame in which poses are placed.
 
     Attributes:
@@ -132,8 +131,7 @@ class Frame:
     mount: Mount
 
 
-@dataclass(frozen=True)
-class PlacedPoses:
+class PlacedPoses(NamedTuple):
     """Sensor poses in the frame of a window, on the device.
 
     Attributes:
@@ -148,7 +146,7 @@ class PlacedPoses:
         status: The non-finite flag.
     """
 
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count
     corners: Corners | None
     frame: Frame
     cell: Buffer

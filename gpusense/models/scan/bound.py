@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -198,5 +197,5 @@ class DeviceCall(BoundCall):
             scoring = pipeline.scoring(readings, placed, table, log_p, self._space, ordered=False)
             program += pipeline.program(scoring)
             # Readings stay where the first piece has placed them.
-            readings = replace(readings, placing=None)
+            readings = readings._replace(placing=None)
         return program

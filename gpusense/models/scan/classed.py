@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from gpusense.models.scan.rules import Rules
 from gpusense.world.scanner import Scanner
 
 
-@dataclass(frozen=True)
-class LeftOut:
+class LeftOut(NamedTuple):
     """Readings of a scan that are not evaluated at every pose; they are counted when asked for.
 
     Attributes:
@@ -58,8 +57,7 @@ class LeftOut:
         return int(np.count_nonzero(informative & ~(self.used | self.used_max)))
 
 
-@dataclass(frozen=True)
-class ClassedScans:
+class ClassedScans(NamedTuple):
     """The readings of S scans that are evaluated at every pose, one scan after the other.
 
     Attributes:
@@ -191,8 +189,8 @@ def _grouped(scan: ClassedScans) -> ClassedScans:
     # Rays stand in the order of their first readings.
     place = np.argsort(index)
     order = np.argsort(np.argsort(place)[inverse.ravel()], kind="stable")
-    return replace(
-        scan, columns=scan.columns[order], readings=scan.readings[order], vectors=vectors[order],
+    return scan._replace(
+        columns=scan.columns[order], readings=scan.readings[order], vectors=vectors[order],
         rays=vectors[index[place]], first=np.append(0, np.cumsum(counts[place])).astype(np.int32),
         ray_counts=np.array([len(index)]),
     )  # fmt: skip

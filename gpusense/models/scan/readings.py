@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,7 @@ _INT = np.dtype(np.int32)
 _GROUP = 64
 
 
-@dataclass(frozen=True)
-class Readings:
+class Readings(NamedTuple):
     """Readings of S scans on the device.
 
     Attributes:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import MutableMapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,8 +18,7 @@ from gpusense.world.scanner import Scanner
 Known = MutableMapping[int | None, Poses]
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """S scans of N poses each.
 
     Attributes:

@@ -157,16 +157,18 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     if rules.max_is_range:
         finite = np.isfinite(ranges)
         hit, far = hit | (far & finite), far & ~finite
-    used, used_max = rules.choice.among(hit, far if rules.z_max > 0 else np.zeros_like(far))
+    none = np.zeros(far.shape, bool)
+    used, used_max = rules.choice.among(hit, far if rules.z_max > 0 else none)
     if rules.max_is_constant:
         evaluated, constant = used, used_max
     else:
-        evaluated, constant = used | used_max | (not rules.specialize), np.zeros_like(far)
+        evaluated, constant = used | used_max | (not rules.specialize), none
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
     rows, columns = evaluated.nonzero()
     counts = np.bincount(rows, minlength=len(ranges))
-    # Adding 0 makes 0 of -0, the product without max readings.
-    constants = np.bincount(constant.nonzero()[0], minlength=len(ranges)) * rules.log_max + 0.0
+    constants = np.zeros(len(ranges))
+    if constant.any():
+        constants += np.bincount(constant.nonzero()[0], minlength=len(ranges)) * rules.log_max
     if len(columns) < ranges.size:
         values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
     else:

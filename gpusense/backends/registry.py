@@ -162,7 +162,7 @@ class Library(ABC):
 
     def device_of_queue(self, queue: Any) -> tuple[BackendInfo, Any]:
         """Return a queue's device as ``list_devices`` does; parts of devices have selections that are not listed."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} takes no queues of users")
 
     def open_queue(self, queue: Any, info: BackendInfo) -> Backend:
         """Return a backend that works on a user's queue.
@@ -170,7 +170,7 @@ class Library(ABC):
         Raises:
             ValueError: the queue is not an in-order queue.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} takes no queues of users")
 
 
 def load(entry: Entry) -> tuple[Library | None, str]:

@@ -101,7 +101,7 @@ class Argument:
 
     @property
     def is_struct(self) -> bool:
-        """Whether the argument is a struct."""
+        """Tell whether the argument is a struct."""
         return self.type in STRUCTS
 
     @property

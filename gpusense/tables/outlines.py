@@ -98,9 +98,9 @@ class Outlines:
         """Write the results of :meth:`straight_normals`."""
         behind, ahead = self._moments(sides)
         for index, span in enumerate(SPANS):
-            todo = np.nonzero(place == len(SPANS))[0]
-            parts = behind[..., todo], ahead[..., todo]
-            lowest = np.full(len(todo), span.residual)
+            remaining = np.nonzero(place == len(SPANS))[0]
+            parts = behind[..., remaining], ahead[..., remaining]
+            lowest = np.full(len(remaining), span.residual)
             for back in range(span.least, span.count - span.least):
                 front = span.count - 1 - back
                 line = _fit_line(parts[0][:, back] + parts[1][:, front], span.count)
@@ -108,8 +108,8 @@ class Outlines:
                 if span.advance is not None:
                     better &= _advance(line, *parts, back, front) < span.advance
                 lowest[better] = line.residual[better]
-                normal[todo[better]] = line.normal[better]
-                place[todo[better]] = index
+                normal[remaining[better]] = line.normal[better]
+                place[remaining[better]] = index
 
     def _moments(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sum the moments of the sides behind and ahead of M sides.

@@ -38,6 +38,7 @@ Versions: nav2_amcl 1.5.0 and Beluga 2.1.1, with the default parameters of their
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -60,7 +61,7 @@ def _check_bool(name: str, value: object) -> None:
 
 
 @dataclass(frozen=True)
-class Peer(Likelihood):
+class Peer(Likelihood, ABC):
     """A program whose weights ``compat`` reproduces.
 
     Args:
@@ -87,15 +88,15 @@ class Peer(Likelihood):
         """See Likelihood.obstacles; cells that are neither free nor occupied are unknown."""
         return grid.cells != 0 if unknown == "occupied" else grid.cells == _OCCUPIED
 
+    @abstractmethod
     def field_values(
         self, squared: np.ndarray, p: LikelihoodFieldParameters, resolution: float, range_max: float
     ) -> np.ndarray:
         """Return the densities of cells at squared distances [cells^2] from the nearest obstacle."""
-        raise NotImplementedError
 
+    @abstractmethod
     def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
         """Return the density of end points off the map."""
-        raise NotImplementedError
 
     def terms(self, density: np.ndarray | float) -> np.ndarray:
         """Return the terms of the likelihood field's sum."""
@@ -194,7 +195,7 @@ class Beluga(Peer):
 
     @property
     def boundaries(self) -> bool:
-        """Whether only occupied cells beside a free cell are obstacles of the likelihood field."""
+        """Tell whether only occupied cells beside a free cell are obstacles of the likelihood field."""
         return not self.prob if self.only_obstacle_boundaries is None else self.only_obstacle_boundaries
 
     @property

@@ -106,7 +106,7 @@ class BeamParameters(_Parameters):
         return {name: value for name, value in values.items() if value or name not in ("range_bias", "sigma_growth")}
 
     def __repr__(self) -> str:
-        return f"BeamParameters({', '.join(f'{name}={value!r}' for name, value in self.to_dict().items())})"
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.to_dict().items())})"
 
 
 @dataclass(frozen=True)

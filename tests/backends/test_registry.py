@@ -101,7 +101,7 @@ def test_a_new_backend_is_listed_and_selected(metal):
 
 
 def test_devices_anew_renews_all_verdicts(metal, monkeypatch):
-    """Those of a library, such as on loading drivers, before its devices are listed; and those on devices."""
+    """Renew the verdicts on a library, such as on loading drivers, before its devices are listed; then on devices."""
     seen = []
     monkeypatch.setattr(metal, "renew", lambda: seen.append("library"))
     monkeypatch.setattr(metal, "list_devices", lambda: seen.append("list") or [(INFO, "handle")])

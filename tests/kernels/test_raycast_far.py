@@ -60,7 +60,7 @@ def rounded(value: Fraction, real: np.dtype) -> Fraction:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_counts_of_boundaries_near_the_longest_range(precision):
-    """Those whose rounded distances are below t, or t itself: at such distances and next to them, by fractions."""
+    """Compare counts of boundaries at and next to their rounded distances with fractions."""
     real, rng, count = np.dtype(precision), np.random.default_rng(17), 1500
     speed = np.concatenate(
         [rng.uniform(0.5, 1, count), np.sqrt(np.full(count, 0.5)), 2.0 ** rng.uniform(-20, 0, count)]

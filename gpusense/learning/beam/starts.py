@@ -183,7 +183,7 @@ def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, 
 
 
 def _different(one: Point, other: Point) -> bool:
-    """Whether two points are too far apart to lead to the same maximum for certain."""
+    """Return whether two points are so far apart that they may lead to different maxima."""
     ratios = math.log(one.sigma / other.sigma), math.log(one.rate / other.rate)
     shapes = max(map(abs, ratios)) > math.log(_FACTOR)
     moved = abs(one.bias - other.bias) > min(one.sigma, other.sigma)

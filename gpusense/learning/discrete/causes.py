@@ -56,7 +56,7 @@ class DiscreteFit:
     log_likelihood: float
     """The log-likelihood of all readings: probabilities of bins, not densities; natural logarithm."""
     converged: bool
-    """Whether the gradient vanishes at the result, within the bounds of the search."""
+    """Return whether the gradient vanishes at the result, within the bounds of the search."""
     standard_errors: Mapping[str, float]
     """The standard error of each parameter, in its unit, from the curvature of the likelihood; NaN if undetermined."""
     trace: tuple[float, ...]

@@ -138,7 +138,7 @@ def _pushed(data: Counts, theta: Floats) -> tuple[Floats, NDArray[np.bool]]:
 
 
 def _is_flat(data: Counts, theta: Floats) -> bool:
-    """Whether the gradient vanishes within the bounds."""
+    """Return whether the gradient vanishes within the bounds."""
     slope, pushed = _pushed(data, theta)
     return bool((np.abs(slope)[~pushed] <= _FLAT).all())
 

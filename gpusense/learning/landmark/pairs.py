@@ -68,7 +68,7 @@ class Limits:
 
     @property
     def full_circle(self) -> bool:
-        """Whether the field of view is a full circle."""
+        """Tell whether the field of view is a full circle."""
         return self.half_field >= math.pi
 
 
@@ -100,7 +100,7 @@ class Pairs:
 
     @property
     def measured(self) -> tuple[bool, bool, bool]:
-        """Whether at least one pair has a residual of range, of bearing and of signature."""
+        """Tell whether at least one pair has a residual of range, of bearing and of signature."""
         measured: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
         return bool(measured[0]), bool(measured[1]), bool(measured[2])
 

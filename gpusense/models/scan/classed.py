@@ -89,7 +89,7 @@ class ClassedScans(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """Whether several readings share a ray."""
+        """Tell whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
 
     @property

@@ -47,7 +47,7 @@ class Request(NamedTuple):
 
     @property
     def per_beam(self) -> bool:
-        """Whether the log-likelihoods of the readings are requested."""
+        """Tell whether the log-likelihoods of single readings are requested (``per_beam``)."""
         return self.parts.shape[-1] > 0
 
     def result_parts(self) -> np.ndarray:

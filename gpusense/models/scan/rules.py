@@ -83,12 +83,12 @@ class Rules:
 
     @functools.cached_property
     def separate(self) -> bool:
-        """Whether each reading has a separate ray: no bearings are the same, or equal ones are cast one by one."""
+        """Tell whether each reading has its ray: all bearings differ, or nothing is left out."""
         return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)
 
     @property
     def max_is_constant(self) -> bool:
-        """Whether max readings add a constant term, and are not evaluated."""
+        """Tell whether max readings are added as a constant term instead of being evaluated."""
         return self.specialize and not self.max_depends
 
     @functools.cached_property

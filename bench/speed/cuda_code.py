@@ -19,8 +19,9 @@ from pathlib import Path
 
 import warp as wp
 
+from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import warp_module
-from gpusense.interface.signatures import FLAGS, KERNELS
+from gpusense.interface.signatures import KERNELS
 
 _INSTRUCTION = re.compile(r"/\*[0-9a-f]{4,}\*/\s+(?:@!?U?P\w+\s+)?([A-Z]\w*)")
 _ENDS = {"BRA", "CALL", "EXIT", "RET", "BSYNC", "WARPSYNC"}

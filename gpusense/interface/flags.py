@@ -1,6 +1,56 @@
-"""Flags of kernels by the conditions on which they depend."""
+"""Flags of kernels: their meaning, and the conditions on which they depend."""
 
 from __future__ import annotations
+
+from gpusense.interface import casters
+
+FLAGS = {
+    "FLOAT64": "real numbers are float64",
+    "ORIGINS_OUTSIDE": "some beam starts outside the grid",
+    "OUTSIDE_OCCUPIED": "what lies outside the grid is a wall",
+    "HIT": "z_hit > 0",
+    "SHORT": "z_short > 0",
+    "RAND": "z_rand > 0",
+    "BIAS": "range_bias is not 0",
+    "GROWTH": "sigma_hit grows with range",
+    "SHARP": "the normal density's peak is so high that exponents need more than the working precision",
+    "SINGLE": "the mixture has one continuous component",
+    "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
+    "SECTORS_2": "empty rectangles are made for 2 sectors of each quadrant's directions",
+    "SECTORS_4": "empty rectangles are made for 4 of them",
+    **casters.FLAGS,
+    "AMCL_LINES": "Bresenham's lines are nav2_amcl's: they look one cell beyond their end, at ranges beyond range_max",
+    "BELUGA_LINES": "Bresenham's lines are Beluga's: ties go straight on, and rays from outside the grid meet nothing",
+    "ECHO": "a sensor hears the nearest of several rays, or its angle of incidence matters",
+    "INCIDENCE": "the angle of incidence chooses the mixture's terms, or says whether anything returns",
+    "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
+    "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
+    "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
+    "WIDE": "a work-item computes 16 particles or beams at once, for processors whose compilers do not do so",
+    "SHARED_RAYS": "several readings have the same bearing",
+    "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
+    "HUGE_HEADINGS": "some heading is beyond 2^20 rad",
+    "ORDERED": "particles come in an order in which neighbours have much the same position and heading",
+    "STRANDED": "there are enough readings for a work-item to add up whole strands of them",
+    "QUICK": "nearest cells are found by rounding, and again with more digits only where that is in doubt",
+    "INSIDE": "no end point of the cloud leaves the field's table",
+    "SCANS": "several scans are scored together, each with readings and particles of its own",
+    "PER_BEAM": "the log-likelihood of each reading is wanted",
+    "BILINEAR": "the field is interpolated",
+    "LOG_TABLE": "the field's table holds log densities, not distances",
+    "POSES_FLOAT32": "poses on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "RANGES_FLOAT32": "readings on the device are float32 numbers, as GPU frameworks hold them, not float64",
+    "SOME_BEAMS": "readings on the device are those of more beams than are used",
+    "END_POINTS": "readings on the device become end points of beams, not rays with ranges",
+    "RANGE": "some feature has a range",
+    "BEARING": "some feature has a bearing",
+    "SIGNATURE": "some feature has a signature",
+    "FIELD": "the field of view is less than a full circle",
+    "KNOWN": "it is known which landmark each feature is",
+    "MARGINAL": "each feature's densities at all landmarks are summed",
+    "INFORMATION": "the sums of the log-likelihood's second derivatives are wanted",
+    "CAREFUL": "end points need more than the working precision to fall into the right cell",
+}
 
 
 def flags_if(**conditions: object) -> frozenset[str]:

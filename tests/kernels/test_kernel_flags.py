@@ -13,8 +13,9 @@ import pytest
 from support.kernel_scenes import PRECISIONS, scene_flags
 
 from gpusense.backends import get_backend
+from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import warp_module
-from gpusense.interface.signatures import FLAGS, KERNELS
+from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant
 
 # Kernel, the flag, flags beside it, and what only the flag's code has, in OpenCL and in Warp's C++.

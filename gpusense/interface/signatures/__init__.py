@@ -1,0 +1,21 @@
+"""One row per kernel: its file, launch shape and arguments in order. Every backend binds its arguments from here.
+
+A kernel has three bodies (NumPy reference, OpenCL, Warp) with the same name and the same arguments; a test holds the
+three to this table. ``real`` stands for the precision of a model, float32 or float64; ``double`` is always float64, and
+``coordinate`` (poses) and ``measured`` (readings) are float64, or float32 with POSES_FLOAT32 and RANGES_FLOAT32.
+"""
+
+from __future__ import annotations
+
+from gpusense.interface.signatures import learning_kernels, map_kernels, point_kernels, scan_kernels
+from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of
+
+__all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of"]
+
+# Every kernel; a new room of kernels is a file of this folder.
+KERNELS: dict[str, Kernel] = {
+    **map_kernels.KERNELS,
+    **scan_kernels.KERNELS,
+    **point_kernels.KERNELS,
+    **learning_kernels.KERNELS,
+}

@@ -1,0 +1,19 @@
+"""Kernels that learn parameters."""
+
+from __future__ import annotations
+
+from gpusense.interface.signatures.rows import Kernel, kernel
+
+# Readings and expected ranges to learn from, in blocks of one length.
+_PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
+
+KERNELS: dict[str, Kernel] = {
+    "e_step": kernel(
+        "learning", "block", *_PAIRS, "real terms [12]", "out real sums [blocks * width]", "int blocks", "int readings",
+        "int across", "int along", "int width",
+    ),
+    "pair_causes": kernel(
+        "learning", "block", *_PAIRS, "real terms [12]", "out real4 causes [blocks * readings]", "int blocks",
+        "int readings", "int across", "int along",
+    ),
+}  # fmt: skip

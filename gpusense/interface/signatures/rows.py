@@ -1,0 +1,106 @@
+"""Arguments and launch shapes of kernels, and what rows of several kinds of kernel share."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpusense.interface.structs import STRUCTS
+
+_SCALARS: dict[str, np.dtype] = {
+    "int": np.dtype(np.int32),
+    "uchar": np.dtype(np.uint8),
+    "ushort": np.dtype(np.uint16),
+    "double": np.dtype(np.float64),
+}
+_WIDTHS = {"": 1, "2": 2, "4": 4}
+
+
+def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> int:
+    match node:
+        case ast.Constant(value=int(number)):
+            return number
+        case ast.Name(id=name):
+            return int(values[name])
+        case ast.Attribute(value=ast.Name(id=name), attr=field):
+            return int(getattr(values[name], field))
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _evaluate(left, values) + _evaluate(right, values)
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            return _evaluate(left, values) * _evaluate(right, values)
+    raise ValueError(f"shape: must be a sum or product of integers, names and fields, got {ast.unparse(node)!r}")
+
+
+@dataclass(frozen=True)
+class Argument:
+    """One argument of a kernel: an array (with its shape in words), or a scalar or struct (shape None)."""
+
+    name: str
+    type: str
+    shape: str | None = None
+    output: bool = False
+
+    @property
+    def is_struct(self) -> bool:
+        """Tell whether the argument is a struct."""
+        return self.type in STRUCTS
+
+    @property
+    def width(self) -> int:
+        """Numbers per element: 4 for real4."""
+        return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
+
+    def elements(self, values: Mapping[str, Any]) -> int:
+        """Return an array's number of elements: its shape sums and multiplies integers, scalars and structs' fields."""
+        assert self.shape is not None
+        return _evaluate(ast.parse(self.shape, mode="eval").body, values)
+
+    def dtype(self, real: np.dtype) -> np.dtype:
+        """NumPy dtype of one number of an array or scalar."""
+        base = self.type.rstrip("24")
+        return real if base == "real" else _SCALARS[base]
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel: the concept (file) it belongs to, what one work-item is, its arguments, and its work-group size.
+
+    A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group. Where a
+    kernel is compiled for several lanes (WIDE), its groups have ``wide_group`` work-items, and with ``wide`` each of
+    them takes as many neighbours of the first axis as there are lanes.
+    """
+
+    file: str
+    launch: tuple[str, ...]
+    arguments: tuple[Argument, ...]
+    group: int
+    wide: bool = False
+    wide_group: int = 1
+
+
+# Particles or beams of a work-item of such a kernel.
+LANES = 16
+
+
+def lanes_of(flags: frozenset[str]) -> int:
+    """How many particles or beams a work-item computes at once."""
+    return LANES if "WIDE" in flags else 1
+
+
+def kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = False, wide_group: int = 1) -> Kernel:
+    """Return the kernel whose arguments are rows such as ``"out real parts [particles * features]"``."""
+    arguments = []
+    for row in rows:
+        head, _, shape = row.partition("[")
+        *output, kind, name = head.split()
+        arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group, wide, wide_group)
+
+
+WINDOW = "Window window"
+POSES = ("int2 pose_cell [particles]", "real4 pose [particles]")
+PLACED = (*POSES, "real4 pose_low [particles]")

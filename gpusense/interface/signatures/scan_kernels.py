@@ -1,0 +1,87 @@
+"""Kernels that place poses and readings, cast rays and score scans."""
+
+from __future__ import annotations
+
+from gpusense.interface.constants import MIXTURE_TERMS
+from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, kernel
+
+# Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
+_NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
+_CONES = "real2 ray [rays * cone.rays]"
+# A map as a caster has it: what an entry is, and how many there are, is the caster's.
+_CAST = ("entry map_table [map]",)
+_CASTING = ("Caster caster", "RangeScale scale")
+# Poses on their way into a window of the grid.
+_GIVEN = (
+    "coordinate poses [particles * 3]", "out int2 pose_cell [particles]", "out real4 pose [particles]",
+    "out real4 pose_low [particles]", "out int pose_status [2]",
+)  # fmt: skip
+_FRAME = ("Frame frame", WINDOW, "int particles")
+_POINTS = ("real2 point [readings]", "real2 point_low [readings]", "real terms [6]")
+_TERMS = (
+    f"real terms [{MIXTURE_TERMS} * tables.incidence_bins]", "real edges [tables.incidence_bins]",
+    "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
+)  # fmt: skip
+# With SCANS: where the rays or end points of each scan begin, and its constant term.
+_SCANS = ("int start [scans + 1]", "real constant_terms [scans]")
+_RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
+_SCORE = ("Score score", "ScanBatch batch")
+_FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
+
+KERNELS: dict[str, Kernel] = {
+    "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME),
+    "place_inputs": kernel(
+        "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
+        "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
+        "out real guard [blocks]", "out real constant_term [1]", *_FRAME, "int head", "ReadingRules rules",
+    ),
+    "cast_ranges": kernel(
+        "ranges", "ray particle", *_CAST, *POSES, "real2 ray [rays]", "out real ranges [particles * rays]", WINDOW,
+        "int particles", "int rays", *_CASTING, wide=True,
+    ),
+    "score_beams": kernel(
+        "beam", "particle", *_CAST, *_NORMALS, *POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
+        *_TERMS, *_SCANS, *_RESULT, WINDOW, "int particles", "int rays", "int readings", "MixtureTables tables",
+        "Cone cone", *_CASTING, *_SCORE, wide_group=16,
+    ),
+    "cast_tiles": kernel(
+        "ranges", "item", *_CAST, *POSES, "int order [particles]", "real2 ray [rays]",
+        "out real ranges [particles * rays]", WINDOW, "int particles", "int rays", *_CASTING, "int spread",
+    ),
+    "beam_tiles": kernel(
+        "beam", "item", *_CAST, *_NORMALS, *POSES, "int order [particles]", _CONES, "int first [rays + 1]",
+        "real reading [readings]", *_TERMS, "int start [scans + 1]", "out real parts [readings * particles]", WINDOW,
+        "int particles", "int rays", "int readings", "MixtureTables tables", "Cone cone", *_CASTING, "int spread",
+        "ScanBatch batch",
+    ),
+    "cast_echoes": kernel(
+        "echo", "ray particle", *_CAST, *_NORMALS, *POSES, _CONES, "out real ranges [particles * rays]",
+        "out real incidence [particles * rays]", WINDOW, "int particles", "int rays", "Cone cone", *_CASTING,
+    ),
+    "sum_parts": kernel(
+        "sums", "place", "real parts [count * particles]", "int order [particles]", "int counts [scans]",
+        "real constant_terms [scans]", "out real log_p [particles]", "int particles", "int count", "int block",
+        *_SCORE,
+    ),
+    "order_bounds": kernel(
+        "order", "bin", *POSES, "out int bounds [7]", "out int bins [32768]", "int particles",
+    ),
+    "order_count": kernel(
+        "order", "particle", *POSES, "int bounds [7]", "out int bins [32768]", "out int bin_of [particles]",
+        "int particles",
+    ),
+    "order_starts": kernel("order", "stretch", "out int bounds [7]", "out int bins [32768]"),
+    "order_fill": kernel(
+        "order", "particle", "int bin_of [particles]", "out int bins [32768]", "out int order [particles]",
+        "int particles",
+    ),
+    "field_blocks": kernel(
+        "field", "item", _FIELD_TABLE, *PLACED, *_POINTS, "real guard [readings]", "int start [scans + 1]",
+        "out real parts [readings * particles]", WINDOW, "int particles", "int readings", "int spread",
+        "ScanBatch batch",
+    ),
+    "score_field": kernel(
+        "field", "particle", _FIELD_TABLE, *PLACED, *_POINTS, *_SCANS, *_RESULT, WINDOW, "int particles",
+        "int readings", "real guard", *_SCORE, wide=True,
+    ),
+}  # fmt: skip

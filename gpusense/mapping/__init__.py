@@ -1,0 +1,1 @@
+"""Occupancy grids made from scans and poses."""

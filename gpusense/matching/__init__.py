@@ -1,0 +1,1 @@
+"""Poses of scans and local maps relative to scans and maps."""

@@ -26,6 +26,8 @@ _NAMES = {
     "learning.landmark.suspicious": ("suspicious_landmarks",),
     "localization.weights": ("Weights", "normalize_weights", "resample"),
     "logs": ("Odometry", "Scan", "read_log"),
+    "matching.match": ("match_scan",),
+    "matching.result": ("ScanMatch",),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),

@@ -23,6 +23,8 @@ from gpusense.localization.weights import resample as resample
 from gpusense.logs import Odometry as Odometry
 from gpusense.logs import Scan as Scan
 from gpusense.logs import read_log as read_log
+from gpusense.matching.match import match_scan as match_scan
+from gpusense.matching.result import ScanMatch as ScanMatch
 from gpusense.models.landmark.model import LandmarkModel as LandmarkModel
 from gpusense.models.point.absolute import HeadingModel as HeadingModel
 from gpusense.models.point.absolute import PositionModel as PositionModel

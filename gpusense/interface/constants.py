@@ -32,6 +32,8 @@ NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
 BEACON, BEACON_TERMS = 6, 13
 # Kernel file icp: numbers of the result of a match.
 MATCH_RESULT = 24
+# Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (6).
+GRADIENT_NUMBERS = 10
 
 
 def strands_in(terms: int) -> int:

@@ -41,8 +41,8 @@ def match_scan(
 
     Points of the second scan are paired with the nearest points of the reference, and moved onto the lines through
     these and their neighbours (point-to-line ICP, Censi 2008) with weights that leave out what disagrees. Space
-    that the reference did not see neither attracts nor repels. Where the scans do not agree at the end, ``"auto"`` searches
-    around the guess from many starts, and takes the pose with the best score.
+    that the reference did not see neither attracts nor repels. Where the scans do not agree at the end, ``"auto"``
+    searches around the guess from many starts, and takes the pose with the best score.
 
     Args:
         reference: (K,) readings of the earlier scan [m], or (S, K) for S matches.

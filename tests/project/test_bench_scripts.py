@@ -369,20 +369,7 @@ def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest
 
 
 def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
-    small = [
-        "--backend",
-        needs("opencl"),
-        "--size",
-        "12",
-        "--particles",
-        "40",
-        "--beams",
-        "7",
-        "--calls",
-        "3",
-        "--load",
-        "1",
-    ]
-    report = run_script("speed/whole_calls.py", *small, output=tmp_path / "small")
+    small = ["--size", "12", "--particles", "40", "--beams", "7", "--calls", "3", "--load", "1"]
+    report = run_script("speed/whole_calls.py", "--backend", needs("opencl"), *small, output=tmp_path / "small")
     assert {row["way"] for row in report["rows"]} >= {"launches alone", "log_likelihood", "bound"}
     assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])

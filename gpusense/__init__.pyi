@@ -17,6 +17,11 @@ from gpusense.learning.discrete.table import DiscreteBeamModel as DiscreteBeamMo
 from gpusense.learning.landmark.fit import fit_landmark_parameters as fit_landmark_parameters
 from gpusense.learning.landmark.result import LandmarkFit as LandmarkFit
 from gpusense.learning.landmark.suspicious import suspicious_landmarks as suspicious_landmarks
+from gpusense.learning.point.beacons import fit_beacon_parameters as fit_beacon_parameters
+from gpusense.learning.point.bumper import fit_bumper_parameters as fit_bumper_parameters
+from gpusense.learning.point.heading import fit_heading_parameters as fit_heading_parameters
+from gpusense.learning.point.position import fit_position_parameters as fit_position_parameters
+from gpusense.learning.point.result import PointFit as PointFit
 from gpusense.localization.weights import Weights as Weights
 from gpusense.localization.weights import normalize_weights as normalize_weights
 from gpusense.localization.weights import resample as resample

@@ -49,6 +49,11 @@ class PoseMode:
         score: Mean score of the end points, from 0 (all far from obstacles) to 1 (all on obstacles).
         log_likelihood: log p(z | pose, m) by the model.
         agreement: Share of the hits that agree with the expected ranges at the pose.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.PoseMode(np.array([1.0, 2.0, 0.5]), score=0.98, log_likelihood=-12.5, agreement=0.9).score
+        0.98
     """
 
     pose: Floats
@@ -73,6 +78,12 @@ class Location:
         angle: Angle between neighbouring headings [rad].
         poses: Number of poses of the grid.
         evaluated: Number of poses and blocks of poses that were evaluated.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> model = gs.LikelihoodFieldModel(gs.OccupancyGrid([[0, 100]]), gs.Scanner([0.0], 1.0), backend="numpy")
+        >>> gs.locate_scan(model, [np.inf], angle=0.5).status
+        'no match'
     """
 
     pose: Floats
@@ -127,13 +138,11 @@ def locate_scan(
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> grid = gs.worlds.building()
-        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.1, count=62, range_max=20.0)
-        >>> z = gs.RayCaster(grid, range_max=20.0, backend="numpy").cast([(5.0, 4.0, 0.7)], scanner.bearings)[0]
-        >>> model = gs.LikelihoodFieldModel(grid, scanner, backend="numpy")
-        >>> found = gs.locate_scan(model, z, resolution=0.2, angle=0.1)
-        >>> found.status, found.pose.shape
-        ('found', (3,))
+        >>> grid = gs.OccupancyGrid(np.pad(np.zeros((20, 30), int), 1, constant_values=100), resolution=0.1)
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0, 1.6, 3.1], range_max=9.0), backend="numpy")
+        >>> found = gs.locate_scan(model, [2.0, 0.8, 1.1], resolution=0.1, angle=0.2)
+        >>> found.status, found.poses, round(found.score, 1)
+        ('ambiguous', 22528, 1.0)
     """
     if not isinstance(model, LikelihoodFieldModel):
         raise TypeError(f"model: must be a LikelihoodFieldModel, got {checks.show(model)}")

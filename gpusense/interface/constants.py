@@ -30,6 +30,8 @@ NEGLIGIBLE = 40.0
 # the reading minus the bias with its low part; numbers of the mixture.
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
 BEACON, BEACON_TERMS = 6, 13
+# Kernel file ray_counts: fraction bits of a coordinate in cells.
+RAY_BITS = 12
 
 
 def strands_in(terms: int) -> int:

@@ -36,7 +36,7 @@ _DEPTH = 0.0125
 _RIVAL = 0.99
 # Poses nearer than this to a better one are part of its mode [m, rad].
 _MODE_RADIUS, _MODE_ANGLE = 0.5, math.radians(15)
-# A range agrees with the map if it is within so many sigma_hit, or cells, of the expected range.
+# A range agrees with the map within this many sigma_hit, or cells, of the expected range.
 _AGREE_SIGMAS, _AGREE_CELLS = 1.5, 3
 
 

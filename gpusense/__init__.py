@@ -31,6 +31,8 @@ _NAMES = {
     "learning.landmark.suspicious": ("suspicious_landmarks",),
     "localization.weights": ("Weights", "normalize_weights", "resample"),
     "logs": ("Odometry", "Scan", "read_log"),
+    "mapping.build": ("build_map",),
+    "matching.locate": ("Location", "PoseMode", "locate_scan"),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),

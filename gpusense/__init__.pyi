@@ -28,6 +28,10 @@ from gpusense.localization.weights import resample as resample
 from gpusense.logs import Odometry as Odometry
 from gpusense.logs import Scan as Scan
 from gpusense.logs import read_log as read_log
+from gpusense.mapping.build import build_map as build_map
+from gpusense.matching.locate import Location as Location
+from gpusense.matching.locate import PoseMode as PoseMode
+from gpusense.matching.locate import locate_scan as locate_scan
 from gpusense.models.landmark.model import LandmarkModel as LandmarkModel
 from gpusense.models.point.absolute import HeadingModel as HeadingModel
 from gpusense.models.point.absolute import PositionModel as PositionModel

@@ -30,6 +30,8 @@ NEGLIGIBLE = 40.0
 # reading minus the bias with its low part, and the bias; numbers of the mixture.
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
 BEACON, BEACON_TERMS = 7, 12
+# Kernel file ray_counts: fraction bits of a coordinate in cells.
+RAY_BITS = 12
 
 
 def strands_in(terms: int) -> int:

@@ -117,10 +117,20 @@ class SensorView(NamedTuple):
     log_missed: real
 
 
+class ScoreTable(NamedTuple):
+    """Tables of one size, one behind the other, each with a margin [cells]; see the kernel file ``search``."""
+
+    tables: int
+    rows: int
+    cols: int
+    margin: int
+
+
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {
     struct.__name__: struct
     for struct in (
         Window, Frame, Caster, RangeScale, Cone, MixtureTables, Score, ScanBatch, ReadingRules, Buckets, SensorView,
+        ScoreTable,
     )
 }  # fmt: skip
 

@@ -15,6 +15,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "score_beams": ({"LINEAR"},),
     "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),
+    "shift_scores": (set(),),
 }
 
 

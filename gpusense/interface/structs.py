@@ -117,6 +117,15 @@ class SensorView(NamedTuple):
     log_missed: real
 
 
+class ScoreTable(NamedTuple):
+    """Tables of one size, one behind the other, each with a margin [cells]; see the kernel file ``search``."""
+
+    tables: int
+    rows: int
+    cols: int
+    margin: int
+
+
 class MatchRules(NamedTuple):
     """Rules of a scan match; see the kernel file ``icp``. Distances are in metres."""
 
@@ -138,7 +147,7 @@ STRUCTS: dict[str, type[tuple[Any, ...]]] = {
     struct.__name__: struct
     for struct in (
         Window, Frame, Caster, RangeScale, Cone, MixtureTables, Score, ScanBatch, ReadingRules, Buckets, SensorView,
-        MatchRules,
+        ScoreTable, MatchRules,
     )
 }  # fmt: skip
 

@@ -10,9 +10,11 @@ from __future__ import annotations
 from gpusense.interface.signatures import (
     learning_kernels,
     map_kernels,
+    mapping_kernels,
     matching_kernels,
     point_kernels,
     scan_kernels,
+    search_kernels,
 )
 from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of
 
@@ -21,8 +23,10 @@ __all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of"]
 # Every kernel; a new room of kernels is a file of this folder.
 KERNELS: dict[str, Kernel] = {
     **map_kernels.KERNELS,
+    **mapping_kernels.KERNELS,
     **scan_kernels.KERNELS,
     **point_kernels.KERNELS,
     **learning_kernels.KERNELS,
     **matching_kernels.KERNELS,
+    **search_kernels.KERNELS,
 }

@@ -1,0 +1,324 @@
+"""Global localisation of one scan: the best pose on a grid over the whole map, by branch and bound."""
+
+from __future__ import annotations
+
+import math
+import threading
+import weakref
+from dataclasses import dataclass, field
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense._util.typing import Space
+from gpusense.backends import get_backend
+from gpusense.interface.terms import log_weight
+from gpusense.matching.score_tables import TOP, ScoreTables, quantized
+from gpusense.matching.search import Found, PoseGrid, Search
+from gpusense.models.scan.caster import RayCaster
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.models.scan.rules import BeamChoice
+from gpusense.tables.distances import distance_transform
+from gpusense.world.frames import ray_vectors
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Reading, classify
+
+Floats = NDArray[np.float64]
+Status = Literal["found", "ambiguous", "no match"]
+
+# Side of the largest block that is bounded as a whole [m], relative to the field's max_distance, and most levels.
+_BLOCK, _MOST_LEVELS = 0.8, 5
+# Poses that score lower than the best one by this share of the largest score are searched for modes.
+_DEPTH = 0.0125
+# A mode with this share of the best score is as good as the best.
+_RIVAL = 0.99
+# Poses nearer than this to a better one are part of its mode [m, rad].
+_MODE_RADIUS, _MODE_ANGLE = 0.5, math.radians(15)
+# A range agrees with the map within this many sigma_hit, or cells, of the expected range.
+_AGREE_SIGMAS, _AGREE_CELLS = 1.5, 3
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMode:
+    """A local maximum of the scores of poses.
+
+    Attributes:
+        pose: (3,) x, y and theta in the world [m, m, rad].
+        score: Mean score of the end points, from 0 (all far from obstacles) to 1 (all on obstacles).
+        log_likelihood: log p(z | pose, m) by the model.
+        agreement: Share of the hits that agree with the expected ranges at the pose.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.PoseMode(np.array([1.0, 2.0, 0.5]), score=0.98, log_likelihood=-12.5, agreement=0.9).score
+        0.98
+    """
+
+    pose: Floats
+    score: float
+    log_likelihood: float
+    agreement: float
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """The result of :func:`locate_scan`.
+
+    Attributes:
+        pose: (3,) the likeliest pose on the grid of poses: x, y and theta in the world [m, m, rad].
+        score: Mean score of the end points there, from 0 to 1.
+        log_likelihood: log p(z | pose, m) by the model.
+        agreement: Share of the hits that agree with the expected ranges at the pose.
+        modes: The pose and distinct other ones that score nearly as well, by falling score.
+        status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
+            scan.
+        resolution: Distance between neighbouring positions of the grid of poses [m].
+        angle: Angle between neighbouring headings [rad].
+        poses: Number of poses of the grid.
+        evaluated: Number of poses and blocks of poses that were evaluated.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> model = gs.LikelihoodFieldModel(gs.OccupancyGrid([[0, 100]]), gs.Scanner([0.0], 1.0), backend="numpy")
+        >>> gs.locate_scan(model, [np.inf], angle=0.5).status
+        'no match'
+    """
+
+    pose: Floats
+    score: float
+    log_likelihood: float
+    agreement: float
+    modes: tuple[PoseMode, ...] = field(repr=False)
+    status: Status
+    resolution: float
+    angle: float
+    poses: int
+    evaluated: int
+
+    @property
+    def found(self) -> bool:
+        """Whether one pose alone explains the scan."""
+        return self.status == "found"
+
+
+def locate_scan(
+    model: LikelihoodFieldModel,
+    ranges: ArrayLike,
+    *,
+    resolution: float = 0.05,
+    angle: float = 0.0175,
+    positions: Literal["free", "all"] = "free",
+    modes: int = 10,
+    min_agreement: float = 0.7,
+) -> Location:
+    """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
+
+    Positions are centres of map cells. Branch and bound (Hess et al., 2016) over integer scores finds every pose whose
+    score can belong to the largest log-likelihood; the model evaluates these. So the pose is that of brute force with
+    ``model.log_likelihood``, ties by the lowest row, then column, then heading.
+
+    A pose is only reported as ``"found"`` if the expected ranges there agree with at least ``min_agreement`` of the
+    hits, and no distinct pose is as good.
+
+    Args:
+        model: A likelihood field; its beams, parameters and device are used.
+        ranges: (K,) readings [m].
+        resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
+        angle: Angle between neighbouring headings [rad], up to a right angle; lowered to the next that divides
+            a right angle.
+        positions: ``"free"``: the robot's position must lie in a free cell; ``"all"``: anywhere on the map.
+        modes: Largest number of modes.
+        min_agreement: Least share of hits that must agree with expected ranges, from 0 to 1.
+
+    Raises:
+        TypeError: the model is not a LikelihoodFieldModel, or an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, the model has ``compat``, or no cell of the map is free.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> grid = gs.OccupancyGrid(np.pad(np.zeros((20, 30), int), 1, constant_values=100), resolution=0.1)
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0, 1.6, 3.1], range_max=9.0), backend="numpy")
+        >>> found = gs.locate_scan(model, [2.0, 0.8, 1.1], resolution=0.1, angle=0.2)
+        >>> found.status, found.poses, round(found.score, 1)
+        ('ambiguous', 22528, 1.0)
+    """
+    if not isinstance(model, LikelihoodFieldModel):
+        raise TypeError(f"model: must be a LikelihoodFieldModel, got {checks.show(model)}")
+    if model.compat is not None:
+        raise ValueError(
+            f"model: must have compat=None, since weights of peers are no likelihood, got {model.compat!r}"
+        )
+    cell = model.grid.resolution
+    stride = max(round(checks.real("resolution", resolution, above=0) / cell), 1)
+    turns = 4 * math.ceil(math.pi / 2 / checks.real("angle", angle, above=1e-4, high=math.pi / 2) - 1e-9)
+    checks.choice("positions", positions, ("free", "all"))
+    checks.integer("modes", modes, low=1)
+    checks.real("min_agreement", min_agreement, low=0, high=1)
+    grid = model.grid
+    headings = 2 * math.pi / turns * np.arange(turns)[None]
+    allowed = _allowed(grid, stride) if positions == "free" else None
+    rows, cols = (-(-size // stride) for size in grid.shape)
+    searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
+    hits, points = _end_points(model, ranges)
+    options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
+    if not len(points):
+        nothing = np.full(3, np.nan)
+        return Location(nothing, 0.0, 0.0, 0.0, (), "no match", evaluated=0, **options)  # type: ignore[arg-type]
+    place = _place_of(model, stride)
+    with place.lock:
+        slack = max(len(points), math.ceil(_DEPTH * TOP * len(points)))
+        found = place.search.find([points / cell], searched, slack=slack, allowed=allowed)
+    best = _likeliest(model, ranges, grid, searched, found, stride, len(points))
+    chosen = _modes(model, ranges, hits, place, grid, searched, found, stride, best, modes)
+    top = chosen[0]
+    return Location(
+        top.pose, top.score, top.log_likelihood, top.agreement, chosen, _status(chosen, min_agreement),
+        evaluated=found.evaluated, **options,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+class _Place:
+    """The tables of a model for searches, made on the first call."""
+
+    def __init__(self, model: LikelihoodFieldModel, stride: int) -> None:
+        self.lock = threading.Lock()
+        self.grid, self.stride = model.grid, stride
+        backend = get_backend(model.device.selection)
+        p, cell = model.parameters, model.grid.resolution
+        unknown, outside = cast(Space, model.unknown), cast(Space, model.outside)
+        obstacles = model.grid.obstacles(unknown)
+        walled = outside == "occupied"
+        obstacles = np.pad(obstacles, 1, constant_values=True) if walled else obstacles
+        distances = distance_transform(obstacles, resolution=cell, backend=backend)
+        distances = distances[1:-1, 1:-1] if walled else distances
+        shortest = min(model.grid.shape) / stride
+        levels = min(math.log2(max(_BLOCK * p.max_distance / (cell * stride), 1)), math.log2(max(shortest / 4, 1)))
+        low, high = (float(_log_density(model, np.array([d]))[0]) for d in (p.max_distance, 0.0))
+        scores = quantized(_log_density(model, np.minimum(distances, p.max_distance)), low, high)
+        self.search = Search(
+            ScoreTables(
+                backend, scores, levels=min(int(levels), _MOST_LEVELS), stride=stride, beyond=TOP if walled else 0
+            )
+        )
+        self.caster = RayCaster(model.grid, model.scanner.range_max, backend=backend, unknown=unknown, outside=outside)
+
+
+_PLACES: weakref.WeakKeyDictionary[LikelihoodFieldModel, _Place] = weakref.WeakKeyDictionary()
+
+
+def _place_of(model: LikelihoodFieldModel, stride: int) -> _Place:
+    """Return the tables of a model; a model whose map has changed has new ones."""
+    place = _PLACES.get(model)
+    if place is None or place.grid is not model.grid or place.stride != stride:
+        place = _PLACES[model] = _Place(model, stride)
+    return place
+
+
+def _log_density(model: LikelihoodFieldModel, distance: np.ndarray) -> np.ndarray:
+    """Return log densities of distances [m] to the nearest obstacle; see the kernel file ``field``."""
+    p = model.parameters
+    hit = log_weight(p.z_hit) - math.log(p.sigma_hit * math.sqrt(2 * math.pi)) - 0.5 * (distance / p.sigma_hit) ** 2
+    return np.logaddexp(hit, log_weight(p.z_rand) - math.log(model.scanner.range_max))
+
+
+def _end_points(model: LikelihoodFieldModel, ranges: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the hits that the model uses, and their (M, 2) end points on the robot [m]."""
+    scanner = model.scanner
+    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    hits = np.flatnonzero(BeamChoice.of(model.beams, scanner.count).used(classify(z, scanner) == Reading.HIT))
+    vectors = ray_vectors(scanner.bearings, scanner.mount)
+    return hits, z[hits, None] * vectors[hits] + np.array(scanner.mount[:2])
+
+
+def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
+    """Return which positions lie in free cells.
+
+    Raises:
+        ValueError: none does.
+    """
+    allowed = grid.free[::stride, ::stride]
+    if not allowed.any():
+        raise ValueError("positions: 'free' needs a position in a free cell, got none; use positions='all'")
+    return allowed
+
+
+def _to_world(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
+    """Convert (M, 3) poses in the grid's frame [cells, cells, rad] to the world, headings from -pi to pi."""
+    xy = grid._to_world(cells[:, :2] * grid.resolution)
+    theta = np.remainder(cells[:, 2] + grid.origin[2] + math.pi, 2 * math.pi) - math.pi
+    return np.column_stack([xy, theta])
+
+
+def _likeliest(
+    model: LikelihoodFieldModel,
+    ranges: ArrayLike,
+    grid: OccupancyGrid,
+    searched: PoseGrid,
+    found: Found,
+    stride: int,
+    hits: int,
+) -> int:
+    """Return the index of the likeliest pose by the model; rounding moves a score by half a step for each hit."""
+    near = found.score >= found.score[0] - hits
+    poses = _to_world(grid, searched.poses(found, stride)[near])
+    log_p = model.log_likelihood(poses, ranges)
+    index = np.flatnonzero(near)
+    likeliest = index[log_p == log_p.max()]
+    order = np.lexsort((found.heading[likeliest], found.col[likeliest], found.row[likeliest]))
+    return int(likeliest[order[0]])
+
+
+def _modes(
+    model: LikelihoodFieldModel,
+    ranges: ArrayLike,
+    hits: np.ndarray,
+    place: _Place,
+    grid: OccupancyGrid,
+    searched: PoseGrid,
+    found: Found,
+    stride: int,
+    best: int,
+    most: int,
+) -> tuple[PoseMode, ...]:
+    """Return the best pose and the other local maxima among the poses, by falling score."""
+    poses = _to_world(grid, searched.poses(found, stride))
+    left = np.ones(len(poses), bool)
+    chosen: list[int] = []
+    following: int | None = best
+    radius = max(_MODE_RADIUS, 2 * stride * grid.resolution)
+    while following is not None and len(chosen) < most:
+        chosen.append(following)
+        off = poses - poses[following]
+        turn = np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
+        left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > _MODE_ANGLE)
+        following = int(np.argmax(left)) if left.any() else None
+    log_p = model.log_likelihood(poses[chosen], ranges)
+    scale = TOP * len(hits)
+    agreement = _agreement(model, np.asarray(ranges, np.float64), hits, place.caster, poses[chosen])
+    return tuple(
+        PoseMode(poses[i], float(found.score[i]) / scale, float(log_p[n]), float(agreement[n]))
+        for n, i in enumerate(chosen)
+    )
+
+
+def _agreement(
+    model: LikelihoodFieldModel, ranges: np.ndarray, hits: np.ndarray, caster: RayCaster, poses: np.ndarray
+) -> np.ndarray:
+    """Return the share of hits whose expected range at each pose is near the reading."""
+    x, y, yaw = model.scanner.mount
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    sensors = poses + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(poses), yaw)], axis=1)
+    expected = caster.cast(sensors, model.scanner.bearings[hits])
+    tolerance = max(_AGREE_SIGMAS * model.parameters.sigma_hit, _AGREE_CELLS * model.grid.resolution)
+    share: np.ndarray = (np.abs(expected - ranges[hits]) <= tolerance).mean(axis=1)
+    return share
+
+
+def _status(modes: tuple[PoseMode, ...], min_agreement: float) -> Status:
+    """Return whether the first mode alone explains the scan."""
+    rivals = [mode for mode in modes[1:] if mode.agreement >= min_agreement and mode.score >= _RIVAL * modes[0].score]
+    if rivals:
+        return "ambiguous"
+    return "found" if modes[0].agreement >= min_agreement else "no match"

@@ -1,0 +1,17 @@
+// Cells of tables of scores, which lie one behind the other, each with a margin of cells beyond the map around it.
+
+// Columns of a run that a kernel in vectors reads at once; the margin holds one.
+#define RUN 16
+
+// Return the rows of a table with its margin.
+int padded_lines(const ScoreTable scores) { return scores.rows + 2 * scores.margin; }
+
+// Return the columns of a table with its margin.
+int padded_stride(const ScoreTable scores) { return scores.cols + 2 * scores.margin; }
+
+// Return the index of a cell in its table; cells beyond the margin have the value of the margin's outer cells.
+int cell_index(const ScoreTable scores, const int row, const int col) {
+    const int line = min(max(row, -scores.margin), scores.rows + scores.margin - 1) + scores.margin;
+    const int begin = min(max(col, -scores.margin), scores.cols + scores.margin - RUN) + scores.margin;
+    return line * padded_stride(scores) + begin;
+}

@@ -1,0 +1,119 @@
+"""Exhaustive search over poses: sums of a table's cells over the end points of a scan.
+
+For one heading the end points fall into integer cells, and the cells of all positions on the grid are the same ones,
+shifted. The score of a position is the sum of the table over the shifted cells (Olson, Real-time correlative scan
+matching, ICRA 2009). A pooled table holds the largest value of a square of positions, so that its sums are upper bounds
+of all scores in the square (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are those of
+integers: a bound is never below a score that it bounds.
+
+Tables lie one behind the other, each with a margin of cells beyond the map around it. An item is a scan at a heading;
+its points are first[item] to before first[item + 1], each in a table of its own, the image. A folded table holds every
+period-th cell of a table as an image of its own: shifts by whole periods read neighbours.
+"""
+
+import warp as wp
+
+from .prelude import kernel
+from .score_cells import ScoreTable, cell_index, padded_lines, padded_stride
+
+
+# Write the largest of each cell and those reach rows and columns on. One work-item takes a cell.
+@kernel
+def pool_scores(table: wp.array(dtype=wp.uint8), pooled: wp.array(dtype=wp.uint8), scores: ScoreTable, reach: wp.int32):
+    image, line, col = wp.tid()
+    lines = padded_lines(scores)
+    stride = padded_stride(scores)
+    if col >= stride or line >= lines or image >= scores.tables:
+        return
+    begin = image * lines * stride
+    low = begin + wp.min(line + reach, lines - 1) * stride
+    right = wp.min(col + reach, stride - 1)
+    upper = wp.max(table[begin + line * stride + col], table[begin + line * stride + right])
+    lower = wp.max(table[low + col], table[low + right])
+    pooled[begin + line * stride + col] = wp.max(upper, lower)
+
+
+# Write every period-th row and column of each padded table as an image, for each of period^2 first cells. One work-item
+# takes a cell of an image.
+@kernel
+def fold_scores(
+    table: wp.array(dtype=wp.uint8),
+    out: wp.array(dtype=wp.uint8),
+    scores: ScoreTable,
+    folded: ScoreTable,
+    period: wp.int32,
+    beyond: wp.int32,
+):
+    image, line, col = wp.tid()
+    lines = padded_lines(folded)
+    stride = padded_stride(folded)
+    if col >= stride or line >= lines or image >= folded.tables:
+        return
+    source = image // (period * period)
+    phase = image % (period * period)
+    from_line = (line - folded.margin) * period + phase // period
+    from_col = (col - folded.margin) * period + phase % period
+    rows = padded_lines(scores)
+    cols = padded_stride(scores)
+    value = wp.uint8(beyond)
+    if line >= folded.margin and col >= folded.margin and from_line < rows and from_col < cols:
+        value = table[(source * rows + from_line) * cols + from_col]
+    out[(image * lines + line) * stride + col] = value
+
+
+# Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes a
+# shift of an item.
+@kernel
+def shift_scores(
+    table: wp.array(dtype=wp.uint8),
+    point: wp.array(dtype=wp.vec2i),
+    image: wp.array(dtype=wp.int32),
+    first: wp.array(dtype=wp.int32),
+    score: wp.array(dtype=wp.int32),
+    scores: ScoreTable,
+    items: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+):
+    item, row, col = wp.tid()
+    if col >= width or row >= height or item >= items:
+        return
+    size = padded_lines(scores) * padded_stride(scores)
+    total = int(0)
+    for k in range(first[item], first[item + 1]):
+        cell = point[k]
+        total += int(table[image[k] * size + cell_index(scores, cell.y + row, cell.x + col)])
+    score[(item * height + row) * width + col] = total
+
+
+# Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift. One work-item takes
+# a candidate.
+@kernel
+def candidate_scores(
+    table: wp.array(dtype=wp.uint8),
+    point: wp.array(dtype=wp.vec2i),
+    image: wp.array(dtype=wp.int32),
+    first: wp.array(dtype=wp.int32),
+    candidate: wp.array(dtype=wp.int32),
+    score: wp.array(dtype=wp.int32),
+    scores: ScoreTable,
+    candidates: wp.int32,
+):
+    n = wp.tid()
+    if n >= candidates:
+        return
+    item = candidate[3 * n]
+    row = candidate[3 * n + 1]
+    col = candidate[3 * n + 2]
+    size = padded_lines(scores) * padded_stride(scores)
+    total = int(0)
+    for k in range(first[item], first[item + 1]):
+        cell = point[k]
+        total += int(table[image[k] * size + cell_index(scores, cell.y + row, cell.x + col)])
+    score[n] = total
+
+
+def make(name, flags):
+    """Return a kernel of the file; no flag changes one."""
+    kernels = {"pool_scores": pool_scores, "fold_scores": fold_scores}
+    return (kernels | {"shift_scores": shift_scores, "candidate_scores": candidate_scores})[name]

@@ -1,0 +1,164 @@
+"""Maps from scans: counts against a walk in fractions, log-odds, extent, options, and agreement on recorded scans."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from support.kernel_scenes import run
+
+import gpusense as gs
+from gpusense.backends import get_backend
+
+UNIT = 4096
+
+
+def fraction_cells(start, end):
+    """Return the cells of a ray in order: the next boundary by fractions of the ray, x first where they are equal."""
+    x, y = (Fraction(int(v), UNIT) for v in start)
+    dx, dy = (Fraction(int(v), UNIT) - w for v, w in zip(end, (x, y), strict=True))
+    col, row = math.floor(x), math.floor(y)
+    goal = math.floor(x + dx), math.floor(y + dy)
+    cells = [(row, col)]
+    while (col, row) != goal:
+        ways = []
+        for axis, (place, now, size, target) in enumerate(((x, col, dx, goal[0]), (y, row, dy, goal[1]))):
+            if now != target:
+                ways.append((((now + 1 if size > 0 else now) - place) / size, axis))
+        if min(ways)[1] == 0:
+            col += 1 if dx > 0 else -1
+        else:
+            row += 1 if dy > 0 else -1
+        cells.append((row, col))
+    return cells
+
+
+def rays():
+    """Return rays inside, across and outside a grid of 20 x 30 cells, along edges and through corners."""
+    rng = np.random.default_rng(4)
+    start = rng.integers(-5 * UNIT, 35 * UNIT, (150, 2))
+    end = rng.integers(-5 * UNIT, 35 * UNIT, (150, 2))
+    start[:40], end[:40] = start[:40] // UNIT * UNIT, end[:40] // UNIT * UNIT
+    end[40:60, 0] = start[40:60, 0]
+    end[60:70] = start[60:70]
+    end[70:80] = start[70:80] + rng.integers(-9, 9, (10, 1)) * UNIT
+    return start.astype(np.int32), end.astype(np.int32), rng.integers(0, 2, 150).astype(np.int32)
+
+
+def test_counts_are_those_of_a_walk_in_fractions(backend):
+    start, end, hit = rays()
+    hits, misses = np.zeros((20, 30), np.int32), np.zeros((20, 30), np.int32)
+    counted = run(
+        get_backend(backend),
+        "count_rays",
+        frozenset(),
+        (150,),
+        start,
+        end,
+        hit,
+        hits.copy(),
+        misses.copy(),
+        20,
+        30,
+        150,
+    )
+    for one in range(150):
+        cells = fraction_cells(start[one], end[one])
+        for i, (row, col) in enumerate(cells):
+            if 0 <= row < 20 and 0 <= col < 30:
+                (hits if hit[one] and i == len(cells) - 1 else misses)[row, col] += 1
+    np.testing.assert_array_equal(counted["hits"], hits)
+    np.testing.assert_array_equal(counted["misses"], misses)
+
+
+def test_a_room_is_rebuilt(backend):
+    cells = np.pad(np.zeros((30, 40), int), 1, constant_values=100)
+    cells[15, 10:14] = 100
+    origin = (5e5 + 0.05, -2e6, 0.6)
+    room = gs.OccupancyGrid(cells, 0.1, origin)
+    scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.01, count=620, range_max=10.0, mount=(0.1, 0.0, 0.3))
+    xy = room.cell_centers([5, 25, 8, 24], [6, 30, 33, 8])
+    poses = np.column_stack([xy, [0.0, 1.0, 2.0, 3.0]])
+    scans = gs.BeamModel(room, scanner, backend="numpy", precision="float64").expected_ranges(poses) + 0.02
+    built = gs.build_map(scans, poses, scanner, resolution=0.1, origin=origin, shape=(32, 42), backend=backend)
+    known = ~built.unknown
+    # A ray that grazes a wall may leave it again within these 2 cm.
+    assert (built.occupied != room.occupied)[known].mean() < 0.01
+    assert known.mean() > 0.95 and built.origin == origin
+    assert built == gs.build_map(scans, poses, scanner, resolution=0.1, origin=origin, shape=(32, 42), backend="numpy")
+
+
+def test_log_odds_add_up():
+    scanner = gs.Scanner([0.0], range_max=5.0)
+    scans, poses = [[1.05], [1.05], [2.05]], [(0.05, 0.05, 0.0)] * 3
+    options = dict(resolution=0.1, origin=(0, 0, 0), shape=(1, 30), p_hit=0.8, p_miss=0.3, p_prior=0.2)
+    cells = gs.build_map(scans, poses, scanner, backend="numpy", **options).cells[0]
+
+    def percent(hits, misses):
+        odds = 0.25 * 4.0**hits * (3 / 7) ** misses
+        return round(100 * odds / (1 + odds))
+
+    assert cells[:10].tolist() == [percent(0, 3)] * 10
+    assert cells[11] == percent(2, 1) and cells[12] == percent(0, 1) and cells[21] == percent(1, 0)
+    assert (cells[22:] == -1).all()
+
+
+def test_far_and_max_readings():
+    scanner, pose = gs.Scanner([0.0], range_max=5.0), [(0.05, 0.05, 0.0)]
+    options = dict(resolution=0.1, origin=(0, 0, 0), shape=(1, 60), backend="numpy")
+
+    def known(z, **more):
+        grid = gs.build_map([[z]], pose, scanner, **options, **more)
+        return int((~grid.unknown).sum()), int(grid.occupied.sum())
+
+    assert known(3.02) == (31, 1)
+    assert known(3.02, range_limit=2.02) == (21, 0)
+    assert known(np.inf) == (0, 0) and known(np.nan, clear_max=True) == (0, 0)
+    assert known(np.inf, clear_max=True) == (51, 0) and known(5.0, clear_max=True, range_limit=1.02) == (11, 0)
+
+
+def test_the_extent_holds_all_rays_and_progress_sees_each_launch(monkeypatch):
+    monkeypatch.setattr("gpusense.mapping.counts._SCANS", 2)
+    scanner = gs.Scanner([0.0, math.pi / 2], range_max=5.0)
+    seen = []
+    grid = gs.build_map(np.full((3, 2), 2.0), [(1, 1, 0), (-4, 7, 1), (3, 3, 2)], scanner, resolution=0.5,
+                        backend="numpy", progress=seen.append)  # fmt: skip
+    assert len(seen) == 2 and seen[-1] == grid
+    assert not (~grid.unknown)[[0, -1]].any() and not (~grid.unknown)[:, [0, -1]].any()
+    assert all(value % 0.5 == 0 for value in grid.origin[:2])
+
+
+def test_bad_arguments_are_named():
+    scanner, good = gs.Scanner([0.0], range_max=5.0), ([[1.0]], [(0, 0, 0)])
+    for options, name in [
+        ({"resolution": 0}, "resolution"), ({"origin": (0, 0, 0)}, "shape"), ({"shape": (3, 3)}, "origin"),
+        ({"origin": (0, 0, 0), "shape": (0, 3)}, "shape"), ({"p_hit": 0.5}, "p_hit"), ({"p_miss": 0.5}, "p_miss"),
+        ({"p_prior": 1}, "p_prior"), ({"range_limit": -1}, "range_limit"), ({"occupied_threshold": 0}, "occ"),
+        ({"resolution": 1e-5}, "resolution"),
+    ]:  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{name}"):
+            gs.build_map(*good, scanner, backend="numpy", **options)
+    for arguments, name in [(([[np.nan]], [(0, 0, 0)]), "scans"), (([[1.0, 2.0]], [(0, 0, 0)]), "scans"),
+                            (([[1.0]], [(0, 0)]), "poses")]:  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{name}"):
+            gs.build_map(*arguments, scanner, backend="numpy")
+    with pytest.raises(TypeError, match=r"^scanner:"):
+        gs.build_map(*good, None, backend="numpy")
+    with pytest.raises(TypeError, match=r"^clear_max:"):
+        gs.build_map(*good, scanner, backend="numpy", clear_max=1)
+
+
+def test_odd_scans_agree_with_the_map_of_the_even_ones(tmp_path, data_dir):
+    scans = list(gs.read_log(data_dir / "carmen_logs" / "intel-corrected.log.gz"))
+    even, odd, scanner = scans[::2], scans[1::8], scans[0].scanner
+    grid = gs.build_map([s.ranges for s in even], [s.pose for s in even], scanner, range_limit=20.0)
+    gs.write_map(grid, tmp_path / "map.yaml")
+    assert np.array_equal(gs.read_map(tmp_path / "map.yaml").cells, grid.cells)
+    derived = gs.read_map(data_dir / "carmen_logs" / "derived_maps" / "intel_even_05cm.yaml")
+    log_p = [
+        sum(float(model.log_likelihood(np.array([s.pose]), s.ranges)[0]) for s in odd)
+        for model in (gs.LikelihoodFieldModel(each, scanner) for each in (grid, derived))
+    ]
+    assert log_p[0] > log_p[1]

@@ -1,0 +1,125 @@
+"""Global localisation of a scan: brute force with the model, symmetrical and distant maps, scans off the map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+
+PARAMETERS = gs.LikelihoodFieldParameters(sigma_hit=0.15, max_distance=1.0)
+
+
+def house(origin=(0.0, 0.0, 0.0), *, symmetrical: bool = False) -> gs.OccupancyGrid:
+    """Return a room of 6 m x 4 m with an inner wall and a pillar, unless symmetrical; beyond the walls unknown."""
+    cells = np.full((48, 68), -1)
+    cells[3:45, 3:65] = 100
+    cells[4:44, 4:64] = 0
+    if not symmetrical:
+        cells[4:30, 40] = 100
+        cells[20:23, 12:16] = 100
+    return gs.OccupancyGrid(cells, 0.1, origin)
+
+
+SCANNER = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.05, count=81, range_max=8.0, mount=(0.1, 0.05, 0.2))
+
+
+def scan_at(grid: gs.OccupancyGrid, pose, noise: float = 0.0) -> np.ndarray:
+    """Return ranges from a robot's pose, NaN and no return among them."""
+    model = gs.BeamModel(grid, SCANNER, backend="numpy")
+    ranges = model.expected_ranges(np.array([pose]))[0] + np.random.default_rng(2).normal(0, noise, SCANNER.count)
+    ranges[5], ranges[40] = np.nan, np.inf
+    return ranges
+
+
+@pytest.mark.parametrize("positions", ["free", "all"])
+@pytest.mark.parametrize(("outside", "beams"), [("free", None), ("occupied", 30)])
+def test_the_pose_is_that_of_brute_force(backend, positions, outside, beams):
+    grid = house((2.0, -1.0, 0.4))
+    ranges = scan_at(grid, (4.0, 2.6, 1.3), 0.02)
+    model = gs.LikelihoodFieldModel(
+        grid, SCANNER, PARAMETERS, backend=backend, outside=outside, beams=beams, unknown="free"
+    )
+    found = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1, positions=positions)
+    headings = 2 * math.pi / 64 * np.arange(64)
+    rows, cols = np.mgrid[0:48:2, 0:68:2]
+    centers = grid.cell_centers(rows.ravel(), cols.ravel())
+    poses = np.array([(x, y, heading + 0.4) for x, y in centers for heading in headings])
+    log_p = model.log_likelihood(poses, ranges).reshape(*rows.shape, 64)
+    if positions == "free":
+        log_p[~grid.free[::2, ::2]] = -np.inf
+    best = poses[log_p.argmax()]
+    np.testing.assert_allclose(found.pose[:2], best[:2], atol=1e-9)
+    assert abs(math.remainder(found.pose[2] - best[2], 2 * math.pi)) < 1e-9
+    assert found.log_likelihood == pytest.approx(float(log_p.max()), abs=1e-3)
+    assert (found.poses, found.resolution) == (log_p.size, pytest.approx(0.2))
+    assert found.evaluated < 0.5 * found.poses
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e6, -4e5, -2.1)])
+def test_a_scan_is_found_wherever_the_map_lies(backend, origin):
+    grid = house(origin)
+    (truth,) = house(origin).cell_centers([33], [50])
+    pose = np.array([*truth, origin[2] + 2.0])
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend=backend)
+    found = gs.locate_scan(model, scan_at(grid, pose, 0.01), resolution=0.1, angle=0.05)
+    assert found.status == "found" and found.found
+    assert np.hypot(*(found.pose - pose)[:2]) < 0.15
+    assert abs(math.remainder(found.pose[2] - pose[2], 2 * math.pi)) < 0.05
+    assert found.score > 0.9 and found.agreement > 0.9
+    assert found.modes[0].pose is found.pose
+
+
+def test_a_symmetrical_map_has_two_modes():
+    grid = house(symmetrical=True)
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="numpy")
+    pose = np.array([1.65, 1.75, 0.3])
+    found = gs.locate_scan(model, scan_at(grid, pose), resolution=0.1, angle=0.1)
+    assert found.status == "ambiguous" and not found.found
+    other = np.array([6.8, 4.8, math.pi]) - pose * [1, 1, -1]
+    for truth in (pose, other):
+        off = [np.hypot(*(mode.pose - truth)[:2]) + abs(math.remainder(mode.pose[2] - truth[2], 2 * math.pi))
+               for mode in found.modes]  # fmt: skip
+        assert min(off) < 0.3
+
+
+def test_scans_off_the_map_and_without_readings_have_no_match():
+    grid = house()
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="numpy")
+    ragged = np.random.default_rng(1).uniform(0.5, 7.5, SCANNER.count)
+    found = gs.locate_scan(model, ragged, resolution=0.2, angle=0.1)
+    assert found.status == "no match" and found.agreement < 0.7
+    nothing = gs.locate_scan(model, np.full(SCANNER.count, np.inf), resolution=0.2, angle=0.1)
+    assert nothing.status == "no match" and np.isnan(nothing.pose).all() and nothing.modes == ()
+
+
+def test_a_changed_map_is_searched_anew():
+    grid = house()
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="numpy")
+    ranges = scan_at(grid, (2.05, 2.55, 1.0))
+    before = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
+    model.update_map(np.full((40, 1), 100), (4, 25))
+    after = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1)
+    assert before.status == "found" and after.status == "no match"
+
+
+def test_bad_arguments_are_named():
+    grid, ranges = house(), np.ones(SCANNER.count)
+    model = gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy")
+    for options, name in [
+        ({"resolution": 0}, "resolution"), ({"angle": 0}, "angle"), ({"positions": "known"}, "positions"),
+        ({"modes": 0}, "modes"), ({"min_agreement": 2}, "min_agreement"),
+    ]:  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{name}:"):
+            gs.locate_scan(model, ranges, **options)
+    with pytest.raises(ValueError, match=r"^ranges:"):
+        gs.locate_scan(model, ranges[1:])
+    with pytest.raises(TypeError, match=r"^model:"):
+        gs.locate_scan(gs.BeamModel(grid, SCANNER, backend="numpy"), ranges)
+    with pytest.raises(ValueError, match=r"^model: must have compat=None"):
+        gs.locate_scan(gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy", compat="amcl"), ranges)
+    unknown = gs.LikelihoodFieldModel(gs.OccupancyGrid(np.full((9, 9), -1)), SCANNER, backend="numpy")
+    with pytest.raises(ValueError, match=r"^positions: 'free' needs"):
+        gs.locate_scan(unknown, ranges)

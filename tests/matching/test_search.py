@@ -1,0 +1,132 @@
+"""The best poses of a grid: branch and bound against brute force, which NumPy sums here pose by pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.kernel_scenes import run
+
+from gpusense.backends import get_backend
+from gpusense.interface.structs import ScoreTable
+from gpusense.matching.score_tables import ScoreTables, field_scores, quantized
+from gpusense.matching.search import PoseGrid, Search
+
+BACKENDS = ("numpy", "opencl", "warp")
+each_backend = pytest.mark.parametrize("name", BACKENDS)
+
+
+def scene(tables: int, *, beyond: int = 0):
+    """Return tables, end points of scans (one of them without any), and start positions partly off the tables."""
+    rng = np.random.default_rng([tables, beyond])
+    scores = rng.integers(0, 256, (tables, 33, 47), np.uint8)
+    scores[:, 5:25, 10:40] //= 8
+    points = [rng.uniform(-30, 30, (count, 2)) for count in (17, 0, 300)]
+    start = np.array([[3.2, 4.9], [1.0, 1.0], [-20.5, 30.25]])
+    headings = rng.uniform(-4, 4, (3, 5))
+    return scores, points, PoseGrid(start, headings, 13, 22)
+
+
+def brute_force(scores, points, grid, stride, beyond):
+    """Return (S, A, H, W) sums, each cell looked up by itself."""
+    sums = np.zeros((len(points), grid.headings.shape[1], grid.height, grid.width), np.int64)
+    rows, cols = scores.shape[1:]
+    for s, a in np.ndindex(sums.shape[:2]):
+        table = scores[s % len(scores)]
+        cos, sin = np.cos(grid.headings[s, a]), np.sin(grid.headings[s, a])
+        for i, j in np.ndindex(sums.shape[2:]):
+            x = grid.start[s, 0] + (cos * points[s][:, 0] - sin * points[s][:, 1])
+            y = grid.start[s, 1] + (sin * points[s][:, 0] + cos * points[s][:, 1])
+            col, row = np.floor(x).astype(int) + stride * j, np.floor(y).astype(int) + stride * i
+            inside = (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
+            sums[s, a, i, j] = table[row[inside], col[inside]].sum() + beyond * np.count_nonzero(~inside)
+    return sums
+
+
+@each_backend
+@pytest.mark.parametrize(
+    ("tables", "stride", "levels", "beyond"), [(1, 1, 3, 0), (3, 1, 2, 0), (1, 2, 2, 7), (3, 3, 1, 255), (1, 1, 0, 9)]
+)
+def test_branch_and_bound_finds_the_poses_of_brute_force(name, tables, stride, levels, beyond, needs):
+    scores, points, grid = scene(tables, beyond=beyond)
+    search = Search(ScoreTables(get_backend(needs(name)), scores, levels=levels, stride=stride, beyond=beyond))
+    sums = brute_force(scores, points, grid, stride, beyond)
+    allowed = np.random.default_rng(3).random((grid.height, grid.width)) < 0.3
+    for mask in (None, allowed):
+        counted = sums if mask is None else np.where(mask, sums, -1)
+        for slack in (0, 40):
+            found = search.find(points, grid, slack=slack, allowed=mask)
+            expected = []
+            for s in range(len(points)):
+                a, i, j = np.nonzero((counted[s] >= counted[s].max() - slack) & (counted[s] >= 0))
+                order = np.lexsort((a, j, i, -counted[s][a, i, j]))
+                expected.append(np.stack([np.full(len(a), s), i, j, a, counted[s][a, i, j]], axis=1)[order])
+            got = np.stack([found.scan, found.row, found.col, found.heading, found.score], axis=1)
+            np.testing.assert_array_equal(got, np.concatenate(expected))
+            assert found.complete.all()
+            brute = search.find(points, grid, slack=slack, allowed=mask, level=0)
+            np.testing.assert_array_equal(brute.score, found.score)
+            assert brute.evaluated == grid.count
+
+
+@pytest.mark.parametrize("name", ["opencl", "warp"])
+def test_kernels_have_the_sums_of_the_reference(name, needs):
+    rng = np.random.default_rng(5)
+    shape = ScoreTable(2, 20, 31, 16)
+    # The margin holds the value of cells beyond the table.
+    table = np.full((2, 52, 63), 9, np.uint8)
+    table[:, 16:-16, 16:-16] = rng.integers(0, 256, (2, 20, 31))
+    first = np.array([0, 40, 40, 700], np.int32)
+    point = rng.integers(-60, 90, (700, 2)).astype(np.int32)
+    image = rng.integers(0, 2, 700).astype(np.int32)
+    candidate = np.stack([rng.integers(0, 3, 200), rng.integers(-9, 30, 200), rng.integers(-9, 30, 200)], 1)
+    folded = ScoreTable(18, 18, 21, 16)
+    calls = [
+        ("pool_scores", (63, 52, 2), table, np.zeros_like(table), shape, 4),
+        ("fold_scores", (53, 50, 18), table, np.zeros(18 * 50 * 53, np.uint8), shape, folded, 3, 9),
+        ("shift_scores", (21, 9, 3), table, point, image, first, np.zeros(3 * 9 * 21, np.int32), shape, 3, 9, 21),
+        ("candidate_scores", (200,), table, point, image, first, candidate.astype(np.int32),
+         np.zeros(200, np.int32), shape, 200),
+    ]  # fmt: skip
+    device = get_backend(needs(name))
+    for kernel, size, *values in calls:
+        wide = [frozenset({"WIDE"})] if kernel == "shift_scores" and name == "opencl" else []
+        expected = run(get_backend("numpy"), kernel, frozenset(), size, *values)
+        for flags in [frozenset(), *wide]:
+            got = run(device, kernel, flags, size, *values)
+            for output, numbers in expected.items():
+                np.testing.assert_array_equal(got[output], numbers, err_msg=f"{kernel} {output} {flags}")
+
+
+def test_the_best_pose_of_a_room_is_found_by_few_evaluations():
+    rows, cols = np.mgrid[:80, :100]
+    room = np.minimum(np.minimum(rows, 79 - rows), np.minimum(cols, 99 - cols)) * 0.05
+    search = Search(ScoreTables(get_backend("numpy"), field_scores(room, 0.1, 0.5), levels=3))
+    turn = np.linspace(-3, 3, 90, endpoint=False)
+    cos, sin = np.cos(turn), np.sin(turn)
+    with np.errstate(divide="ignore"):
+        ends = np.minimum(np.where(cos > 0, 59 / cos, -40 / cos), np.where(sin >= 0, 29 / sin, -50 / sin))
+    points = np.stack([ends * cos, ends * sin], axis=1)
+    grid = PoseGrid.around(np.array([[44.5, 45.5, 0.1]]), (10, 12), 8, 0.025)
+    found = search.find([points], grid)
+    pose = grid.poses(found, 1)[found.best[0]]
+    np.testing.assert_allclose(pose, (40.5, 50.5, 0.0), atol=1e-9)
+    assert found.evaluated < 0.5 * grid.count
+
+
+def test_poses_beyond_the_memory_are_dropped_and_reported(monkeypatch):
+    monkeypatch.setattr("gpusense.matching.search._MOST_KEPT", 50)
+    scores = np.zeros((20, 20), np.uint8)
+    scores[10, 10] = 200
+    search = Search(ScoreTables(get_backend("numpy"), scores, levels=2))
+    grid = PoseGrid(np.array([[0.5, 0.5]]), np.zeros((1, 1)), 20, 20)
+    found = search.find([np.zeros((1, 2))], grid, slack=255)
+    assert (found.row[0], found.col[0], found.score[0]) == (10, 10, 200)
+    assert not found.complete[0] and len(found.scan) <= 50
+
+
+def test_scores_are_rounded_by_at_most_half_a_step():
+    values = np.linspace(-3.7, 1.3, 1001)
+    scores = quantized(values, -3.7, 1.3)
+    assert scores[0] == 0 and scores[-1] == 255
+    assert np.abs(-3.7 + scores * (5 / 255) - values).max() <= 2.5 / 255 + 1e-12
+    assert not quantized(values, 1.0, 1.0).any()

@@ -28,6 +28,8 @@ _NAMES = {
     "logs": ("Odometry", "Scan", "read_log"),
     "mapping.build": ("build_map",),
     "matching.locate": ("Location", "PoseMode", "locate_scan"),
+    "matching.match_map": ("MapMatch", "match_map"),
+    "matching.pose_likelihood": ("PoseLikelihood", "pose_likelihood"),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),

@@ -35,6 +35,8 @@ _NAMES = {
     "matching.locate": ("Location", "PoseMode", "locate_scan"),
     "matching.match": ("match_scan",),
     "matching.result": ("ScanMatch",),
+    "matching.match_map": ("MapMatch", "match_map"),
+    "matching.pose_likelihood": ("PoseLikelihood", "pose_likelihood"),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),

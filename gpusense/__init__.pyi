@@ -33,6 +33,10 @@ from gpusense.matching.locate import Location as Location
 from gpusense.matching.locate import PoseMode as PoseMode
 from gpusense.matching.locate import locate_scan as locate_scan
 from gpusense.matching.match import match_scan as match_scan
+from gpusense.matching.match_map import MapMatch as MapMatch
+from gpusense.matching.match_map import match_map as match_map
+from gpusense.matching.pose_likelihood import PoseLikelihood as PoseLikelihood
+from gpusense.matching.pose_likelihood import pose_likelihood as pose_likelihood
 from gpusense.matching.result import ScanMatch as ScanMatch
 from gpusense.models.landmark.model import LandmarkModel as LandmarkModel
 from gpusense.models.point.absolute import HeadingModel as HeadingModel

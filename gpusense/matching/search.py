@@ -132,6 +132,7 @@ class Search:
         slack: int = 0,
         level: int | None = None,
         allowed: np.ndarray | None = None,
+        images: Sequence[np.ndarray] | None = None,
     ) -> Found:
         """Return the best pose of each scan, and all poses whose scores are at most ``slack`` lower.
 
@@ -142,13 +143,14 @@ class Search:
             level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: all levels
                 of the tables.
             allowed: (height, width) bool: positions that may be found. None: all.
+            images: (K_s,) table of each point. None: those of the scans.
 
         Returns:
             The poses. A scan without points scores 0 everywhere. Without an allowed position there is no pose.
         """
         level = self.tables.levels if level is None else level
         run = _Run(self, grid, slack, allowed, level)
-        run.upload(points)
+        run.upload(points, images)
         bounds = run.block_bounds()
         if level == 0:
             run.keep(*run.above(bounds, np.full(len(grid.start), -1)), final=True)
@@ -173,7 +175,7 @@ class _Run:
         self._evaluated = 0
         self._allowed = None if allowed is None else _pooled_masks(allowed, level)
 
-    def upload(self, points: Sequence[np.ndarray]) -> None:
+    def upload(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
         """Place the end points of all scans at all headings, and copy them to the device."""
         grid, tables = self._grid, self._tables
         cells = [
@@ -183,8 +185,10 @@ class _Run:
         counts = np.repeat([len(part) for part in points], self._turns)
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         flat = np.concatenate([part.reshape(-1, 2) for part in cells]) if cells else np.empty((0, 2), np.int32)
-        images = np.zeros(len(points), np.int32) if tables.shape.tables == 1 else np.arange(len(points), dtype=np.int32)
-        image = np.repeat(images, [part.shape[0] * part.shape[1] for part in cells]).astype(np.int32)
+        if images is None:
+            several = tables.shape.tables > 1
+            images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
+        image = np.concatenate([np.tile(part, self._turns) for part in images]).astype(np.int32)
         self._host = flat, image
         upload = self._space.upload
         self._points = (

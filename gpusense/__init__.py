@@ -30,7 +30,7 @@ _NAMES = {
     "learning.point.result": ("PointFit",),
     "learning.landmark.suspicious": ("suspicious_landmarks",),
     "localization.weights": ("Weights", "normalize_weights", "resample"),
-    "logs": ("Odometry", "Scan", "read_log"),
+    "logs": ("Odometry", "Scan", "check_mount", "read_log"),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),

@@ -37,8 +37,16 @@ import numpy as np
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
 from gpusense.logs.transforms import Transforms, matrix_of, planar_mount
+from gpusense.world.messages import (
+    distinct_beams,
+    laser_geometry,
+    planar_pose,
+    real_field,
+    rotation_of,
+    spread_readings,
+    stamp_of,
+)
 from gpusense.world.messages import field as field_of
-from gpusense.world.messages import laser_geometry, planar_pose, real_field, rotation_of, stamp_of
 from gpusense.world.scanner import Scanner
 
 _BASES = ("base_footprint", "base_link")
@@ -206,28 +214,17 @@ def _scanner(path: Path, bag: _Bag, range_max: float | None, mount: Pose, upside
                                    range_min=nearest, mount=mount)  # fmt: skip
         ((first, step, count, _, _),) = bag.geometries
         sign = -1 if upside_down else 1
-        return Scanner.uniform(angle_min=sign * first, angle_increment=sign * step, count=_distinct(step, count),
+        return Scanner.uniform(angle_min=sign * first, angle_increment=sign * step, count=distinct_beams(step, count),
                                range_max=farthest, range_min=nearest, mount=mount)  # fmt: skip
-
-
-def _distinct(step: float, count: int) -> int:
-    """Return the number of beams without a last one that points where the first does."""
-    return count - 1 if count > 2 and abs(abs(step) * (count - 1) - 2 * math.pi) < 0.5 * abs(step) else count
 
 
 def _readings(message: object, scanner: Scanner, common: bool, upside_down: bool) -> Floats:
     """Return the readings of a scan for its scanner; read-only."""
-    raw = np.array(field_of("message", message, "ranges"), np.float64)
-    raw[raw == 0] = math.nan
-    if not common:
-        ranges = raw[: scanner.count]
+    if common:
+        ranges = spread_readings(message, scanner.count, upside_down)
     else:
-        first, step = (real_field("message", message, name) for name in ("angle_min", "angle_increment"))
-        raw = raw[: _distinct(step, len(raw))]
-        bearings = (first + step * np.arange(len(raw))) * (-1 if upside_down else 1)
-        places = np.rint((bearings + math.pi) / (2 * math.pi) * scanner.count).astype(np.int64) % scanner.count
-        ranges = np.full(scanner.count, math.nan)
-        ranges[places] = raw
+        ranges = np.array(field_of("message", message, "ranges"), np.float64)[: scanner.count]
+    ranges[ranges == 0] = math.nan
     ranges.setflags(write=False)
     return ranges
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpusense._util import checks
 
@@ -88,6 +89,28 @@ def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
         raise ValueError(f"{name}.orientation: {rule}, got a tilt of {math.degrees(math.acos(rotation[2, 2])):.3g} deg")
     x, y = (real_field(name, pose, f"position.{axis}") for axis in "xy")
     return x, y, math.atan2(rotation[1, 0], rotation[0, 0])
+
+
+def distinct_beams(step: float, count: int) -> int:
+    """Return the number of beams without a last one that points where the first one does."""
+    return count - 1 if count > 2 and abs(abs(step) * (count - 1) - 2 * math.pi) < 0.5 * abs(step) else count
+
+
+def spread_readings(message: object, places: int, upside_down: bool = False) -> NDArray[np.float64]:
+    """Return the readings of a ``sensor_msgs/LaserScan`` on evenly spaced bearings all round; NaN between them.
+
+    Args:
+        message: The scan.
+        places: Number of bearings, from -pi on; each reading takes the nearest one.
+        upside_down: Whether the beams run clockwise.
+    """
+    raw = np.array(field("message", message, "ranges"), np.float64)
+    first, step = (real_field("message", message, name) for name in ("angle_min", "angle_increment"))
+    raw = raw[: distinct_beams(step, len(raw))]
+    bearings = (first + step * np.arange(len(raw))) * (-1 if upside_down else 1)
+    ranges: NDArray[np.float64] = np.full(places, math.nan)
+    ranges[np.rint((bearings + math.pi) / (2 * math.pi) * places).astype(np.int64) % places] = raw
+    return ranges
 
 
 def laser_geometry(message: object) -> dict[str, Any]:

@@ -37,6 +37,7 @@ _NAMES = {
     "matching.result": ("ScanMatch",),
     "matching.match_map": ("MapMatch", "match_map"),
     "matching.pose_likelihood": ("PoseLikelihood", "pose_likelihood"),
+    "logs": ("Odometry", "Scan", "check_mount", "read_log"),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),

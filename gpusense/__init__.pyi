@@ -27,6 +27,7 @@ from gpusense.localization.weights import normalize_weights as normalize_weights
 from gpusense.localization.weights import resample as resample
 from gpusense.logs import Odometry as Odometry
 from gpusense.logs import Scan as Scan
+from gpusense.logs import check_mount as check_mount
 from gpusense.logs import read_log as read_log
 from gpusense.mapping.build import build_map as build_map
 from gpusense.matching.locate import Location as Location

@@ -366,3 +366,14 @@ def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest
         cases = [case for peer in ("amcl", "beluga") for case in script.cases(peer)]
         assert [(case.model, case.peer.name) for case in cases] == [(s["model"], s["peer"]) for s in one["scores"]]
         assert [case.field.to_dict() for case in cases] == [s["field"] for s in one["scores"]]
+
+
+def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
+    report = run_script(
+        "studies/global_matching.py", "--data", str(data_dir), "--backend", needs("opencl"), "--part", "window",
+        "--part", "olin", "--scans", "2", "--repeats", "1", output=tmp_path / "matching",
+    )  # fmt: skip
+    assert [row["level"] for row in report["window"]] == [0, 1, 2, 3]
+    assert report["window"][0]["evaluated"] == 1 > report["window"][3]["evaluated"]
+    (olin,) = report["olin"]
+    assert olin["right"] == 1 and olin["found_wrong"] == 0

@@ -153,7 +153,7 @@ class Search:
         run.upload(points, images)
         bounds = run.block_bounds()
         if level == 0:
-            run.keep(*run.above(bounds, np.full(len(grid.start), -1)), final=True)
+            run.keep_all(bounds)
         else:
             run.descend_best(bounds)
             run.descend_all(bounds)
@@ -309,10 +309,14 @@ class _Run:
         np.maximum.at(self._best, candidates[:, 0] // self._turns, score)
         np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
 
-    def keep(self, candidates: np.ndarray, score: np.ndarray, *, final: bool = False) -> None:
+    def keep_all(self, scores: np.ndarray) -> None:
+        """Keep the best of all poses of each scan."""
+        self._best = scores.reshape(len(self._best), -1).max(axis=1, initial=-1).astype(np.int64)
+        self._floor = np.where(self._best >= 0, self._best - self._slack, -1)
+        self.keep(*self.above(scores, self._floor))
+
+    def keep(self, candidates: np.ndarray, score: np.ndarray) -> None:
         """Keep poses that reach the floor; with too many of them, raise the floor."""
-        if final:
-            self._raise(candidates, score)
         reached = score >= self._floor[candidates[:, 0] // self._turns]
         self._kept.append((candidates[reached], score[reached]))
         if sum(len(part) for _, part in self._kept) > _MOST_KEPT:

@@ -9,6 +9,7 @@ from gpusense.plots.drawing import (
     save,
 )
 from gpusense.plots.localization import localization_figure
+from gpusense.plots.matches import match_figure
 from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
 from gpusense.plots.positions import (
     draw_beacons,
@@ -32,6 +33,7 @@ __all__ = [
     "draw_scan",
     "draw_solution_set",
     "localization_figure",
+    "match_figure",
     "new_figure",
     "pose_lattice",
     "position_log_density",

@@ -30,7 +30,6 @@ _NAMES = {
     "learning.point.result": ("PointFit",),
     "learning.landmark.suspicious": ("suspicious_landmarks",),
     "localization.weights": ("Weights", "normalize_weights", "resample"),
-    "logs": ("Odometry", "Scan", "read_log"),
     "mapping.build": ("build_map",),
     "matching.locate": ("Location", "PoseMode", "locate_scan"),
     "matching.match": ("match_scan",),

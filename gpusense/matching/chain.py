@@ -17,7 +17,7 @@ from gpusense.matching.uncertainty import Uncertainty, statuses, symmetric, unce
 
 # A score below this starts a search of the window, and a score below the second one, far from the guess, a search
 # nearby: far is in capture radii and rad.
-_DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
+DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
 # Starts of a search that are refined, and how far apart they are: m and rad, at a capture radius of 1 m.
 _REFINED, _APART, _TURNED = 6, 0.1, 0.05
 # Penalties of a score: for a distance of a capture radius from the guess, and for a last step that was not small.
@@ -67,7 +67,7 @@ def match_pairs(
         best = Best(result, np.full((len(pairs), 3), np.nan))
         if method == "auto":
             enough = points.counts[pairs].min(axis=1) > 2
-            poor = enough & (result[:, 3] < _DOUBTFUL)
+            poor = enough & (result[:, 3] < DOUBTFUL)
             moved = np.abs(result[:, :3] - sensor)
             far = (moved[:, :2].max(axis=1) > _FAR * options.capture) | (moved[:, 2] > _FAR_TURN)
             for some, reach in (

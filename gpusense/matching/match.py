@@ -1,4 +1,4 @@
-"""Match a scan to an earlier scan: the pose of the second in the frame of the first."""
+"""Match a scan to an earlier scan or to a map: the pose of the second in the frame of the first, or in the world."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from gpusense.matching.chain import match_pairs
 from gpusense.matching.options import check_guess, check_options
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
+from gpusense.matching.scan_map import match_by_maps
+from gpusense.matching.to_map import match_to_map
 from gpusense.models.arguments import real_dtype
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
-METHODS = ("auto", "icp")
+METHODS = ("auto", "icp", "gauss_newton", "correlative")
 
-Method = Literal["auto", "icp"]
+Method = Literal["auto", "icp", "gauss_newton", "correlative"]
 
 
 def match_scan(
@@ -37,19 +39,24 @@ def match_scan(
     capture: float = 1.0,
     window: ArrayLike = (1.2, 1.05),
 ) -> ScanMatch:
-    """Return the pose of a scan in the frame of an earlier scan.
+    """Return the pose of a scan in the frame of an earlier scan, or in a map.
 
     Points of the second scan are paired with the nearest points of the reference, and moved onto the lines through
     these and their neighbours (point-to-line ICP, Censi 2008) with weights that leave out what disagrees. Space
     that the reference did not see neither attracts nor repels. Where the scans do not agree at the end, ``"auto"``
-    searches around the guess from many starts, and takes the pose with the best score.
+    searches around the guess from many starts, and takes the pose with the best score. In a map, the
+    reference is the scan that is expected at the guess, and then at the pose found; where that fails, the whole window
+    is searched.
 
     Args:
-        reference: (K,) readings of the earlier scan [m], or (S, K) for S matches.
+        reference: (K,) readings of the earlier scan [m], or (S, K) for S matches; or a map.
         ranges: (K,) readings of the second scan, or (S, K) for S matches in one call.
         scanner: The scanner of both; its mount is the sensor's pose on the robot.
-        guess: (3,) or (S, 3) pose of the second robot frame in the first one [m, m, rad].
-        method: ``"icp"`` from the guess alone, or ``"auto"``, which searches where that fails.
+        guess: (3,) or (S, 3) pose of the second robot frame in the first one, or in the world [m, m, rad].
+        method: ``"auto"``, the chain: from the guess, with a search where that fails. ``"icp"``: point-to-line ICP
+            from the guess alone, between scans. ``"gauss_newton"``: damped steps on likelihood fields of the map, or of
+            a map of the reference scan, from coarse to fine. ``"correlative"``: the best of all poses on a grid in the
+            window, without refinement, by branch and bound.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight.
@@ -79,6 +86,12 @@ def match_scan(
     device = get_backend(backend)
     real = real_dtype(precision, device)
     second = readings("ranges", ranges, scanner, device)
+    if isinstance(reference, OccupancyGrid):
+        if method == "icp":
+            raise ValueError("method: 'icp' needs a scan as reference, got a map: use 'gauss_newton'")
+        poses = check_guess(guess, None if second.ndim == 1 else len(second), np.inf)
+        matches = match_to_map(reference, np.atleast_2d(second), scanner, poses, method, device, precision, options)
+        return matches[0] if second.ndim == 1 else matches
     first = readings("reference", reference, scanner, device)
     single = first.ndim == 1 and second.ndim == 1
     first, second = np.atleast_2d(first), np.atleast_2d(second)
@@ -86,6 +99,9 @@ def match_scan(
         rule = f"must be one scan, or as many as ranges has, {len(second)}"
         raise ValueError(f"reference: {rule}, got {len(first)}")
     poses = check_guess(guess, None if single else len(second))
+    if method in ("gauss_newton", "correlative") and len(second):
+        matches = match_by_maps(first, second, scanner, poses, method, device, precision, options)
+        return matches[0] if single else matches
     points = scan_points(np.concatenate([first, second]), scanner, real)
     pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
     matches = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])

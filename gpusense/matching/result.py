@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +74,35 @@ class ScanMatch:
             raise TypeError("a single match has no items")
         values = {field.name: getattr(self, field.name)[index] for field in fields(self)}
         return ScanMatch(**values | {"status": str(values["status"])})
+
+    @classmethod
+    def joined(cls, matches: list[ScanMatch]) -> ScanMatch:
+        """Return the matches of several calls as one, in their order; at least one."""
+        return cls(**{f.name: np.concatenate([getattr(match, f.name) for match in matches]) for f in fields(cls)})
+
+    def moved(self, frame: Floats) -> ScanMatch:
+        """Return S matches in the frame in which the reference's robot frames are at (S, 3) poses."""
+        c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
+        x, y, theta = self.pose.T
+        turn = (theta + frame[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        pose = np.stack([frame[:, 0] + c * x - s * y, frame[:, 1] + s * x + c * y, turn], axis=1)
+        zero, one = np.zeros(len(c)), np.ones(len(c))
+        turned = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+        lost = np.isinf(self.covariance)
+        finite = turned @ np.where(lost, 0, self.covariance) @ turned.transpose(0, 2, 1)
+        # The signs of infinite parts, and no trace of rounding.
+        part = turned @ np.where(lost, np.sign(self.covariance), 0) @ turned.transpose(0, 2, 1)
+        covariance = np.where(np.abs(part) > 1e-3, np.copysign(np.inf, part), finite)
+        directions = self.directions @ turned.transpose(0, 2, 1)
+        return replace(self, pose=pose, covariance=covariance, directions=directions)
+
+    def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
+        """Return S matches with the chosen ones of others in place of some rows."""
+        values = {}
+        for field in fields(self):
+            values[field.name] = np.array(getattr(self, field.name))
+            values[field.name][rows[chosen]] = getattr(others, field.name)[chosen]
+        return ScanMatch(**values)
 
     def explain(self) -> str:
         """Return status and its meaning, for one match or counted over many."""

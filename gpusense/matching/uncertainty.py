@@ -73,18 +73,37 @@ def uncertainty(
         lever: (S,) length by which headings are multiplied [m].
     """
     sigma, factor = noise_of(squared / scale**2)
-    variance = (sigma * scale) ** 2
+    doubted = doubt * ((sigma * scale) ** 2)[:, None, None]
+    return spread(information, doubted, _SHARED * factor * scale**2, pairs, lever, np.full(len(lever), _LEAST_PAIRS))
+
+
+def spread(
+    information: np.ndarray,
+    doubted: np.ndarray,
+    variance: np.ndarray,
+    pairs: np.ndarray,
+    lever: np.ndarray,
+    least: np.ndarray,
+) -> Uncertainty:
+    """Return covariances, eigenvalues and observed directions of (S, 3, 3) sums of w J J'.
+
+    Args:
+        information: The sums.
+        doubted: The part of them that errors of the lines make up.
+        variance: (S,) factor of the inverse [m^2].
+        pairs: (S,) sums of weights.
+        lever: (S,) length by which headings are multiplied [m].
+        least: (S,) least eigenvalue of an observed direction.
+    """
     balance = np.stack([np.ones_like(lever), np.ones_like(lever), 1 / lever], axis=1)
-    balanced = information * balance[:, :, None] * balance[:, None, :]
-    doubted = doubt * variance[:, None, None] * balance[:, :, None] * balance[:, None, :]
-    values, vectors = np.linalg.eigh(balanced - doubted)
-    spurious = np.einsum("sik,sij,sjk->sk", vectors, doubted, vectors)
-    observed = values > np.maximum(_LEAST_PAIRS, _LEAST_RATIO * spurious)
+    both = balance[:, :, None] * balance[:, None, :]
+    values, vectors = np.linalg.eigh((information - doubted) * both)
+    spurious = np.einsum("sik,sij,sjk->sk", vectors, doubted * both, vectors)
+    observed = values > np.maximum(least[:, None], _LEAST_RATIO * spurious)
     inverse = np.where(observed, 1 / np.where(observed, values, 1), 0)
     # To meters and radians.
     axes = vectors * balance[:, :, None]
-    scaled = (_SHARED * factor * scale**2)[:, None] * inverse
-    covariance = np.einsum("sik,sk,sjk->sij", axes, scaled, axes)
+    covariance = np.einsum("sik,sk,sjk->sij", axes, variance[:, None] * inverse, axes)
     lost = np.where(observed[:, None, :], 0.0, vectors)
     covariance += _infinite(np.einsum("sik,sjk->sij", lost, lost))
     shares = np.clip(values / np.maximum(pairs, 1)[:, None], 0, None)

@@ -376,13 +376,13 @@ def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest
         assert [case.field.to_dict() for case in cases] == [s["field"] for s in one["scores"]]
 
 
-<<<<<<< HEAD
 def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
     small = ["--size", "12", "--particles", "40", "--beams", "7", "--calls", "3", "--load", "1"]
     report = run_script("speed/whole_calls.py", "--backend", needs("opencl"), *small, output=tmp_path / "small")
     assert {row["way"] for row in report["rows"]} >= {"launches alone", "log_likelihood", "bound"}
     assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])
-=======
+
+
 def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script(
         "studies/global_matching.py", "--data", str(data_dir), "--backend", needs("opencl"), "--part", "window",
@@ -392,4 +392,3 @@ def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_p
     assert report["window"][0]["evaluated"] == 1 > report["window"][3]["evaluated"]
     (olin,) = report["olin"]
     assert olin["right"] == 1 and olin["found_wrong"] == 0
->>>>>>> match2

@@ -322,6 +322,14 @@ def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_p
         assert row["filter"]["error_median"] < 0.2
 
 
+def test_offsets_of_beacons_run(data_dir: Path, tmp_path: Path) -> None:
+    arguments = ("--data", str(data_dir), "--set", "simulated")
+    report = run_script("studies/beacon_offsets.py", *arguments, output=tmp_path / "beacon_offsets")
+    (found,) = report["sets"]
+    none, common, each = found["rows"]
+    assert each["nees"] < 3 < each["raw"] and each["held_out"] > common["held_out"] > none["held_out"]
+
+
 def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
     arguments = ["--figures", str(tmp_path / "drawn"), "--most", "64"]
     report = run_script("accuracy/discrete_convergence.py", *arguments, output=tmp_path / "discrete")

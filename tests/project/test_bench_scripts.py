@@ -381,3 +381,11 @@ def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script("speed/whole_calls.py", "--backend", needs("opencl"), *small, output=tmp_path / "small")
     assert {row["way"] for row in report["rows"]} >= {"launches alone", "log_likelihood", "bound"}
     assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])
+
+
+def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """Generated buildings alone, which need no data."""
+    arguments = ["--matches", "6", "--backend", needs("opencl")]
+    report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
+    assert len(report["rows"]) == 6
+    assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])

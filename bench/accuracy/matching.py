@@ -6,8 +6,8 @@ Rows "pairs": the sets of ``matching_pairs`` (300 pairs each; truth from reflect
 odometry's guess, without a guess, and from the reference +-0.5 m and +-10 degrees. Rows "simulated": exact and noisy
 scans of neighbouring poses in six maps, from guesses with such errors. Rows "map": odd scans of logs in the maps of
 their even ones, from such guesses. A match is wrong beyond 0.2 m or 5 degrees. Times are those of one call with all
-matches, the best of three, after a call that compiles; processor times are summed over cores. NEES is the squared error
-by the predicted covariance over 3: 1 in the mean if the covariance is right.
+matches, the best of ``--repeats``, after a call that compiles; processor times are summed over cores. NEES is the
+squared error by the predicted covariance over 3: 1 in the mean if the covariance is right.
 """
 
 from __future__ import annotations
@@ -36,10 +36,13 @@ LOGS = ("intel", "freiburg-079", "csail", "aces")
 REAL_MAPS = ("depot", "levinelobby", "basement_hallways_5cm")
 
 
+REPEATS = 3
+
+
 def timed(call: Any) -> tuple[ScanMatch, float, float]:
-    """Return the result of a call, and its best wall and processor time of three [s]."""
+    """Return the result of a call, and its best wall and processor time of some repeats [s]."""
     match, wall, processor = call(), np.inf, np.inf
-    for _ in range(3):
+    for _ in range(REPEATS):
         begun, used = time.perf_counter(), time.process_time()
         match = call()
         wall, processor = min(wall, time.perf_counter() - begun), min(processor, time.process_time() - used)
@@ -133,7 +136,7 @@ def match_noisy(first: np.ndarray, second: np.ndarray, guess: np.ndarray, noise:
 
 def in_maps(data: Path, backend: str, limit: int, seed: int) -> list[dict[str, Any]]:
     """Return the rows of odd scans of logs in the maps of their even ones."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name in LOGS:
         grid, numbered = odd_scans(data, name, limit)
         chosen = [scan for _, scan in numbered]
@@ -153,7 +156,10 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--recorded", type=Path, help="folder of recorded data; without it generated buildings alone")
     parser.add_argument("--matches", type=int, default=300, help="most matches of a row (default: %(default)s)")
+    parser.add_argument("--repeats", type=int, default=3, help="timed calls of each row (default: %(default)s)")
     arguments: argparse.Namespace = parse(parser, argv)
+    global REPEATS
+    REPEATS = arguments.repeats
     data, backend, most = arguments.recorded, arguments.backend, arguments.matches
     rows = [] if data is None else recorded(data, backend, most)
     rows += simulated(data, backend, most, arguments.seed)

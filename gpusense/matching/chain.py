@@ -18,6 +18,8 @@ from gpusense.matching.uncertainty import Uncertainty, statuses, symmetric, unce
 # A score below this starts a search of the window, and a score below the second one, far from the guess, a search
 # nearby: far is in capture radii and rad.
 DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
+# Guesses that are farther than this from the result, in capture radii and rad, are poor.
+_NEAR, _NEAR_TURN = 0.1, 0.05
 # Starts of a search that are refined, and how far apart they are: m and rad, at a capture radius of 1 m.
 _REFINED, _APART, _TURNED = 6, 0.1, 0.05
 # Penalties of a score: for a distance of a capture radius from the guess, and for a last step that was not small.
@@ -77,6 +79,7 @@ def match_pairs(
                 if some.any():
                     which = np.flatnonzero(some)
                     _search(device, which, sensor[which], reach, best, options, most, points.gap)
+            _repeat(device, sensor, best, options, most, points.gap)
         space.wait()
     return _finished(best, points.rms_range(pairs[:, 1]), options, mount)
 
@@ -114,6 +117,18 @@ def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> floa
     """Return what a result loses of its score by its distance from the guess, and by not having converged."""
     distance = float(np.hypot(*(result[:2] - guess[:2]))) / options.capture
     return _FARTHER * distance + _UNSETTLED * float(result[5] == 0)
+
+
+def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, most: int, gap: float) -> None:
+    """Match pairs again from their results where the guess was poor: the way to a result may have ended nearby."""
+    moved = np.abs(best.result[:, :3] - guess)
+    rows = np.flatnonzero((moved[:, :2].max(axis=1) > _NEAR * options.capture) | (moved[:, 2] > _NEAR_TURN))
+    if len(rows):
+        again = device.run(rows, best.result[rows, None, :3], options.rules(most, gap))[:, 0]
+        better = (
+            again[:, 3] + _UNSETTLED * again[:, 5] > best.result[rows, 3] + _UNSETTLED * best.result[rows, 5] - 1e-3
+        )
+        best.result[rows[better]] = again[better]
 
 
 def nearby(options: MatchOptions) -> np.ndarray:

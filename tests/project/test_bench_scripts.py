@@ -400,3 +400,11 @@ def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_p
     assert report["window"][0]["evaluated"] == 1 > report["window"][3]["evaluated"]
     (olin,) = report["olin"]
     assert olin["right"] == 1 and olin["found_wrong"] == 0
+
+
+def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """Generated buildings alone, which need no data."""
+    arguments = ["--matches", "6", "--backend", needs("opencl")]
+    report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
+    assert len(report["rows"]) == 6
+    assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])

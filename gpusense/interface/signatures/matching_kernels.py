@@ -14,7 +14,7 @@ KERNELS: dict[str, Kernel] = {
         "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "int start [scans + 1]",
         "real constant_terms [scans]", f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
-        "Score score", "ScanBatch batch",
+        "Score score", "ScanBatch batch", wide=True,
     ),
     "fit_lines": kernel(
         "icp", "beam scan", *_POINTS, "out real4 line [points]", "int scans", "int points", "int reach", "int most",

@@ -6,6 +6,7 @@ import numpy as np
 
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import GRADIENT_NUMBERS
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import launch
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.run import Piece, run_pieces
@@ -53,8 +54,9 @@ class _Gradient:
         numbers = space.empty("gradient", GRADIENT_NUMBERS * piece.count, pipeline.real)
         resolution = pipeline.grid.resolution
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
+        flags = (pipeline.components | readings.flags) - _OTHERS
         gradient = launch(
-            "field_gradient", (pipeline.components | readings.flags) - _OTHERS, (piece.count,), table=table,
+            "field_gradient", widened(backend.info.lanes, "field_gradient", flags), (piece.count,), table=table,
             pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, point=readings.arguments["point"],
             point_low=readings.arguments["point_low"], terms=pipeline.terms, start=readings.arguments["start"],
             constant_terms=readings.sums["constant_terms"], gradient=numbers, window=placed.frame.window,

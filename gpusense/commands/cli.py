@@ -14,7 +14,9 @@ from typing import NoReturn
 from gpusense._version import __version__
 
 # Modules of gpusense.commands, in the order of the help.
-COMMANDS = ("devices", "selftest", "demo", "map", "score", "fit", "likelihood-map", "landmarks", "bench")
+COMMANDS = (
+    "devices", "selftest", "demo", "map", "score", "fit", "match", "likelihood-map", "landmarks", "bench",
+)  # fmt: skip
 
 BAD_INPUT = 2
 INTERRUPTED = 130

@@ -26,12 +26,16 @@ MIXTURE_TERMS = 14
 NEARBY, SERIES, VON_MISES = 0, 1, 2
 WRAPS, WAVES = 3, 6
 NEGLIGIBLE = 40.0
-# Kernel file beacons: distributions of a range; numbers of a beacon: its place (x, its low part, y, its low part), and
-# the reading minus the bias with its low part; numbers of the mixture.
+# Kernel file beacons: distributions of a range; numbers of a beacon: its place (x, its low part, y, its low part), the
+# reading minus the bias with its low part, and the bias; numbers of the mixture.
 NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
-BEACON, BEACON_TERMS = 6, 13
+BEACON, BEACON_TERMS = 7, 12
 # Kernel file ray_counts: fraction bits of a coordinate in cells.
 RAY_BITS = 12
+# Kernel file icp: numbers of the result of a match.
+MATCH_RESULT = 24
+# Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (6).
+GRADIENT_NUMBERS = 10
 
 
 def strands_in(terms: int) -> int:

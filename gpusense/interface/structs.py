@@ -126,11 +126,28 @@ class ScoreTable(NamedTuple):
     margin: int
 
 
+class MatchRules(NamedTuple):
+    """Rules of a scan match; see the kernel file ``icp``. Distances are in metres."""
+
+    iterations: int
+    stride: int
+    score_stride: int
+    thin: int
+    capture: real
+    least_capture: real
+    scale: real
+    least_scale: real
+    shrink: real
+    gap: real
+    near: real
+    tolerance: real
+
+
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {
     struct.__name__: struct
     for struct in (
         Window, Frame, Caster, RangeScale, Cone, MixtureTables, Score, ScanBatch, ReadingRules, Buckets, SensorView,
-        ScoreTable,
+        ScoreTable, MatchRules,
     )
 }  # fmt: skip
 

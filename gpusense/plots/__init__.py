@@ -9,6 +9,7 @@ from gpusense.plots.drawing import (
     save,
 )
 from gpusense.plots.localization import localization_figure
+from gpusense.plots.matches import match_figure
 from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
 from gpusense.plots.pose_maps import (
     draw_likelihood_field,
@@ -41,6 +42,7 @@ __all__ = [
     "draw_scan_field",
     "draw_solution_set",
     "localization_figure",
+    "match_figure",
     "new_figure",
     "pose_lattice",
     "pose_likelihood_figure",

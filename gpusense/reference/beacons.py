@@ -17,12 +17,13 @@ from gpusense.reference.error_free import Pair, add_term, pair_product, pair_sum
 from gpusense.reference.log_terms import bounded_square, either
 from gpusense.reference.offsets import distance_pair, offset
 
-# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
-# peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
+# A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
+# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max; for two normals, scale and peak of
+# the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
 # of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
-SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, RANGE_MAX, BIAS = range(7)
-WIDE_SCALE, WIDE_SCALE_LOW, WIDE_PEAK, WIDE_PEAK_LOW = range(7, 11)
-OFFSET, OFFSET_LOW, POWER, T_SCALE, ARC, ODD = range(7, 13)
+SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, RANGE_MAX = range(6)
+WIDE_SCALE, WIDE_SCALE_LOW, WIDE_PEAK, WIDE_PEAK_LOW = range(6, 10)
+OFFSET, OFFSET_LOW, POWER, T_SCALE, ARC, ODD = range(6, 12)
 # From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
 STEEPEST = 1e18
 
@@ -66,7 +67,7 @@ def log_range(
     """Return log p of one range at each distance."""
     r = two_sum(d[0], -beacon[4])
     r = two_sum(r[0], r[1] + (d[1] - beacon[5]))
-    near = np.clip(d[0] + terms[BIAS], 0, terms[RANGE_MAX])
+    near = np.clip(d[0] + beacon[6], 0, terms[RANGE_MAX])
     far = terms[RANGE_MAX] - near
     if kind == STUDENT_T:
         log_p = log_student_t(r, near, far, terms, series)

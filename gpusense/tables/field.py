@@ -12,8 +12,8 @@ from gpusense.interface.terms import log_weight
 from gpusense.tables.cells import check_size
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
 from gpusense.world.compat import OVERLAID, Beluga, Peer
+from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import LikelihoodFieldParameters
-from gpusense.world.peer_weights import Likelihood
 from gpusense.world.windows import Window
 
 # Width of the ring around the window whose cells stand for space outside the grid [cells].

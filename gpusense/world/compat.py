@@ -46,8 +46,9 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.world.peer_weights import BeamWeights, FieldWeights, Likelihood
+from gpusense.world.peer_weights import BeamWeights, FieldWeights
 from gpusense.world.scanner import Scanner
 
 _OCCUPIED, _UNKNOWN = 100, -1

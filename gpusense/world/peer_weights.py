@@ -1,15 +1,11 @@
-"""Parameters of the models of nav2_amcl and Beluga, and the rules of likelihoods, which their weights replace."""
+"""Parameters of the models of nav2_amcl and Beluga."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import numpy as np
-
-from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.world.scanner import Scanner
 
 
 @dataclass(frozen=True)
@@ -47,75 +43,3 @@ class FieldWeights(LikelihoodFieldParameters):
     max_distance: float = 2.0
 
     _sum_is_one: ClassVar[bool] = False
-
-
-@dataclass(frozen=True)
-class Likelihood:
-    """The book's likelihoods: the rules of models without ``compat``.
-
-    Attributes:
-        name: None.
-        beam: Default parameters of the beam model.
-        field: Default parameters of the likelihood field.
-        constant_term: First term of the beam model's sum over readings.
-        field_constant: First term of the likelihood field's sum over readings.
-        outside: ``"free"`` or ``"occupied"``: state of space outside the grid for the beam model.
-        unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
-        caster: Default caster of the beam model.
-        is_peer: Whether weights are those of a peer.
-        cubes: Whether the likelihood field sums cubes of densities, in place of logarithms.
-        overlaid: Whether the likelihood field has cells of a fixed density.
-        neighbors: Cells around a cell on which its state in a mask depends.
-    """
-
-    name: ClassVar[Any] = None
-    beam: ClassVar[BeamParameters] = BeamParameters()
-    field: ClassVar[LikelihoodFieldParameters] = LikelihoodFieldParameters()
-    constant_term: ClassVar[float] = 0.0
-    outside: ClassVar[str] = "free"
-    unknown: ClassVar[str] = "free"
-    caster: ClassVar[str] = "exact"
-    is_peer: ClassVar[bool] = False
-
-    @property
-    def cubes(self) -> bool:
-        """See the attributes of the class."""
-        return False
-
-    @property
-    def field_constant(self) -> float:
-        """See the attributes of the class."""
-        return 1.0 if self.cubes else 0.0
-
-    @property
-    def overlaid(self) -> bool:
-        """See the attributes of the class."""
-        return False
-
-    @property
-    def neighbors(self) -> int:
-        """See the attributes of the class."""
-        return 0
-
-    def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Return readings as they are."""
-        return ranges
-
-    def without_readings(self, constant: float, first: float, *, cubes: bool) -> float:
-        """Return the logarithm of a scan without evaluated readings.
-
-        Args:
-            constant: The sum of its constant terms.
-            first: The first term of sums.
-            cubes: Whether the model sums cubes, which have no constant terms.
-        """
-        with np.errstate(divide="ignore"):
-            return float(np.log(first)) if cubes else constant
-
-    def obstacles(self, grid: OccupancyGrid, unknown: str) -> np.ndarray:
-        """Return the (H, W) mask of the cells that stop a beam; do not write to it."""
-        return grid.obstacles("occupied" if unknown == "occupied" else "free")
-
-    def field_obstacles(self, grid: OccupancyGrid, unknown: str) -> np.ndarray:
-        """Return the (H, W) mask of the likelihood field's obstacles; do not write to it."""
-        return self.obstacles(grid, unknown)

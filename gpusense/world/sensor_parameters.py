@@ -135,8 +135,8 @@ class BeaconParameters(_Parameters):
 
     sigma_range: float = 0.3
     """The standard deviation of a correct range, or a Student t's scale, > 0 [m]."""
-    bias: float = 0.0
-    """The mean error of ranges; positive if they are too long [m]."""
+    bias: float | tuple[float, ...] = 0.0
+    """The mean error of ranges, one for all or one for each beacon; positive if they are too long [m]."""
     kind: Literal["normal", "student_t", "mixture"] = "normal"
     """The distribution of correct ranges: a normal, Student's t, or a mixture of a normal and a wide normal."""
     nu: int = 4
@@ -157,7 +157,11 @@ class BeaconParameters(_Parameters):
     def __post_init__(self) -> None:
         for name in ("sigma_range", "sigma_heavy", "range_max"):
             self._check(name, above=0)
-        self._check("bias")
+        if isinstance(self.bias, (list, tuple, np.ndarray)):
+            each = checks.array("bias", self.bias, ("M",))
+            object.__setattr__(self, "bias", tuple(float(value) for value in each))
+        else:
+            self._check("bias")
         checks.choice("kind", self.kind, ("normal", "student_t", "mixture"))
         object.__setattr__(self, "nu", checks.integer("nu", self.nu, low=1, high=MOST_DEGREES))
         self._check("heavy_weight", low=0, high=1)

@@ -8,10 +8,10 @@
 #define NORMAL 0
 #define STUDENT_T 1
 #define TWO_NORMALS 2
-// A beacon has its place (x, its low part, y, its low part), and the reading minus the bias with its low part.
-#define BEACON 6
-// 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
-// peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
+// A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
+#define BEACON 7
+// 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max; for two normals, scale and peak of
+// the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
 // of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
 #define SCALE 0
 #define SCALE_LOW 1
@@ -19,17 +19,16 @@
 #define PEAK_LOW 3
 #define RANDOM 4
 #define RANGE_MAX 5
-#define BIAS 6
-#define WIDE_SCALE 7
-#define WIDE_SCALE_LOW 8
-#define WIDE_PEAK 9
-#define WIDE_PEAK_LOW 10
-#define OFFSET 7
-#define OFFSET_LOW 8
-#define POWER 9
-#define T_SCALE 10
-#define ARC 11
-#define ODD 12
+#define WIDE_SCALE 6
+#define WIDE_SCALE_LOW 7
+#define WIDE_PEAK 8
+#define WIDE_PEAK_LOW 9
+#define OFFSET 6
+#define OFFSET_LOW 7
+#define POWER 8
+#define T_SCALE 9
+#define ARC 10
+#define ODD 11
 // From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
 #define STEEPEST ((real)1e18)
 // From here on the error function is 1 to the last bit.
@@ -69,7 +68,7 @@ real log_student_t(const real2 residual, const real near, const real far, global
 real log_range(const real2 d, global const real *beacon, global const real *terms, global const real *series,
                const int count, const int kind) {
     const real2 first = two_sum(d.x, -beacon[4]), r = two_sum(first.x, first.y + (d.y - beacon[5]));
-    const real near = clamp(d.x + terms[BIAS], (real)0, terms[RANGE_MAX]), far = terms[RANGE_MAX] - near;
+    const real near = clamp(d.x + beacon[6], (real)0, terms[RANGE_MAX]), far = terms[RANGE_MAX] - near;
     real log_p;
     if (kind == STUDENT_T)
         log_p = log_student_t(r, near, far, terms, series, count);

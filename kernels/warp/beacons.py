@@ -15,16 +15,16 @@ from . import error_free, log_terms, offsets
 from .prelude import kernel, precision
 
 STUDENT_T, TWO_NORMALS = wp.constant(1), wp.constant(2)
-# A beacon has its place (x, its low part, y, its low part), and the reading minus the bias with its low part.
-BEACON = wp.constant(6)
-# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max, bias; for two normals, scale and
-# peak of the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
+# A beacon has its place (x, its low part, y, its low part), the reading minus the bias with its low part, and the bias.
+BEACON = wp.constant(7)
+# 1 / (sigma sqrt 2), log of z_hit and the peak, log of the uniform part, range_max; for two normals, scale and peak of
+# the wide one. For a t with peak P: 1 / (sigma sqrt(nu k)) with k = P^(2 / (nu + 1)), log z_hit, and in place
 # of the wide normal: 1 / k, (nu + 1) / 2, 1 / (sigma sqrt nu), the factor of the arc, and 1 for an odd nu.
 SCALE, SCALE_LOW, PEAK, RANDOM = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(4)
-RANGE_MAX, BIAS = wp.constant(5), wp.constant(6)
-WIDE_SCALE, WIDE_PEAK = wp.constant(7), wp.constant(9)
-OFFSET, OFFSET_LOW, POWER, T_SCALE = wp.constant(7), wp.constant(8), wp.constant(9), wp.constant(10)
-ARC, ODD = wp.constant(11), wp.constant(12)
+RANGE_MAX = wp.constant(5)
+WIDE_SCALE, WIDE_PEAK = wp.constant(6), wp.constant(8)
+OFFSET, OFFSET_LOW, POWER, T_SCALE = wp.constant(6), wp.constant(7), wp.constant(8), wp.constant(9)
+ARC, ODD = wp.constant(10), wp.constant(11)
 
 
 @functools.cache
@@ -102,7 +102,7 @@ def make(name, flags):
     ):
         first = two_sum(d.x, -beacon[base + 4])
         r = two_sum(first.x, first.y + (d.y - beacon[base + 5]))
-        near = wp.clamp(d.x + terms[BIAS], ZERO, terms[RANGE_MAX])
+        near = wp.clamp(d.x + beacon[base + 6], ZERO, terms[RANGE_MAX])
         far = terms[RANGE_MAX] - near
         log_p = real(0.0)
         if kind == STUDENT_T:

@@ -117,7 +117,10 @@ def functions(flags):
             else:
                 return log_field(vec2(value, ZERO), terms)
 
-    return SimpleNamespace(between=between, bilinear=bilinear, log_field=log_field, reading_value=reading_value)
+    return SimpleNamespace(
+        between=between, bilinear=bilinear, field_exponent=field_exponent, log_field=log_field,
+        reading_value=reading_value,
+    )  # fmt: skip
 
 
 @functools.cache

@@ -69,9 +69,7 @@ def test_readings_are_placed_as_the_host_prepares_them(
 ) -> None:
     """For all choices of beams and all that max readings may be."""
     real = np.dtype(precision)
-    for count, (z_max, kind) in itertools.product(
-        (1, 16, 53), ((0.0, MAX_LEFT_OUT), (0.1, MAX_FIXED), (0.1, MAX_PLACED))
-    ):
+    for count, (z_max, kind) in itertools.product((1, 53), ((0.0, MAX_LEFT_OUT), (0.1, MAX_FIXED), (0.1, MAX_PLACED))):
         scanner = gs.Scanner(np.linspace(-3, 3, count), RANGE, NEAREST)
         vectors = ray_vectors(scanner.bearings, scanner.mount)
         nearest = float((np.float32 if single else np.float64)(NEAREST))

@@ -59,6 +59,7 @@ ON_PURPOSE = [
     Purpose("error_free", "where_pair strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
     Purpose("field", "quick_value careful_value", KERNELS_ONLY, QUICK),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
+    Purpose("icp", "_refine", REFERENCE_ONLY, "the kernel's loop, with the variables that the kernel keeps"),
     Purpose(
         "landmark_grid", "squared_reach with_landmark", KERNELS_ONLY,
         "kernels look at landmarks one by one and shrink the disc; the reference evaluates all in the disc",

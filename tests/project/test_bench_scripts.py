@@ -173,6 +173,7 @@ def test_all_kinds_of_landmark_calls_run(tmp_path: Path) -> None:
     assert all(row["what"].endswith("30 landmarks, tracking") and row["readings"] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_sonar_field_runs(tmp_path: Path) -> None:
     """Every method is tuned and scored, and the drawings are made; an absent recorded run is left out."""
     report = run_script(
@@ -210,6 +211,7 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
         assert row["shared"] == ("together_s" in row) == ("scans" in row["what"])
 
 
+@pytest.mark.slow
 def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None:
     """A tree has the bits of itself, and rows of both its processes."""
     arguments = ["--old", str(BENCH.parent), "--new", str(BENCH.parent), "--backend", needs("opencl"), "--limit", "50"]
@@ -237,12 +239,14 @@ def test_fuzz_rays_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert report["rays"] >= 30000 and [row["differing_rays"] for row in report["rows"]] == [0]
 
 
+@pytest.mark.slow
 def test_extreme_runs(tmp_path: Path) -> None:
     arguments = ["--backend", "numpy", "--part", "levels", "--precision", "float64"]
     report = run_script("accuracy/extreme.py", *arguments, output=tmp_path / "extreme")
     assert len(report["rows"]["levels"]) == 4 and all(row["ok"] for row in report["rows"]["levels"])
 
 
+@pytest.mark.slow
 def test_stiff_density_runs(tmp_path: Path) -> None:
     arguments = ["--backend", "numpy", "--step", "8", "--figures", str(tmp_path / "drawn")]
     report = run_script("accuracy/stiff_density.py", *arguments, output=tmp_path / "stiff")
@@ -251,6 +255,7 @@ def test_stiff_density_runs(tmp_path: Path) -> None:
     assert {file.name for file in (tmp_path / "drawn").iterdir()} == {"stiff_hit.png", "stiff_short.png"}
 
 
+@pytest.mark.slow
 def test_first_call_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", needs("opencl"), "--repeats", "1"]
     report = run_script("speed/first_call.py", *arguments, output=tmp_path / "first")
@@ -272,6 +277,7 @@ def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert 0 < report["within"] <= report["identified"] <= 12
 
 
+@pytest.mark.slow
 def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--scans", "20", "--block", "2"]
     sets = ["sonar1", "sonar2", "lidar_wall", "intel", "s3000"]
@@ -299,6 +305,7 @@ def test_localisation_with_fitted_parameters_runs(needs: Callable[[str], str], d
     assert log["scored_scans"] == 2 and all(1 <= row["rank"]["median"] < 20 for row in log["rows"])
 
 
+@pytest.mark.slow
 def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     chosen = [word for name in ("mrclam_2", "beacons", "lego", "freiburg") for word in ("--set", name)]
     arguments = ["--data", str(data_dir), "--backend", needs("opencl"), *chosen, "--scans", "600", "--particles", "300"]
@@ -342,6 +349,7 @@ def test_stretches_of_machine_code_end_at_labels_and_branches(
     assert [names for names in found if names] == [["LDC", "BRA"], ["FADD", "FMUL"], ["EXIT"]]
 
 
+@pytest.mark.slow
 def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
     """A recorded map, on every device that is present."""
     arguments = ["--data", str(data_dir), "--map", "columbia", "--log", "none"]
@@ -366,6 +374,13 @@ def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest
         cases = [case for peer in ("amcl", "beluga") for case in script.cases(peer)]
         assert [(case.model, case.peer.name) for case in cases] == [(s["model"], s["peer"]) for s in one["scores"]]
         assert [case.field.to_dict() for case in cases] == [s["field"] for s in one["scores"]]
+
+
+def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
+    small = ["--size", "12", "--particles", "40", "--beams", "7", "--calls", "3", "--load", "1"]
+    report = run_script("speed/whole_calls.py", "--backend", needs("opencl"), *small, output=tmp_path / "small")
+    assert {row["way"] for row in report["rows"]} >= {"launches alone", "log_likelihood", "bound"}
+    assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])
 
 
 def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from gpusense.interface.signatures import (
     learning_kernels,
     map_kernels,
     mapping_kernels,
+    matching_kernels,
     point_kernels,
     scan_kernels,
     search_kernels,
@@ -26,5 +27,6 @@ KERNELS: dict[str, Kernel] = {
     **scan_kernels.KERNELS,
     **point_kernels.KERNELS,
     **learning_kernels.KERNELS,
+    **matching_kernels.KERNELS,
     **search_kernels.KERNELS,
 }

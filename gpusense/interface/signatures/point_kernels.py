@@ -47,7 +47,7 @@ KERNELS: dict[str, Kernel] = {
         "int particles", "int kind", "real temperature",
     ),
     "score_beacons": kernel(
-        "beacons", "particle", "real4 place [particles]", "real beacon [6 * beacons]", "real terms [13]",
+        "beacons", "particle", "real4 place [particles]", "real beacon [7 * beacons]", "real terms [12]",
         "real series [count]", "out real log_p [particles]", "int particles", "int beacons", "int count", "int kind",
         "real temperature",
     ),

@@ -67,6 +67,10 @@ class BeaconModel(PointModel):
         self.xy = checks.array("xy", points.reshape(0, 2) if points.shape == (0,) else points, ("M", 2)).copy()
         self.xy.flags.writeable = False
         super().__init__(backend, precision, temperature)
+        bias = self.parameters.bias
+        if isinstance(bias, tuple) and len(bias) != len(self.xy):
+            raise ValueError(f"parameters: bias must be one for each of {len(self.xy)} beacons, got {len(bias)}")
+        self._bias = np.broadcast_to(np.array(bias, np.float64), (len(self.xy),))
         self._flags |= flags_if(RAND=self.parameters.z_rand > 0)
         # Poses and beacons are placed relative to the middle of the beacons.
         middle = (self.xy.min(axis=0) / 2 + self.xy.max(axis=0) / 2) if len(self.xy) else np.zeros(2)
@@ -150,12 +154,12 @@ class BeaconModel(PointModel):
             if number := int(np.count_nonzero(which)):
                 why = f"{number} of {len(z)} {why}"
                 left_out.append(Omission(what, why, f"{share(number, len(z))} of the ranges"))
-        rows = []
+        rows, used = [], index[valid]
         with localcontext(prec=DIGITS):
-            for (x, y), reading in zip(self.xy[index[valid]], z[valid], strict=True):
+            for (x, y), reading, bias in zip(self.xy[used], z[valid], self._bias[used], strict=True):
                 numbers = (exact(float(x)) - exact(self._origin[0]), exact(float(y)) - exact(self._origin[1]),
-                           exact(float(reading)) - exact(p.bias))  # fmt: skip
-                rows.append(two_parts(numbers, self._real))
+                           exact(float(reading)) - exact(float(bias)))  # fmt: skip
+                rows.append([*two_parts(numbers, self._real), self._real.type(bias)])
         return np.array(rows, self._real).reshape(-1, BEACON), left_out
 
     def _mixture(self) -> tuple[int, np.ndarray, np.ndarray]:
@@ -163,7 +167,7 @@ class BeaconModel(PointModel):
         p, real = self.parameters, self._real
         self._check_scale("sigma_range", p.sigma_range)
         self._check_scale("range_max", p.range_max)
-        self._check_scale("bias", max(abs(p.bias), 1.0), "its size ")
+        self._check_scale("bias", max(float(np.abs(self._bias).max(initial=0.0)), 1.0), "its size ")
         random = log_weight(p.z_rand) - math.log(p.range_max)
         rest: list[Any] = [0.0] * 6
         series = np.zeros(1)
@@ -184,7 +188,7 @@ class BeaconModel(PointModel):
                     heavy = _normal(p.sigma_heavy, total(log_of(p.z_hit), log_of(p.heavy_weight)))
                     rest = [*two_parts(heavy, real), 0.0, 0.0]
                 first = two_parts(_normal(p.sigma_range, total(log_of(p.z_hit), log_of(share))), real)
-        terms = np.array([*first, random, p.range_max, p.bias, *rest], real)
+        terms = np.array([*first, random, p.range_max, *rest], real)
         assert len(terms) == BEACON_TERMS
         return kind, terms, series.astype(real)
 

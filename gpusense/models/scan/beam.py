@@ -24,8 +24,8 @@ from gpusense.tables import casters
 from gpusense.tables.casters import Caster
 from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
-from gpusense.world.peer_weights import Likelihood
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_table import SensorTable
 

@@ -164,17 +164,18 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     else:
         evaluated, constant = used | used_max | (not rules.specialize), none
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
-    rows, columns = evaluated.nonzero()
-    counts = np.bincount(rows, minlength=len(ranges))
     constants = np.zeros(len(ranges))
-    if constant.any():
-        constants += np.bincount(constant.nonzero()[0], minlength=len(ranges)) * rules.log_max
-    if len(columns) < ranges.size:
-        values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
-    else:
+    if evaluated.all():
         # Scans without gaps need no selection.
-        values = ranges.reshape(-1).astype(np.float64)
-        vectors = rules.vectors if len(ranges) == 1 else rules.vectors[columns]
+        counts = np.full(len(ranges), ranges.shape[1])
+        columns, values, vectors = rules.columns, ranges.reshape(-1).astype(np.float64), rules.vectors
+        if len(ranges) > 1:
+            columns, vectors = np.tile(columns, len(ranges)), np.tile(vectors, (len(ranges), 1))
+    else:
+        columns, counts = evaluated.nonzero()[1], np.count_nonzero(evaluated, axis=1)
+        values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
+        if constant is not none:
+            constants += np.count_nonzero(constant, axis=1) * rules.log_max
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
         LeftOut(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),

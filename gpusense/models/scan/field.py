@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense._util.typing import Compat, Precision, Space
+from gpusense._util.typing import AnyArray, Compat, Precision, Space
 from gpusense.backends import Selection
 from gpusense.interface.plan import Omission, launch_omissions, scene_omissions
 from gpusense.interface.terms import HIGH_PEAK
+from gpusense.models.run import finish
+from gpusense.models.scan.field_gradient import gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
@@ -94,6 +97,37 @@ class LikelihoodFieldModel(ScanModel):
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before the first call."""
         return self._field_pipeline.table_bytes
+
+    def gradient(self, poses: AnyArray, ranges: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return log p(z | x, m) with its gradient and Gauss-Newton information with respect to the pose.
+
+        Args:
+            poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans; see
+                ``log_likelihood``.
+            ranges: (K,) readings [m], or (S, K).
+
+        Returns:
+            NumPy arrays in the model's precision: (N,) log-likelihoods; (N, 3) derivatives in x, y [1/m] and theta
+            [1/rad]; (N, 3, 3) information, the sum over readings of r J J' / sigma_hit^2, where J has the derivatives
+            of the interpolated distance and r is the share of the hit density. With a leading axis (S,) for S scans.
+
+        Raises:
+            TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
+            ValueError: a wrong shape, a pose that is not finite, or a field that is not interpolated.
+            MemoryError: the device cannot hold the map's table, or even a few particles.
+        """
+        if self.parameters.interpolation != "bilinear":
+            raise ValueError(
+                "interpolation: must be 'bilinear' for gradients, got a field with 'nearest': pass "
+                "LikelihoodFieldParameters(interpolation='bilinear')"
+            )
+        request = self._request(poses, ranges, None)
+        with self._lock, self._workspace:
+            numbers = gradients(self._field_pipeline, request, self._workspace)
+            finish(self._workspace, request.poses.on_device)
+        log_p, gradient, information = in_world(numbers, self.grid.origin[2])
+        shape = request.shape
+        return log_p.reshape(shape), gradient.reshape(*shape, 3), information.reshape(*shape, 3, 3)
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.

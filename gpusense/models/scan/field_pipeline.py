@@ -39,6 +39,8 @@ class FieldPipeline(ScanPipeline):
         components: Flags of the mixture.
         log_table: Whether cells hold log densities or cubes of densities, not distances.
         quick: Whether GPUs find cells in working precision, and again with more digits near edges of cells.
+        terms: The numbers of the mixture on the device.
+        guard: Distance from a cell's edge below which an end point needs more digits, by its length + 2 cells.
     """
 
     kept_parts = 1 / BLOCK_TERMS
@@ -59,8 +61,8 @@ class FieldPipeline(ScanPipeline):
         self.careful = self.real == np.float32
         self.quick = self.careful and self.log_table and self.specialize
         self.components, terms = self._mixture(parameters, bilinear=bilinear, cubes=setting.cubes)
-        self._terms = self.backend.upload(terms)
-        self._guard = _GUARD * float(np.finfo(self.real).eps)
+        self.terms = self.backend.upload(terms)
+        self.guard = _GUARD * float(np.finfo(self.real).eps)
         range_max = self.scanner.range_max
         self.table = FieldTable(
             self.real, parameters, grid.resolution, range_max, outside=outside,
@@ -121,7 +123,7 @@ class FieldPipeline(ScanPipeline):
         longest = self._longest_of_blocks(lengths, scans)
         arrays = dict(point=high, point_low=low)
         if self.backend.info.kind == "gpu":
-            arrays["guard"] = (self._guard * (longest + 2)).astype(self.real)
+            arrays["guard"] = (self.guard * (longest + 2)).astype(self.real)
         several = scans.scans > 1
         if several:
             arrays["constant_terms"] = (scans.constants + self.setting.constant_term).astype(self.real)
@@ -134,7 +136,7 @@ class FieldPipeline(ScanPipeline):
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SCANS=several),
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
-            dict(counts=counts, constant_terms=uploaded.get("constant_terms", self._terms)),
+            dict(counts=counts, constant_terms=uploaded.get("constant_terms", self.terms)),
             float(scans.constants[0]) + self.setting.constant_term,
             (scans.scans, scans.most_readings, len(scans.readings)), float(longest.max()) + 2,
         )  # fmt: skip
@@ -153,7 +155,7 @@ class FieldPipeline(ScanPipeline):
         rules = self.rules
         return Sensing(
             self.scanner, rules.beams, rules.vectors[:, None], rules.z_max, end_points=True, max_depends=False,
-            possible=self.setting.possible, specialize=self.specialize, top=math.inf, guard_scale=self._guard,
+            possible=self.setting.possible, specialize=self.specialize, top=math.inf, guard_scale=self.guard,
             real=self.real,
         )  # fmt: skip
 
@@ -187,7 +189,7 @@ class FieldPipeline(ScanPipeline):
         numbers = super().numbers(scoring)
         if scoring.tiles is None:
             # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
-            numbers["guard"] = self._guard * scoring.readings.reach
+            numbers["guard"] = self.guard * scoring.readings.reach
         return numbers
 
     def score_launches(self, scoring: Scoring) -> Program:
@@ -195,7 +197,7 @@ class FieldPipeline(ScanPipeline):
         placed, readings, parts = scoring.placed, scoring.readings, scoring.parts
         count = placed.count
         common = dict(
-            table=scoring.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=self._terms,
+            table=scoring.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=self.terms,
             window=placed.frame.window, particles=count, readings=readings.readings, batch=scoring.batch,
             parts=parts.buffer, **readings.arguments,
         )  # fmt: skip

@@ -28,7 +28,7 @@ from gpusense.models.scan.rules import Rules
 from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.peer_weights import Likelihood
+from gpusense.world.likelihood import Likelihood
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
 # launches fill the device for longer than it takes to start them.

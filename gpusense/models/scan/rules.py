@@ -82,6 +82,11 @@ class Rules:
         return BeamChoice.of(self.beams, self.scanner.count)
 
     @functools.cached_property
+    def columns(self) -> np.ndarray:
+        """(K,) positions of all readings."""
+        return np.arange(self.scanner.count)
+
+    @functools.cached_property
     def separate(self) -> bool:
         """Tell whether each reading has its ray: all bearings differ, or nothing is left out."""
         return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)

@@ -129,6 +129,8 @@ def test_a_heading_integrates_to_1(name: str) -> None:
 XY = np.array([(5e6, 4e6), (5e6 + 30.0, 4e6), (5e6, 4e6 + 40.0)])
 BEACONS = {
     "normal": gs.BeaconParameters(mount=(0.2, 0.1), bias=0.15),
+    "own biases": gs.BeaconParameters(range_max=40.0, sigma_range=2.0, bias=(0.15, -21.0, 12.0)),
+    "own biases of t": gs.BeaconParameters(kind="student_t", range_max=40.0, bias=(0.15, -21.0, 12.0)),
     "near its end": gs.BeaconParameters(sigma_range=5.0, range_max=40.0, z_hit=1.0, z_rand=0.0),
     "shrunk": gs.BeaconParameters(bias=-45.0, sigma_range=3.0, z_hit=0.999, z_rand=0.001),
     "mixture": gs.BeaconParameters(kind="mixture", range_max=60.0),
@@ -142,6 +144,10 @@ BEACONS = {
 }
 
 
+def own_bias(p: gs.BeaconParameters, beacon: int) -> gs.BeaconParameters:
+    return p.replace(bias=p.bias[beacon]) if isinstance(p.bias, tuple) else p
+
+
 @each_precision
 def test_beacons(backend: str, precision: str) -> None:
     rng = np.random.default_rng(5)
@@ -152,7 +158,10 @@ def test_beacons(backend: str, precision: str) -> None:
         ids = [0, 1, 1, 2]
         found = gs.BeaconModel(XY, p, backend=backend, precision=precision).log_likelihood(poses, ranges, ids)
         parts = np.array(
-            [[oracle.beacon(pose, XY[i], ranges[k], p) for k, i in enumerate(ids) if k != 2] for pose in poses]
+            [
+                [oracle.beacon(pose, XY[i], ranges[k], own_bias(p, i)) for k, i in enumerate(ids) if k != 2]
+                for pose in poses
+            ]
         )
         assert found.dtype == precision, name
         assert_close(found, parts.sum(axis=1), precision, parts)
@@ -172,7 +181,7 @@ def test_beacons_of_ten_nanometres(backend: str, precision: str, kind: str, nu: 
 @pytest.mark.parametrize("name", BEACONS)
 @pytest.mark.parametrize("distance", [0.0, 2.0, 30.0])
 def test_a_range_integrates_to_1(name: str, distance: float) -> None:
-    p = BEACONS[name].replace(mount=(0.0, 0.0))
+    p = own_bias(BEACONS[name], 0).replace(mount=(0.0, 0.0))
     mean = distance + p.bias
     if not 0 <= mean <= p.range_max:
         assert name == "shrunk"

@@ -173,7 +173,8 @@ def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gp
     grid, scanner, z = world()
     several = np.stack([poses_of("all over"), poses_of("inside"), poses_of("inside") + 0.1])
     scans = np.stack([z, np.where(np.arange(BEAMS) % 3 == 0, z, np.nan), np.full(BEAMS, np.nan)])
-    for parameters in (*BEAM.values(), gs.BeamParameters(1.0, 0.0, 0.0, 0.0, sigma_hit=0.001)):
+    some = BEAM.values() if precision == "float32" else (BEAM["book"],)
+    for parameters in (*some, gs.BeamParameters(1.0, 0.0, 0.0, 0.0, sigma_hit=0.001)):
         found = []
         for enough in (1 << 21, 1):
             monkeypatch.setattr(tiles, "ENOUGH", enough)

@@ -1,0 +1,204 @@
+"""Run ``gpusense match``: match the scans of a recorded log to one another, or to a map."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import (
+    add_backend,
+    add_json,
+    add_seed,
+    not_negative_number,
+    output_path,
+    positive_number,
+    whole_number,
+)
+from gpusense.commands.output import print_json
+from gpusense.evaluation.machine import machine, machine_line
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.matching import LogMatches
+    from gpusense.logs import Scan
+    from gpusense.world.grid import OccupancyGrid
+
+NAME = "match"
+HELP = "Match the scans of a recorded log to one another, or to a map."
+
+_EPILOG = """\
+Each scan is matched to the one before, from the odometry's guess; with --map to the map, from its logged pose. Errors
+are those against the logged poses, where the log has them. A match is wrong beyond 0.2 m or 5 degrees.
+Ctrl-C ends the run with the results so far.
+
+Exit codes: 0 success, 2 bad input, 130 interrupted.
+
+example:
+  gpusense match --log run.log.gz --limit 300
+  gpusense match --log run.log.gz --guess identity --plot worst.png
+  gpusense match --log run.log.gz --map map.yaml --shift 0.5 --turn 10 --out poses.csv"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add("--log", required=True, type=Path, metavar="FILE", help="a log (CARMEN), plain or .gz")
+    add("--map", type=Path, metavar="YAML", help="a map_server map to which all scans are matched")
+    add("--guess", choices=("odometry", "logged", "identity"),
+        help="the guess of each match (default: odometry, with --map logged)")  # fmt: skip
+    add("--shift", type=not_negative_number, default=0.0, metavar="M",
+        help="change guesses by up to this in x and in y, uniformly at random [m] (default: 0)")  # fmt: skip
+    add("--turn", type=not_negative_number, default=0.0, metavar="DEG",
+        help="change headings of guesses by up to this [degrees] (default: 0)")  # fmt: skip
+    add("--method", choices=("auto", "icp", "gauss_newton", "correlative"), default="auto",
+        help="method of match_scan (default: %(default)s)")  # fmt: skip
+    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
+    add("--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_backend(parser)
+    add_seed(parser)
+    add_json(parser)
+    add("--out", type=output_path(".csv"), metavar="CSV", help="write poses, deviations and statuses")
+    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
+        help="draw the match with the largest correction, before and after")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Match the scans and print the results; after Ctrl-C those so far."""
+    from gpusense.evaluation.matching import match_log
+    from gpusense.world.map_files import read_map
+
+    grid = None if args.map is None else read_map(args.map)
+    scans = _scans(args)
+    parts: list[LogMatches] = []
+    begun = time.perf_counter()
+    try:
+        calls = match_log(
+            scans, grid, guess=args.guess or ("odometry" if grid is None else "logged"), method=args.method,
+            backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed,
+        )  # fmt: skip
+        with progress(len(scans)) as step:
+            for part in calls:
+                parts.append(part)
+                for _ in part.indices:
+                    step(f"scan {part.indices[-1, 1]}")
+    except KeyboardInterrupt:
+        if parts:
+            _report(args, grid, scans, parts, time.perf_counter() - begun)
+        raise
+    _report(args, grid, scans, parts, time.perf_counter() - begun)
+    return 0
+
+
+def _scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
+    """Read the chosen scans, all of one scanner.
+
+    Raises:
+        ValueError: none is chosen, or they are of several scanners.
+    """
+    import itertools
+
+    from gpusense.logs import Scan, read_log
+
+    last = None if args.limit is None else args.offset + args.every * args.limit
+    records = (record for record in read_log(args.log, range_max=args.range_max) if isinstance(record, Scan))
+    chosen = list(itertools.islice(enumerate(records), args.offset, last, args.every))
+    if not chosen:
+        raise ValueError(f"log: must have a scan of index {args.offset}, got fewer in {args.log}")
+    for index, scan in chosen:
+        if scan.scanner != chosen[0][1].scanner:
+            raise ValueError(f"log: every scan must come from the same scanner, got another at scan {index}")
+    return chosen
+
+
+def _report(
+    args: argparse.Namespace,
+    grid: OccupancyGrid | None,
+    scans: list[tuple[int, Scan]],
+    parts: list[LogMatches],
+    seconds: float,
+) -> None:
+    """Print and write the results of all matches, or of those before an interrupt."""
+    from gpusense.evaluation.matching import joined, summary
+
+    matches = joined(parts)
+    total = summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
+    if args.out is not None:
+        _write(args.out, matches)
+    if args.plot is not None:
+        _draw(args.plot, grid, dict(scans), matches)
+    if args.json:
+        print_json(_document(args, matches, total, len(scans)))
+        return
+    _print(total)
+    expected = len(scans) - (grid is None)
+    if len(matches.match) < expected:
+        print(f"interrupted: results of {len(matches.match)} of {expected} matches")
+    for path, word in ((args.out, "written"), (args.plot, "drawn")):
+        if path is not None:
+            print(f"{word}: {path}")
+    print(f"\n{machine_line()}")
+
+
+def _print(total: dict[str, Any]) -> None:
+    from gpusense.matching.result import STATUSES
+
+    print(f"{total['matches']} matches, {total['milliseconds_each']:.3g} ms each with the first call's compilation")
+    for status, count in total["statuses"].items():
+        print(f"  {count} {status}: {STATUSES[status]}")
+    print(f"score: median {total['score_median']:.3f}")
+    if total["wrong"] is not None:
+        turn = {name: math.degrees(total[f"heading_{name}"]) for name in ("median", "p95")}
+        print(
+            f"against the logged poses: {total['position_median']:.4f} m and {turn['median']:.3f} deg median, "
+            f"{total['position_p95']:.4f} m and {turn['p95']:.3f} deg at 95 %; {total['wrong']} wrong"
+        )
+
+
+def _document(args: argparse.Namespace, matches: LogMatches, total: dict[str, Any], chosen: int) -> dict[str, Any]:
+    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
+    match = matches.match
+    names = ("pose", "covariance", "score", "iterations", "converged", "eigenvalues", "status")
+    rows = [
+        {"reference": int(first), "scan": int(second)} | {name: getattr(match, name)[i] for name in names}
+        for i, (first, second) in enumerate(matches.indices)
+    ]
+    return {"options": options, "scans_chosen": chosen, "summary": total, "matches": rows, "machine": machine()}
+
+
+def _write(path: Path, matches: LogMatches) -> None:
+    """Write a line for each match: indices, pose, standard deviations, score and status."""
+    from gpusense._util.files import write_whole
+
+    match = matches.match
+    deviations = np.sqrt(np.einsum("sii->si", match.covariance))
+    lines = ["reference,scan,x,y,theta,deviation_x,deviation_y,deviation_theta,score,status"]
+    for (first, second), pose, deviation, score, status in zip(
+        matches.indices, match.pose, deviations, match.score, match.status, strict=True
+    ):
+        numbers = ",".join(repr(float(value)) for value in (*pose, *deviation, score))
+        lines.append(f"{first},{second},{numbers},{status}")
+    text = "\n".join(lines) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def _draw(path: Path, grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> None:
+    from gpusense.evaluation.matching import differences
+    from gpusense.plots.drawing import save
+    from gpusense.plots.matches import match_figure
+
+    distance, turn = differences(matches.match.pose, matches.guess)
+    worst = int(np.argmax(distance + turn * matches.match.lever / 10))
+    first, second = matches.indices[worst]
+    scan = scans[int(second)]
+    reference = scans[int(first)].ranges if grid is None else grid
+    pose = matches.match.pose[worst]
+    save(match_figure(reference, scan.ranges, scan.scanner, matches.guess[worst], pose), path)

@@ -1,0 +1,28 @@
+"""Kernels that match scans to scans and to maps."""
+
+from __future__ import annotations
+
+from gpusense.interface.constants import GRADIENT_NUMBERS, MATCH_RESULT
+from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
+
+# Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
+_POINTS = ("real4 point [points]", "int start [scans + 1]")
+
+KERNELS: dict[str, Kernel] = {
+    "field_gradient": kernel(
+        "field_gradient", "particle", "real table [(window.rows + 4) * (window.cols + 4)]", *PLACED,
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "int start [scans + 1]",
+        "real constant_terms [scans]", f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
+        "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
+        "Score score", "ScanBatch batch",
+    ),
+    "fit_lines": kernel(
+        "icp", "beam scan", *_POINTS, "out real4 line [points]", "int scans", "int points", "int reach", "int most",
+        "real ratio", "real slack", "real width",
+    ),
+    "match_scans": kernel(
+        "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",
+        f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans", "int points", "int pairs", "int starts",
+        "MatchRules rules", group=4,
+    ),
+}  # fmt: skip

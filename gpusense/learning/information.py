@@ -1,0 +1,65 @@
+"""Standard errors from the observed information, for independent or correlated readings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# Scaled information below this share of the largest counts as none.
+_FLAT = 1e-10
+
+
+def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None) -> Floats:
+    """Compute the standard errors of functions of the coordinates.
+
+    The covariance of the coordinates is the inverse of the information H, or ``H^-1 S H^-1`` with the scatter S of the
+    gradient over blocks (White 1982; Liang and Zeger 1986).
+
+    Args:
+        curve: (m, m) minus the second derivatives of the log-likelihood by the free coordinates.
+        rows: (p, m) derivatives of the functions by these coordinates.
+        scatter: (m, m) scatter of the gradient over blocks; None for independent readings.
+
+    Returns:
+        (p,) standard errors, infinite where the readings hold no information.
+    """
+    if not len(curve):
+        return np.full(len(rows), math.nan)
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), 1e-300))
+    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+    known = size > _FLAT * max(float(size[-1]), 0.0)
+    errors = np.empty(len(rows))
+    for k, row_of in enumerate(rows):
+        row: Floats = axes.T @ (scale * row_of)
+        unknown = np.abs(row[~known]) > 1e-6 * max(float(np.abs(row).max()), 1e-300)
+        errors[k] = math.inf if unknown.any() else _error(row, size, known, scale[:, None] * axes, scatter)
+    return errors
+
+
+def scatter_of(sums: Floats) -> Floats:
+    """Return the (m, m) scatter of the (B, m) gradients of blocks, centred; NaN for fewer than 2 blocks."""
+    blocks, size = sums.shape
+    if blocks < 2:
+        return np.full((size, size), math.nan)
+    off = sums - sums.sum(axis=0) / blocks
+    return (off.T @ off) * (blocks / (blocks - 1))
+
+
+def _error(row: Floats, size: Floats, known: NDArray[np.bool_], axes: Floats, scatter: Floats | None) -> float:
+    """Return the standard error of a parameter.
+
+    Args:
+        row: (m,) derivatives of the parameter along the axes.
+        size: (m,) eigenvalues of the scaled information.
+        known: (m,) mask of the axes with information.
+        axes: (m, m) axes as columns, in the coordinates.
+        scatter: (m, m) scatter of the gradient over blocks, or None.
+    """
+    if scatter is None:
+        return math.sqrt(float((row[known] ** 2 / size[known]).sum()))
+    influence = axes[:, known] @ (row[known] / size[known])
+    return math.sqrt(max(float(influence @ scatter @ influence), 0.0)) if np.isfinite(scatter).all() else math.nan

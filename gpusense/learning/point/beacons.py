@@ -1,0 +1,226 @@
+"""Fit the parameters of ranges to beacons."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gpusense._util import checks
+from gpusense.learning.point.densities import truncated
+from gpusense.learning.point.poses import places_of
+from gpusense.learning.point.problem import Floats, Integers, Problem, check_labels, mix, number_blocks, of_weight
+from gpusense.learning.point.report import report
+from gpusense.learning.point.result import PointFit
+from gpusense.learning.point.search import maximize
+from gpusense.world.sensor_parameters import MOST_DEGREES, BeaconParameters
+
+BiasKind = Literal["none", "common", "each"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Beacons(Problem):
+    """Likelihood of ranges by (log sigma, z_rand[, log sigma_heavy, heavy_weight][, biases])."""
+
+    per_reading: ClassVar[tuple[str, ...]] = ("ranges", "distances", "ids")
+    ranges: Floats
+    distances: Floats
+    ids: Integers
+    kind: str
+    nu: int | None
+    range_max: float
+    biases: int
+    spread: float
+
+    @property
+    def _first(self) -> int:
+        """Place of the first bias."""
+        return 4 if self.kind == "mixture" else 2
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        low_sigma, high_sigma = math.log(max(1e-3 * self.spread, 1e-9 * self.range_max)), math.log(self.range_max)
+        heavy = [(low_sigma, high_sigma), (0.0, 1.0)] if self.kind == "mixture" else []
+        pairs = [(low_sigma, high_sigma), (0.0, 1.0), *heavy, *[(-self.range_max, self.range_max)] * self.biases]
+        low, high = np.array(pairs).T
+        return low, high
+
+    def scales(self, theta: Floats) -> Floats:
+        scale = math.exp(theta[0])
+        weight = [of_weight(theta[1])]
+        heavy = [1.0, of_weight(theta[3])] if self.kind == "mixture" else []
+        return np.array([1.0, *weight, *heavy, *[scale] * self.biases])
+
+    def starts(self) -> list[Floats]:
+        residual = self.ranges - self.distances
+        mode = _half_sample_mode(residual)
+        centre = float(np.median(residual))
+        starts = []
+        for bias in sorted({centre, mode}) if self.biases else [0.0]:
+            spread = 1.4826 * float(np.median(np.abs(residual - bias))) or self.spread
+            each = [float(np.median(residual[self.ids == i])) if (self.ids == i).any() else bias
+                    for i in range(self.biases)] if self.biases > 1 else [bias] * self.biases  # fmt: skip
+            for narrow, weight in ((1.0, 0.05), (0.3, 0.3), (0.1, 0.5), (3.0, 0.01)):
+                heavy = [math.log(4 * narrow * spread), 0.2] if self.kind == "mixture" else []
+                starts.append(np.array([math.log(narrow * spread), weight, *heavy, *each]))
+        return starts
+
+    def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
+        bias = self._bias(theta)
+        mean = self.distances + bias
+        residual = (self.ranges - self.distances) - bias
+        rand = theta[1]
+        share = theta[3] if self.kind == "mixture" else 0.0
+        first = truncated(residual, mean, self.range_max, math.exp(theta[0]), self.nu)
+        parts = [((1 - rand) * (1 - share), first[0]), (rand, np.full(len(mean), -math.log(self.range_max)))]
+        hits = [first]
+        if self.kind == "mixture":
+            hits.append(truncated(residual, mean, self.range_max, math.exp(theta[2]), None))
+            parts.append(((1 - rand) * share, hits[1][0]))
+        log_p, shares, ratios = mix(parts)
+        gradient = np.zeros((len(mean), len(theta)))
+        of_hits = [shares[0], *shares[2:]]
+        hit_ratio = (1 - share) * ratios[0] + (share * ratios[2] if self.kind == "mixture" else 0)
+        gradient[:, 0] = of_hits[0] * first[1]
+        gradient[:, 1] = ratios[1] - hit_ratio
+        if self.kind == "mixture":
+            gradient[:, 2] = of_hits[1] * hits[1][1]
+            gradient[:, 3] = (1 - rand) * (ratios[2] - ratios[0])
+        by_bias = sum(of * hit[2] for of, hit in zip(of_hits, hits, strict=True))
+        if self.biases:
+            place = self.ids if self.biases > 1 else np.zeros(len(mean), np.int64)
+            gradient[np.arange(len(mean)), self._first + place] = by_bias
+        return log_p, gradient
+
+    def _bias(self, theta: Floats) -> Floats:
+        own = theta[self._first :]
+        if self.biases > 1:
+            return own[self.ids]
+        return np.full(len(self.ranges), own[0] if self.biases else 0.0)
+
+    def values(self, theta: Floats) -> dict[str, float]:
+        values = {"sigma_range": math.exp(theta[0])}
+        if self.kind == "mixture":
+            values |= {"sigma_heavy": math.exp(theta[2]), "heavy_weight": float(theta[3])}
+        values |= {"z_hit": 1 - float(theta[1]), "z_rand": float(theta[1])}
+        own = theta[self._first :]
+        if self.biases == 1:
+            return values | {"bias": float(own[0])}
+        return values | {f"bias[{i}]": float(bias) for i, bias in enumerate(own)}
+
+
+def fit_beacon_parameters(
+    poses: ArrayLike,
+    ranges: ArrayLike,
+    xy: ArrayLike,
+    *,
+    ids: ArrayLike | None = None,
+    range_max: float = 100.0,
+    kind: Literal["normal", "student_t", "mixture"] = "normal",
+    nu: int = 4,
+    bias: BiasKind = "common",
+    mount: tuple[float, float] = (0.0, 0.0),
+    blocks: ArrayLike | None = None,
+    max_iterations: int = 200,
+    tolerance: float = 1e-8,
+) -> PointFit[BeaconParameters]:
+    """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
+
+    The likelihood is that of :class:`BeaconModel`: deviations, weights and offsets are fitted; the degrees of freedom
+    of a Student t are given. Starts come from the median and the densest part of the residuals, which outliers hardly
+    move.
+
+    Args:
+        poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.
+        ranges: (S, M) ranges from each pose to all beacons [m], or (F,) with ``ids``. NaN, and values outside
+            [0, range_max], are missing.
+        xy: (M, 2) positions of the beacons in the world [m].
+        ids: None, or (F,) indices of the beacons that the ranges belong to.
+        range_max: The longest range that the radio can report, > 0 [m].
+        kind: The distribution of correct ranges, as in :class:`BeaconParameters`.
+        nu: The degrees of freedom of ``"student_t"``, 1 to 100 [1].
+        bias: ``"common"`` fits one offset of all ranges, ``"each"`` one for each beacon, ``"none"`` keeps it at 0.
+        mount: The antenna's position (x, y) on the robot [m].
+        blocks: None, or (S,) or (F,) integer labels of poses whose errors are correlated, for standard errors.
+        max_iterations: Most iterations of a search.
+        tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
+
+    Returns:
+        The fit. Errors of offsets for each beacon are named ``bias[0]``, ``bias[1]``, ...
+
+    Raises:
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above, the shapes differ, or there is no reading.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> rng, xy = np.random.default_rng(0), np.array([(0.0, 0.0), (9.0, 0.0), (0.0, 9.0)])
+        >>> poses = rng.uniform((0, 0, -3), (9, 9, 3), (500, 3))
+        >>> d = np.hypot(*(poses[:, None, :2] - xy).transpose(2, 0, 1))
+        >>> fit = gs.fit_beacon_parameters(poses, d + rng.normal(0.3, 0.1, d.shape), xy)
+        >>> fit.converged, round(fit.parameters.bias, 1), round(fit.parameters.sigma_range, 2)
+        (True, 0.3, 0.1)
+    """
+    checks.choice("kind", kind, ("normal", "student_t", "mixture"))
+    checks.choice("bias", bias, ("none", "common", "each"))
+    degrees = checks.integer("nu", nu, low=1, high=MOST_DEGREES)
+    longest = checks.real("range_max", range_max, above=0)
+    points = checks.array("xy", xy, ("M", 2))
+    most = checks.integer("max_iterations", max_iterations, low=1)
+    least = checks.real("tolerance", tolerance, above=0)
+    pose, z, index = _readings(poses, ranges, len(points), ids)
+    labels = None if blocks is None else check_labels(blocks, len(pose))[index[0]]
+    antenna = places_of(pose, mount)
+    distances = np.hypot(*(points[index[1]] - antenna[index[0]]).T)
+    used = (z >= 0) & (z <= longest)
+    if not used.any():
+        raise ValueError(f"ranges: must hold one in [0, {longest:g}] m, got {len(z)} without")
+    numbers = number_blocks(None if labels is None else labels[used])
+    residual = z[used] - distances[used]
+    spread = 1.4826 * float(np.median(np.abs(residual - np.median(residual)))) or float(np.ptp(residual))
+    problem = _Beacons(
+        z[used], distances[used], index[1][used], kind, degrees if kind == "student_t" else None, longest,
+        {"none": 0, "common": 1, "each": len(points)}[bias], spread or 1e-6 * longest,
+    )  # fmt: skip
+    end = maximize(problem, most, least)
+    return report(problem, end, _parameters(problem, end.theta, degrees, mount), numbers, int((~used).sum()))
+
+
+def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) -> tuple[Floats, Floats, list[Integers]]:
+    """Return the poses, (n,) ranges, and the index of each range's pose and beacon."""
+    if ids is None:
+        pose = checks.array("poses", poses, ("S", 3))
+        table = checks.array("ranges", ranges, (len(pose), beacons), finite=False)
+        rows, columns = (each.ravel().astype(np.int64) for each in np.indices(table.shape))
+        return pose, table.ravel(), [rows, columns]
+    columns = checks.array("ids", ids, ("F",), dtype=np.int64)
+    pose = checks.array("poses", poses, (len(columns), 3))
+    outside = np.flatnonzero((columns < 0) | (columns >= beacons))
+    if len(outside):
+        at = outside[0]
+        raise ValueError(f"ids: indices must be in [0, {beacons}), got {columns[at]} at index {at}")
+    z = checks.array("ranges", ranges, (len(columns),), finite=False)
+    return pose, z, [np.arange(len(columns)), columns]
+
+
+def _parameters(problem: _Beacons, theta: Floats, nu: int, mount: tuple[float, float]) -> BeaconParameters:
+    values = {name: value for name, value in problem.values(theta).items() if not name.startswith("bias")}
+    own = tuple(theta[problem._first :].tolist())
+    bias = 0.0 if not own else own[0] if len(own) == 1 else own
+    return BeaconParameters(**values, bias=bias, kind=problem.kind, nu=nu, range_max=problem.range_max, mount=mount)  # type: ignore[arg-type]
+
+
+def _half_sample_mode(values: Floats) -> float:
+    """Return the centre of the densest part, found by halving: a start that more than half of outliers do not move.
+
+    Source: Bickel and Fruehwirth (2006), "On a fast, robust estimator of the mode".
+    """
+    ordered = np.sort(values)
+    while len(ordered) > 2:
+        half = (len(ordered) + 1) // 2
+        widths = ordered[half - 1 :] - ordered[: len(ordered) - half + 1]
+        at = int(np.argmin(widths))
+        ordered = ordered[at : at + half]
+    return float(ordered.mean())

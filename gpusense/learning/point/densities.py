@@ -1,0 +1,88 @@
+"""Log densities of residuals with their derivatives: truncated normals and Student's t, wrapped normals, von Mises."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_LOG_ROOT_TWO_PI = 0.5 * math.log(2 * math.pi)
+# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series, as in ``HeadingModel``.
+_WIDEST_SUM, _WRAPS, _WAVES = 1.5, 3, 6
+
+
+def truncated(
+    residual: Floats, mean: Floats, range_max: float, scale: float, nu: int | None
+) -> tuple[Floats, Floats, Floats]:
+    """Return the log density of a normal, or of a Student t, truncated to [0, range_max], and its derivatives.
+
+    Args:
+        residual: (n,) range minus mean [m].
+        mean: (n,) mean before it is clamped to [0, range_max] [m].
+        range_max: Longest range [m].
+        scale: Standard deviation or scale [m].
+        nu: Degrees of freedom of a t, or None for a normal.
+
+    Returns:
+        (n,) log density, its derivatives by log scale and by the mean [1/m].
+    """
+    from scipy.special import ndtr, stdtr
+
+    near = np.clip(mean, 0, range_max)
+    u, x_0, x_1 = residual / scale, near / scale, (range_max - near) / scale
+    if nu is None:
+        log_peak, log_shape, pull = -_LOG_ROOT_TWO_PI, -0.5 * u * u, u
+        mass = ndtr(x_1) - ndtr(-x_0)
+        edges = [np.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI) for x in (x_0, x_1)]
+    else:
+        power = (nu + 1) / 2
+        log_peak = math.lgamma(power) - math.lgamma(nu / 2) - 0.5 * math.log(nu * math.pi)
+        log_shape, pull = -power * np.log1p(u * u / nu), (nu + 1) * u / (nu + u * u)
+        mass = stdtr(nu, x_1) - stdtr(nu, -x_0)
+        edges = [np.exp(log_peak - power * np.log1p(x * x / nu)) for x in (x_0, x_1)]
+    log_p = log_peak - math.log(scale) + log_shape - np.log(mass)
+    by_scale = u * pull - 1 + (x_0 * edges[0] + x_1 * edges[1]) / mass
+    by_mean = (pull + np.where(near == mean, (edges[1] - edges[0]) / mass, 0)) / scale
+    return log_p, by_scale, by_mean
+
+
+def wrapped_normal(residual: Floats, sigma: float) -> tuple[Floats, Floats, Floats]:
+    """Return the log density of a wrapped normal, its derivatives by log sigma, and by the mean [1/rad].
+
+    Args:
+        residual: (n,) residuals in [-pi, pi] [rad].
+        sigma: Standard deviation before wrapping [rad].
+    """
+    if sigma > _WIDEST_SUM:
+        n = np.arange(1, _WAVES + 1)
+        wave = 2 * np.exp(-0.5 * np.minimum(n * sigma, 1e3) ** 2)
+        angle = residual[:, None] * n
+        density = 1 + np.cos(angle) @ wave
+        by_sigma = -(np.cos(angle) @ (wave * (n * sigma) ** 2)) / density
+        return np.log(density) - math.log(2 * math.pi), by_sigma, (np.sin(angle) @ (wave * n)) / density
+    u = (residual[:, None] + 2 * math.pi * np.arange(-_WRAPS, _WRAPS + 1)) / sigma
+    logs = -0.5 * u * u
+    top = np.logaddexp.reduce(logs, axis=1)
+    share = np.exp(logs - top[:, None])
+    log_p = top - _LOG_ROOT_TWO_PI - math.log(sigma)
+    return log_p, (share * u * u).sum(axis=1) - 1, (share * u).sum(axis=1) / sigma
+
+
+def von_mises(residual: Floats, kappa: float) -> tuple[Floats, Floats, Floats]:
+    """Return the log density of a von Mises distribution, its derivatives by log kappa, and by the mean [1/rad].
+
+    Args:
+        residual: (n,) residuals [rad].
+        kappa: Concentration [1].
+    """
+    from scipy.special import i0e, i1e
+
+    drop = 2 * np.sin(residual / 2) ** 2
+    log_p = -kappa * drop - math.log(2 * math.pi * float(i0e(kappa)))
+    # cos r - I1 / I0 = (1 - I1 / I0) - drop; 1 - I1 / I0 is about 1 / (2 kappa) for a large kappa.
+    ratio = float(i1e(kappa) / i0e(kappa))
+    rest = 1 - ratio if kappa < 1e4 else 1 / (2 * kappa) + 1 / (8 * kappa**2) + 1 / (8 * kappa**3)
+    return log_p, kappa * (rest - drop), kappa * np.sin(residual)

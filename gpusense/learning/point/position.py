@@ -1,0 +1,180 @@
+"""Fit the parameters of position fixes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.learning.point.poses import places_of
+from gpusense.learning.point.problem import Floats, Problem, check_labels, mix, number_blocks, of_weight
+from gpusense.learning.point.report import report
+from gpusense.learning.point.result import PointFit
+from gpusense.learning.point.search import maximize
+from gpusense.world.sensor_parameters import PositionParameters
+
+_LOG_TWO_PI = math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fixes(Problem):
+    """Likelihood of fixes by z_rand, a whitening matrix ((a, 0), (b, c)), and the antenna's mount (x, y).
+
+    Coordinates are log a, b and log c, or log a alone for one deviation, where c = a and b = 0. b is in units of the
+    spread's inverse. Without a region z_rand stays 0, without a fit of the mount it stays as given.
+    """
+
+    per_reading: ClassVar[tuple[str, ...]] = ("errors", "cosines", "sines", "inside")
+    errors: Floats
+    cosines: Floats
+    sines: Floats
+    inside: NDArray[np.bool_]
+    correlated: bool
+    area: float | None
+    mount: tuple[float, float]
+    fit_mount: bool
+    spread: float
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        centre = -math.log(self.spread)
+        shape = [(centre - 14, centre + 7)] + ([(-math.inf, math.inf), (centre - 14, centre + 7)] * self.correlated)
+        mount = [(-math.inf, math.inf)] * 2 if self.fit_mount else []
+        low, high = np.array([(0.0, 0.0 if self.area is None else 1.0), *shape, *mount]).T
+        return low, high
+
+    def scales(self, theta: Floats) -> Floats:
+        sigma = math.exp(-theta[1])
+        return np.array(
+            [of_weight(theta[0]), 1.0, *[1 / self.spread, 1.0] * self.correlated, *[sigma] * 2 * self.fit_mount]
+        )
+
+    def starts(self) -> list[Floats]:
+        starts = []
+        for narrow, weight in ((1.0, 0.05), (0.3, 0.3), (0.1, 0.5), (3.0, 0.01)):
+            log_a = -math.log(narrow * self.spread)
+            shape = [log_a, 0.0, log_a] if self.correlated else [log_a]
+            mount = list(self.mount) if self.fit_mount else []
+            starts.append(np.array([weight if self.area is not None else 0.0, *shape, *mount]))
+        return starts
+
+    def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
+        x, y = self.errors.T
+        c, s = self.cosines, self.sines
+        if self.fit_mount:
+            mx, my = theta[-2:]
+            x, y = x - (c * mx - s * my), y - (s * mx + c * my)
+        a, b, d = self._whitening(theta)
+        u, v = a * x, b * x + d * y
+        hit = math.log(a) + math.log(d) - _LOG_TWO_PI - 0.5 * (u * u + v * v)
+        parts = [(1 - theta[0], hit)]
+        if self.area is not None:
+            parts.append((float(theta[0]), np.where(self.inside, -math.log(self.area), -math.inf)))
+        log_p, shares, ratios = mix(parts)
+        columns = [ratios[1] - ratios[0] if self.area is not None else np.zeros(len(x))]
+        columns += [1 - u * u, -v * x, 1 - v * d * y] if self.correlated else [2 - u * u - v * v]
+        if self.fit_mount:
+            # -d hit / d error, by the turned axes of the robot.
+            g, h = a * u + b * v, d * v
+            columns += [g * c + h * s, h * c - g * s]
+        return log_p, np.stack([columns[0], *(shares[0] * column for column in columns[1:])], axis=1)
+
+    def _whitening(self, theta: Floats) -> tuple[float, float, float]:
+        a = math.exp(theta[1])
+        return (a, float(theta[2]), math.exp(theta[3])) if self.correlated else (a, 0.0, a)
+
+    def covariance(self, theta: Floats) -> Floats:
+        """Return the (2, 2) covariance matrix, symmetric to the last bit."""
+        a, b, d = self._whitening(theta)
+        xx, xy = 1 / a**2, -b / (a * a * d)
+        return np.array([[xx, xy], [xy, (b / (a * d)) ** 2 + 1 / d**2]])
+
+    def values(self, theta: Floats) -> dict[str, float]:
+        values = {"z_hit": 1 - float(theta[0]), "z_rand": float(theta[0])}
+        if self.correlated:
+            c = self.covariance(theta)
+            values |= {
+                "covariance_xx": float(c[0, 0]),
+                "covariance_xy": float(c[0, 1]),
+                "covariance_yy": float(c[1, 1]),
+            }
+        else:
+            values["sigma"] = math.exp(-theta[1])
+        return values | ({"mount_x": float(theta[-2]), "mount_y": float(theta[-1])} if self.fit_mount else {})
+
+
+def fit_position_parameters(
+    poses: ArrayLike,
+    fixes: ArrayLike,
+    *,
+    correlated: bool = False,
+    region: tuple[float, float, float, float] | None = None,
+    mount: tuple[float, float] = (0.0, 0.0),
+    fit_mount: bool = False,
+    blocks: ArrayLike | None = None,
+    max_iterations: int = 200,
+    tolerance: float = 1e-8,
+) -> PointFit[PositionParameters]:
+    """Fit the parameters of position fixes at known poses, by maximum likelihood.
+
+    The likelihood is that of :class:`PositionModel`.
+
+    Args:
+        poses: (F, 3) robot poses (x, y, theta) in the world [m, m, rad].
+        fixes: (F, 2) measured x and y of the antenna [m]. One that is not finite is missing.
+        correlated: Whether to fit a covariance matrix in place of one deviation along x and y.
+        region: The rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; with it their weight is fitted.
+        mount: The antenna's position (x, y) on the robot [m], or the start of its fit.
+        fit_mount: Whether to fit the mount, which headings that vary determine.
+        blocks: None, or (F,) integer labels of fixes whose errors are correlated, for standard errors.
+        max_iterations: Most iterations of a search.
+        tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
+
+    Returns:
+        The fit. Entries of a covariance matrix are named ``covariance_xx``, ``covariance_xy`` and ``covariance_yy``.
+
+    Raises:
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above, the shapes differ, or there is no reading.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> poses = rng.uniform((0, 0, -3), (50, 50, 3), (900, 3))
+        >>> fit = gs.fit_position_parameters(poses, poses[:, :2] + rng.normal(0, 2, (900, 2)))
+        >>> fit.converged, round(fit.parameters.sigma, 1)
+        (True, 2.0)
+    """
+    for name, value in (("correlated", correlated), ("fit_mount", fit_mount)):
+        if not isinstance(value, bool):
+            raise TypeError(f"{name}: must be True or False, got {checks.show(value)}")
+    most = checks.integer("max_iterations", max_iterations, low=1)
+    least = checks.real("tolerance", tolerance, above=0)
+    base = PositionParameters(region=region, mount=mount)
+    pose = checks.array("poses", poses, ("F", 3))
+    z = checks.array("fixes", fixes, (len(pose), 2), finite=False)
+    labels = None if blocks is None else check_labels(blocks, len(pose))
+    used = np.isfinite(z).all(axis=1)
+    if not used.any():
+        raise ValueError(f"fixes: must hold one that is finite, got {len(z)} without")
+    area, inside = None, np.zeros(int(used.sum()), bool)
+    if base.region is not None:
+        x, y, far_x, far_y = base.region
+        area, inside = (far_x - x) * (far_y - y), ((z[used] >= (x, y)) & (z[used] <= (far_x, far_y))).all(axis=1)
+    numbers = number_blocks(None if labels is None else labels[used])
+    start = base.mount
+    errors = z[used] - places_of(pose[used], (0.0, 0.0) if fit_mount else start)
+    shown = errors if not fit_mount else z[used] - places_of(pose[used], start)
+    spread = 1.4826 * float(np.median(np.abs(shown))) or float(np.abs(shown).max()) or 1e-6
+    heading = pose[used, 2]
+    problem = _Fixes(errors, np.cos(heading), np.sin(heading), inside, correlated, area, start, fit_mount, spread)
+    end = maximize(problem, most, least)
+    c = problem.covariance(end.theta)
+    found = dict(covariance=c) if correlated else dict(sigma=float(math.exp(-end.theta[1])))
+    rand = float(end.theta[0])
+    at = (float(end.theta[-2]), float(end.theta[-1])) if fit_mount else start
+    parameters = PositionParameters(**found, z_hit=1 - rand, z_rand=rand, region=base.region, mount=at)
+    return report(problem, end, parameters, numbers, int((~used).sum()))

@@ -1,0 +1,124 @@
+"""Maximise a log-likelihood within bounds: Newton steps from the likeliest of several starts.
+
+A coordinate at a bound stays there while the gradient points outwards. In the others a step goes along the axes of the
+second derivatives, uphill along each of them, and is halved until the log-likelihood rises enough (Nocedal and Wright,
+*Numerical Optimization*, sections 3.4 and 16.7).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.learning.point.problem import Floats, Problem
+
+# Starts that are climbed from, and readings that choose between them.
+_CLIMBED, _SAMPLE = 3, 20_000
+# Smallest share of the expected rise that a step must bring, and most halvings.
+_ARMIJO, _HALVINGS = 1e-4, 50
+# Scaled curvature below this share of the largest counts as none; errors of differences stay below the second.
+_FLAT, _NEGATIVE = 1e-10, 1e-7
+
+
+@dataclass(frozen=True)
+class Climb:
+    """End of a search.
+
+    Attributes:
+        theta: (k,) coordinates.
+        value: Log-likelihood.
+        trace: Log-likelihood at the start and after each iteration.
+        converged: Whether the end is a maximum.
+        free: (k,) mask of the coordinates that no bound holds.
+    """
+
+    theta: Floats
+    value: float
+    trace: list[float]
+    converged: bool
+    free: NDArray[np.bool_]
+
+
+def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None = None) -> Climb:
+    """Search from the likeliest starts, on some of the readings if there are many, and then on all of them.
+
+    Args:
+        problem: The problem.
+        max_iterations: Most iterations of a search.
+        tolerance: A search has converged once it expects to gain less than this [nats].
+        start: The only start; None for those of the problem.
+    """
+    if start is not None:
+        return climb(problem, start, max_iterations, tolerance)
+    every = max(1, problem.readings // _SAMPLE)
+    sample = problem.part(every) if every > 1 else problem
+    low, high = problem.bounds()
+    starts = [np.clip(each, low, high) for each in problem.starts()]
+    starts = sorted(starts, key=lambda each: -sample.total(each)[0])[:_CLIMBED]
+    ends = [climb(sample, each, max_iterations, tolerance) for each in starts]
+    best = max(ends, key=lambda end: end.value)
+    return best if sample is problem else climb(problem, best.theta, max_iterations, tolerance)
+
+
+def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float) -> Climb:
+    """Search for a maximum from one start."""
+    low, high = problem.bounds()
+    theta: Floats = np.clip(start, low, high)
+    value, gradient = problem.total(theta)
+    trace, converged = [value], False
+    for _ in range(max_iterations):
+        step, gain, top = _step(problem, theta, gradient, _free(theta, gradient, low, high))
+        if top and gain < tolerance:
+            converged = True
+            break
+        moved = _line_search(problem, theta, value, gradient, step)
+        if moved is None:
+            # A gain within the rounding errors of the sum cannot be measured.
+            converged = top and gain < 1e-12 * max(abs(value), 1.0)
+            break
+        theta, value, gradient = moved
+        trace.append(value)
+    return Climb(theta, value, trace, converged, _free(theta, gradient, low, high))
+
+
+def _free(theta: Floats, gradient: Floats, low: Floats, high: Floats) -> NDArray[np.bool_]:
+    return ~(((theta <= low) & (gradient <= 0)) | ((theta >= high) & (gradient >= 0)))
+
+
+def _step(problem: Problem, theta: Floats, gradient: Floats, free: NDArray[np.bool_]) -> tuple[Floats, float, bool]:
+    """Return the (k,) step, the expected gain, and whether the curvature is that of a maximum."""
+    step = np.zeros(len(theta))
+    if not free.any():
+        return step, 0.0, True
+    curve, g, scale = -problem.hessian(theta, free), gradient[free], problem.scales(theta)[free]
+    diagonal = np.abs(np.diag(curve)) * scale**2
+    scale = scale / np.sqrt(np.maximum(diagonal, max(1e-12 * float(diagonal.max()), 1e-300)))
+    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+    flat = _FLAT * max(float(np.abs(size).max()), 1e-300)
+    along: Floats = axes.T @ (scale * g)
+    moves = along / np.maximum(np.abs(size), flat)
+    step[free] = scale * (axes @ moves)
+    # A step of more than a few scales leaves the region where the curvature holds.
+    limit = 4 * problem.scales(theta)
+    step *= min(1.0, float((limit / np.maximum(np.abs(step), 1e-300)).min()))
+    top = bool(size.min() >= -_NEGATIVE * float(np.abs(size).max()))
+    return step, 0.5 * float(along @ moves), top
+
+
+def _line_search(
+    problem: Problem, theta: Floats, value: float, gradient: Floats, step: Floats
+) -> tuple[Floats, float, Floats] | None:
+    """Return the first point along the step that is likely enough, its log-likelihood and gradient; or None."""
+    low, high = problem.bounds()
+    for halvings in range(_HALVINGS):
+        moved: Floats = np.clip(theta + step * 0.5**halvings, low, high)
+        if np.array_equal(moved, theta):
+            return None
+        reached, slope = problem.total(moved)
+        rise = float(gradient @ (moved - theta))
+        if math.isfinite(reached) and reached > value and reached >= value + _ARMIJO * rise:
+            return moved, reached, slope
+    return None

@@ -1,0 +1,109 @@
+"""Options of a scan match, and the rules of kernels that follow from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.interface.structs import MatchRules
+
+# Points that take part while the scale shrinks, and of each start of a search.
+_COARSE_POINTS, _SEARCH_POINTS = 200, 30
+# Largest translation of a guess between scans [m]; float32 has 6 cm there.
+_FARTHEST = 1e6
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Options of a match.
+
+    Attributes:
+        noise: Standard deviation of ranges [m].
+        capture: Farthest distance between paired points at the start [m].
+        window: Half widths of the search in x and y [m] and theta [rad] about a guess from which ICP fails.
+    """
+
+    noise: float
+    capture: float
+    window: tuple[float, float]
+
+    @property
+    def least_scale(self) -> float:
+        """Scale of the last weights [m]."""
+        return max(3 * self.noise, 0.03 * self.capture)
+
+    def rules(self, points: int, gap: float) -> MatchRules:
+        """Return the rules of a match from a guess; ``points`` is the number of points of a scan."""
+        stride = max(points // _COARSE_POINTS, 1)
+        scale, least = self.capture, self.least_scale
+        near = max(0.3 * self.capture, 3 * least)
+        return MatchRules(40, stride, (stride + 1) // 2, 0, self.capture, near, max(scale, least), least, 0.85, gap,
+                          near, 1e-4 * self.capture)  # fmt: skip
+
+    def search_rules(self, points: int, gap: float) -> MatchRules:
+        """Return the rules of the many starts of a search: few points, few iterations."""
+        full = self.rules(points, gap)
+        stride, least = max(points // _SEARCH_POINTS, 1), max(2.5 * full.least_scale, 0.08 * self.capture)
+        return full._replace(
+            iterations=6, stride=stride, score_stride=stride, thin=1, capture=max(0.7 * self.capture, full.near),
+            scale=max(0.35 * self.capture, least), least_scale=least, shrink=0.55, tolerance=3e-3 * self.capture,
+        )  # fmt: skip
+
+    def final_rules(self, points: int, gap: float) -> MatchRules:
+        """Return the rules of the refinement of a search's best starts."""
+        full = self.rules(points, gap)
+        return full._replace(iterations=30, capture=max(0.4 * self.capture, full.near),
+                             scale=max(0.1 * self.capture, full.least_scale))  # fmt: skip
+
+    def starts(self) -> np.ndarray:
+        """Return (M, 3) offsets of the starts of a search: a hexagonal grid of places times headings."""
+        step, turn = 0.6 * self.capture, math.radians(15.0)
+        reach, half = self.window
+        rings = int(reach / step * 2 / math.sqrt(3)) + 1
+        i, j = np.meshgrid(np.arange(-2 * rings, 2 * rings + 1), np.arange(-rings, rings + 1))
+        x, y = step * (i + 0.5 * j).ravel(), step * (math.sqrt(0.75) * j).ravel()
+        inside = np.hypot(x, y) <= max(reach, 1e-9) * (1 + 1e-9)
+        count = int(half / turn + 1e-9)
+        turns = turn * np.arange(-count, count + 1)
+        places = np.stack([x[inside], y[inside]], axis=1)
+        return np.concatenate([np.column_stack([places, np.full(len(places), angle)]) for angle in turns])
+
+
+def check_options(noise: object, capture: object, window: object) -> MatchOptions:
+    """Check the options of a match.
+
+    Raises:
+        TypeError, ValueError: an option breaks its rule.
+    """
+    values = checks.array("window", window, (2,))
+    reach = checks.real("window[0]", float(values[0]), low=0.0)
+    turn = checks.real("window[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
+    options = MatchOptions(
+        checks.real("noise", noise, low=0.0), checks.real("capture", capture, above=0.0), (reach, turn)
+    )
+    if reach > 20 * options.capture:
+        raise ValueError(f"window: must reach at most 20 times capture = {options.capture}, got {reach}")
+    return options
+
+
+def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST) -> np.ndarray:
+    """Return the guesses of S matches, (S, 3), headings in [-pi, pi].
+
+    Args:
+        guess: (3,) or (S, 3).
+        matches: S, or None for a single match.
+        farthest: Largest coordinate.
+    """
+    read = checks.as_array("guess", guess)
+    shape = (3,) if read.ndim != 2 else ("S" if matches is None else matches, 3)
+    values = checks.array("guess", read, shape)
+    if values.ndim == 2 and matches is None:
+        raise ValueError(f"guess: shape must be (3,) for a single match, got {checks.shape_text(values.shape)}")
+    if np.abs(values[..., :2]).max(initial=0.0) > farthest:
+        raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
+    result = np.array(np.broadcast_to(values, (1 if matches is None else matches, 3)))
+    result[:, 2] = np.angle(np.exp(1j * result[:, 2]))
+    return result

@@ -1,0 +1,118 @@
+"""Result of a scan match: pose, covariance, and whether to trust them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+STATUSES = {
+    "converged": "the scans agree, and every direction of the pose is observed",
+    "unobservable": "the scans agree, but some direction of the pose is not observed, as along a corridor",
+    "ambiguous": "another pose agrees about as well; the covariance spans both",
+    "few points": "too few pairs of points: nothing is known about the pose",
+    "no overlap": "the scans see hardly anything in common: nothing is known about the pose",
+    "poor": "too much of one scan contradicts the other: nothing is known about the pose",
+    "no convergence": "the iterations ended before the steps were small: nothing is known about the pose",
+}
+"""The meaning of each status."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScanMatch:
+    """The pose of a scan in the frame of an earlier scan or of a map, from :func:`gpusense.match_scan`.
+
+    Fields have a leading axis (S,) for S matches.
+
+    Attributes:
+        pose: (3,) x, y [m] and theta [rad, in -pi to pi] of the second scan's robot frame in the reference's robot
+            frame, or in the world for a map.
+        covariance: (3, 3) of x, y, theta [m^2, m rad, rad^2]; infinite along directions that nothing constrains, and
+            where the match failed.
+        score: Share of the points in common sight that agree, 1 at best; points that one scan saw through count
+            against it.
+        iterations: Iterations of the last refinement.
+        converged: Whether the pose may be used along its observed directions.
+        eigenvalues: (3,) ascending: the share of pairs of points that constrain each direction of the pose; 0 if none.
+        directions: (3, 3) rows: the directions of the eigenvalues in x [m], y [m] and theta, where theta is multiplied
+            by ``lever``.
+        lever: Root mean square range of the second scan [m].
+        status: One of :data:`gpusense.matching.result.STATUSES`; an array of strings for S matches.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.0175, count=356, range_max=9.0)
+        >>> b = scanner.bearings
+        >>> room = np.minimum(3 / np.abs(np.cos(b)), 2 / np.abs(np.sin(b)))
+        >>> match = gs.match_scan(room, room, scanner, backend="numpy")
+        >>> match.status, bool(abs(match.pose).max() < 1e-3)
+        ('converged', True)
+    """
+
+    pose: Floats
+    covariance: Floats
+    score: Floats
+    iterations: NDArray[np.int64]
+    converged: NDArray[np.bool]
+    eigenvalues: Floats
+    directions: Floats
+    lever: Floats
+    status: str | NDArray[np.str_]
+
+    def __len__(self) -> int:
+        if self.pose.ndim == 1:
+            raise TypeError("a single match has no length")
+        return len(self.pose)
+
+    def __getitem__(self, index: int) -> ScanMatch:
+        """Return one of S matches."""
+        if self.pose.ndim == 1:
+            raise TypeError("a single match has no items")
+        values = {field.name: getattr(self, field.name)[index] for field in fields(self)}
+        return ScanMatch(**values | {"status": str(values["status"])})
+
+    @classmethod
+    def joined(cls, matches: list[ScanMatch]) -> ScanMatch:
+        """Return the matches of several calls as one, in their order; at least one."""
+        return cls(**{f.name: np.concatenate([getattr(match, f.name) for match in matches]) for f in fields(cls)})
+
+    def moved(self, frame: Floats) -> ScanMatch:
+        """Return S matches in the frame in which the reference's robot frames are at (S, 3) poses."""
+        c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
+        x, y, theta = self.pose.T
+        turn = (theta + frame[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        pose = np.stack([frame[:, 0] + c * x - s * y, frame[:, 1] + s * x + c * y, turn], axis=1)
+        zero, one = np.zeros(len(c)), np.ones(len(c))
+        turned = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+        lost = np.isinf(self.covariance)
+        finite = turned @ np.where(lost, 0, self.covariance) @ turned.transpose(0, 2, 1)
+        # The signs of infinite parts, and no trace of rounding.
+        part = turned @ np.where(lost, np.sign(self.covariance), 0) @ turned.transpose(0, 2, 1)
+        covariance = np.where(np.abs(part) > 1e-3, np.copysign(np.inf, part), finite)
+        directions = self.directions @ turned.transpose(0, 2, 1)
+        return replace(self, pose=pose, covariance=covariance, directions=directions)
+
+    def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
+        """Return S matches with the chosen ones of others in place of some rows."""
+        values = {}
+        for field in fields(self):
+            values[field.name] = np.array(getattr(self, field.name))
+            values[field.name][rows[chosen]] = getattr(others, field.name)[chosen]
+        return ScanMatch(**values)
+
+    def explain(self) -> str:
+        """Return status and its meaning, for one match or counted over many."""
+        if isinstance(self.status, str):
+            return f"{self.status}: {STATUSES[self.status]}"
+        names, counts = np.unique(self.status, return_counts=True)
+        return "\n".join(f"{count} {name}: {STATUSES[name]}" for name, count in zip(names, counts, strict=True))
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, str):
+            x, y, theta = self.pose
+            return f"ScanMatch({self.status}, x={x:.4g}, y={y:.4g}, theta={theta:.4g}, score={float(self.score):.3g})"
+        return f"ScanMatch({len(self)} matches, {np.count_nonzero(self.converged)} converged)"

@@ -1,0 +1,250 @@
+"""Matches of scans to a map: to expected scans, by Gauss-Newton on likelihood fields, and by searches.
+
+A likelihood field measures distances to the centres of occupied cells, half a cell behind the surface that a laser
+sees. Expected scans have the surfaces themselves, and say what a scan could not see.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.matching.chain import DOUBTFUL, concluded, match_pairs, wrapped
+from gpusense.matching.options import MatchOptions
+from gpusense.matching.points import scan_points
+from gpusense.matching.result import ScanMatch
+from gpusense.matching.score_tables import ScoreTables, field_scores
+from gpusense.matching.search import PoseGrid, Search
+from gpusense.matching.uncertainty import Uncertainty, spread
+from gpusense.models.scan.caster import RayCaster
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.tables.distances import distance_transform
+from gpusense.world.frames import ray_vectors
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.scanner import Reading, Scanner, classes
+
+# Weight of readings that have nothing to do with the map.
+_RANDOM = 0.2
+# Least deviation of a field in cells; iterations of each field; the largest step that ends them [m, rad].
+_LEAST_CELLS, _ITERATIONS, _SMALL = 1.5, 15, 1e-4
+# A score below this is a failure. Least hits, and least pairs and share of pairs that observe a direction.
+_POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 8, 2.0, 0.01
+# Positions and headings of a search: cells apart, and points apart at a scan's rms range; most levels of its tables.
+_SEARCH_CELL, _LEVELS = 0.1, 4
+
+
+class MapMatcher:
+    """Fields of a map for one scanner.
+
+    Args:
+        grid: The map.
+        scanner: The scanner.
+        backend: The device.
+        precision: Precision of the fields.
+        options: Capture radius, noise and window.
+    """
+
+    def __init__(
+        self, grid: OccupancyGrid, scanner: Scanner, backend: Backend, precision: str, options: MatchOptions
+    ) -> None:
+        self._grid, self._scanner, self._backend, self._options = grid, scanner, backend, options
+        finest = max(_LEAST_CELLS * grid.resolution, 2 * options.noise)
+        sigmas = [finest]
+        while sigmas[-1] < 0.3 * options.capture:
+            sigmas.append(2.5 * sigmas[-1])
+        self._sigmas = sigmas[::-1]
+        self._models = [self._model(sigma, precision) for sigma in self._sigmas]
+        self._search: Search | None = None
+        self._stride = max(round(_SEARCH_CELL * options.capture / grid.resolution), 1)
+        self._real = np.dtype(precision)
+        self._caster = RayCaster(grid, scanner.range_max, backend=backend, precision=precision)  # type: ignore[arg-type]
+
+    def _model(self, sigma: float, precision: str) -> LikelihoodFieldModel:
+        farthest = max(self._options.capture, 4 * sigma)
+        parameters = LikelihoodFieldParameters(
+            z_hit=1 - _RANDOM, z_rand=_RANDOM, sigma_hit=sigma, max_distance=farthest, interpolation="bilinear"
+        )
+        return LikelihoodFieldModel(
+            self._grid, self._scanner, parameters, backend=self._backend, precision=precision  # type: ignore[arg-type]
+        )  # fmt: skip
+
+    def match(self, ranges: np.ndarray, guess: np.ndarray, method: str) -> ScanMatch:
+        """Match (S, K) readings from (S, 3) guesses in the world."""
+        if method == "auto":
+            return self._chain(ranges, guess)
+        if method == "correlative":
+            pose, iterations = self.searched(ranges, guess), np.zeros(len(guess))
+            calm = np.ones(len(guess), bool)
+        else:
+            pose, iterations, calm = self.refined(ranges, guess)
+        return self._finished(ranges, pose, iterations, calm, method)
+
+    def _chain(self, ranges: np.ndarray, guess: np.ndarray) -> ScanMatch:
+        """Match to expected scans at the guesses, then at the poses found; search the map where that fails."""
+        found = self._to_expected(ranges, self._to_expected(ranges, guess, "auto").pose, "icp")
+        poor = np.flatnonzero((found.score < DOUBTFUL) & (self._hits(ranges).sum(axis=1) >= _FEW))
+        if not len(poor):
+            return found
+        pose = self.refined(ranges[poor], self.searched(ranges[poor], guess[poor]))[0]
+        again = self._to_expected(ranges[poor], pose, "icp")
+        return found.replaced(poor, again, again.score > found.score[poor])
+
+    def _to_expected(self, ranges: np.ndarray, pose: np.ndarray, method: str) -> ScanMatch:
+        """Match readings to the expected readings at poses."""
+        scanner = self._scanner
+        x, y, yaw = scanner.mount
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        sensor = pose + np.stack([c * x - s * y, s * x + c * y, np.full(len(pose), yaw)], axis=1)
+        expected = self._caster.cast(sensor, scanner.bearings)
+        points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), scanner, self._real)
+        pairs = np.arange(2 * len(pose)).reshape(2, -1).T
+        local = match_pairs(
+            self._backend, self._real, points, pairs, np.zeros((len(pose), 3)), method, self._options, scanner.mount[:2]
+        )
+        return local.moved(pose)
+
+    def refined(self, ranges: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return poses of maximal likelihood from coarse to fine, iterations, and whether the last step was small."""
+        pose, count = guess.copy(), np.zeros(len(guess))
+        calm = np.zeros(len(guess), bool)
+        for model in self._models:
+            pose, iterations, calm = _climb(model, ranges, pose)
+            count += iterations
+        pose[:, 2] = wrapped(pose[:, 2])
+        return pose, count, calm
+
+    def searched(self, ranges: np.ndarray, guess: np.ndarray) -> np.ndarray:
+        """Return the poses with the largest scores in the windows around guesses, by branch and bound."""
+        grid, (reach, half) = self._grid, self._options.window
+        stride = self._stride
+        if self._search is None:
+            sigma = max(self._sigmas[0], 2 * grid.resolution)
+            distances = distance_transform(grid.occupied, resolution=grid.resolution, backend=self._backend)
+            scores = field_scores(distances, sigma, 3 * sigma)
+            self._search = Search(ScoreTables(self._backend, scores, levels=_LEVELS, stride=stride))
+        vectors = ray_vectors(self._scanner.bearings, self._scanner.mount)
+        hits, offset = self._hits(ranges), np.array(self._scanner.mount[:2])
+        points = [(z[hit, None] * vectors[hit] + offset) / grid.resolution for z, hit in zip(ranges, hits, strict=True)]
+        lever = max(float(np.sqrt(np.mean(ranges[hits].astype(np.float64) ** 2))) if hits.any() else 1.0, 1.0)
+        angle = min(stride * grid.resolution / lever, half) or 1.0
+        side = int(reach / (stride * grid.resolution))
+        local = grid.world_to_cells(guess[:, :2])
+        centres = np.column_stack([local, guess[:, 2] - grid.origin[2]])
+        poses = PoseGrid.around(centres, (side, side), int(half / angle), angle, stride)
+        found = self._search.find(points, poses)
+        best = poses.poses(found, stride)[found.best]
+        return np.column_stack(
+            [grid._to_world(best[:, :2] * grid.resolution), wrapped(best[:, 2] + grid.origin[2])]
+        )  # fmt: skip
+
+    def score(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return the mean of ``exp(-d^2 / (2 sigma^2))`` over the hits, with the finest field."""
+        near = self._nearness(ranges, pose)
+        return near.sum(axis=1) / np.maximum(self._hits(ranges).sum(axis=1), 1)
+
+    def _nearness(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return (S, K) values of ``exp(-d^2 / (2 sigma^2))``, 0 where there is no hit."""
+        model, sigma = self._models[-1], self._sigmas[-1]
+        _, parts = model.log_likelihood(pose[:, None], ranges, per_beam=True)
+        peak = (1 - _RANDOM) / (sigma * np.sqrt(2 * np.pi))
+        density = np.exp(parts[:, 0].astype(np.float64)) - _RANDOM / self._scanner.range_max
+        near: np.ndarray = np.where(self._hits(ranges), np.clip(density / peak, 0, 1), 0)
+        return near
+
+    def _hits(self, ranges: np.ndarray) -> np.ndarray:
+        hits: np.ndarray = classes(ranges, self._scanner.range_min, self._scanner.range_max) == Reading.HIT
+        return hits
+
+    def _finished(
+        self, ranges: np.ndarray, pose: np.ndarray, iterations: np.ndarray, calm: np.ndarray, method: str
+    ) -> ScanMatch:
+        """Return matches with covariance and status."""
+        sigma, hits, score = self._sigmas[-1], self._hits(ranges), self.score(ranges, pose)
+        _, _, information = self._models[-1].gradient(pose[:, None], ranges)
+        information = information[:, 0].astype(np.float64) * sigma**2
+        near = self._nearness(ranges, pose)
+        squared = -2 * sigma**2 * np.log(np.clip(near, 1e-6, 1))
+        variance = (near * squared).sum(axis=1) / np.maximum(near.sum(axis=1), 1e-9)
+        squares = np.where(hits, ranges, 0).astype(np.float64) ** 2
+        lever = np.maximum(np.sqrt(squares.sum(axis=1) / np.maximum(hits.sum(axis=1), 1)), 1e-3)
+        least = np.maximum(_LEAST_PAIRS, _LEAST_SHARE * near.sum(axis=1))
+        found: Uncertainty = spread(information, 0 * information, variance, near.sum(axis=1), lever, least)
+        # Surfaces are half a cell off the centres of cells, and poses of a search are on a grid.
+        spacing = self._stride * self._grid.resolution / math.sqrt(12) if method == "correlative" else 0.0
+        bias = np.hypot(0.5 * self._grid.resolution, spacing)
+        covariance = found.covariance.copy()
+        covariance[:, [0, 1], [0, 1]] += bias**2
+        covariance[:, 2, 2] += (bias / lever) ** 2
+        found = found._replace(covariance=covariance)
+        status = np.full(len(pose), "converged", dtype="<U16")
+        status[~found.observed.all(axis=1)] = "unobservable"
+        status[~calm] = "no convergence"
+        status[score < _POOR] = "poor"
+        status[hits.sum(axis=1) < _FEW] = "few points"
+        other = np.full((len(pose), 3), np.nan)
+        return concluded(pose, found, score, iterations, status, lever, other)
+
+
+def _climb(
+    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Maximise the log-likelihoods of (S, K) readings from (S, 3) poses by Levenberg's damped Gauss-Newton steps."""
+    scans = len(pose)
+    damping, count, calm = np.full(scans, 1e-3), np.zeros(scans), np.zeros(scans, bool)
+    value, gradient, information = _evaluated(model, ranges, pose)
+    for _ in range(_ITERATIONS):
+        moving = ~calm
+        if not moving.any():
+            break
+        diagonal = np.einsum("sii->si", information)
+        damped = (
+            information
+            + np.eye(3) * (damping[:, None] * diagonal + 1e-6 * (1 + diagonal.max(axis=1))[:, None])[:, None]
+        )
+        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        length = np.hypot(step[:, 0], step[:, 1])
+        step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
+        step[~moving] = 0
+        trial = pose + step
+        new_value, new_gradient, new_information = _evaluated(model, ranges, trial)
+        better = moving & (new_value >= value)
+        pose = np.where(better[:, None], trial, pose)
+        value = np.where(better, new_value, value)
+        gradient = np.where(better[:, None], new_gradient, gradient)
+        information = np.where(better[:, None, None], new_information, information)
+        count += moving
+        damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-6, 1e6)
+        calm |= moving & (np.abs(step).max(axis=1) < (_SMALL if model.precision == "float64" else 3 * _SMALL))
+    return pose, count, calm
+
+
+def _evaluated(
+    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return log p (S,), gradient and information of one pose for each scan."""
+    log_p, gradient, information = model.gradient(pose[:, None], ranges)
+    return log_p[:, 0].astype(np.float64), gradient[:, 0].astype(np.float64), information[:, 0].astype(np.float64)
+
+
+_LOCK = threading.Lock()
+# The last matchers; each keeps its map alive, so that an id stays its own.
+_KEPT: dict[tuple[object, ...], MapMatcher] = {}
+_MOST_KEPT = 4
+
+
+def match_to_map(
+    grid: OccupancyGrid, ranges: np.ndarray, scanner: Scanner, guess: np.ndarray, method: str, backend: Backend,
+    precision: str, options: MatchOptions,
+) -> ScanMatch:  # fmt: skip
+    """Match (S, K) readings to a map from (S, 3) guesses; fields of the last maps are kept."""
+    key = (id(grid), scanner, id(backend), precision, options)
+    with _LOCK:
+        matcher = _KEPT.pop(key, None) or MapMatcher(grid, scanner, backend, precision, options)
+        _KEPT[key] = matcher
+        while len(_KEPT) > _MOST_KEPT:
+            del _KEPT[next(iter(_KEPT))]
+        return matcher.match(ranges, guess, method)

@@ -1,0 +1,75 @@
+"""Gradient and information of an interpolated likelihood field for the poses of a request."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import GRADIENT_NUMBERS
+from gpusense.interface.launches import launch
+from gpusense.interface.structs import ScanBatch, Score
+from gpusense.models.run import Piece, run_pieces
+from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.field_pipeline import FieldPipeline
+from gpusense.models.scan.readings import Readings, placing_launches
+from gpusense.models.scan.request import Request
+
+# Flags of the mixture that the kernel does not know.
+_OTHERS = {"LOG_TABLE", "CUBES"}
+
+
+def gradients(pipeline: FieldPipeline, request: Request, space: Workspace) -> np.ndarray:
+    """Return log p, its gradient (3) and the information (6) of the S N poses, (S N, 10) in the grid's frame."""
+    result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
+    for particles, scans in pipeline.groups(request):
+        if particles.count:
+            most = pipeline.chunk(4 * scans.most_readings)
+            run_pieces(space, particles, most, _Gradient(pipeline, request, particles, scans, space, result))
+    return result
+
+
+class _Gradient:
+    """Run the programs of one group of scans."""
+
+    def __init__(
+        self, pipeline: FieldPipeline, request: Request, particles: Piece, scans: ClassedScans, space: Workspace,
+        result: np.ndarray,
+    ) -> None:  # fmt: skip
+        self._pipeline, self._request, self._space, self._result = pipeline, request, space, result
+        self._first, self._scans = particles.scans[0], scans
+
+    def __call__(self, piece: Piece) -> None:
+        first, last = piece.scans
+        scans = self._scans.part(first - self._first, last - self._first)
+        rows = self._result[piece.begin : piece.end]
+        if (value := self._pipeline.value(scans)) is not None:
+            rows[:, 0] = value
+            return
+        self._run(piece, self._pipeline.upload(scans, self._space), rows)
+
+    def _run(self, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
+        pipeline, space, backend = self._pipeline, self._space, self._pipeline.backend
+        placed, table = pipeline.place(self._request.poses, piece.part, space)
+        numbers = space.empty("gradient", GRADIENT_NUMBERS * piece.count, pipeline.real)
+        resolution = pipeline.grid.resolution
+        mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
+        gradient = launch(
+            "field_gradient", (pipeline.components | readings.flags) - _OTHERS, (piece.count,), table=table,
+            pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, point=readings.arguments["point"],
+            point_low=readings.arguments["point_low"], terms=pipeline.terms, start=readings.arguments["start"],
+            constant_terms=readings.sums["constant_terms"], gradient=numbers, window=placed.frame.window,
+            particles=piece.count, readings=readings.readings, guard=pipeline.guard * readings.reach, mount_x=mount_x,
+            mount_y=mount_y, resolution=resolution, score=Score(readings.constant_term, pipeline.setting.temperature),
+            batch=ScanBatch(piece.count // readings.scans, 0),
+        )  # fmt: skip
+        backend.run((*placing_launches(placed, readings.placing), gradient))
+        space.download(numbers, rows)
+
+
+def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return log p (M,), gradient (M, 3) and information (M, 3, 3) in the world from numbers in the grid's frame."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    information = numbers[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3)
+    real = numbers.dtype
+    return numbers[:, 0], (numbers[:, 1:4] @ turned.T).astype(real), (turned @ information @ turned.T).astype(real)

@@ -1,0 +1,232 @@
+"""Scan matching by point-to-line ICP with exact nearest points.
+
+The points of a scan are sorted by bearing. Kernels search from the bearing of a place outwards, until no point farther
+in bearing can be nearer; the reference compares all points.
+
+Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
+Geman and McClure's, ``(1 / (1 + (e / c)^2))^2``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface import structs
+from gpusense.interface.constants import MATCH_RESULT
+
+FULL_TURN = 6.283185307179586
+# Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+UNSEEN = 0.13
+
+
+def bearing_of(place: np.ndarray) -> np.ndarray:
+    """Return the bearings of (N, 2) places in [0, 2 pi)."""
+    bearing = np.arctan2(place[:, 1], place[:, 0])
+    return np.where(bearing < 0, bearing + place.dtype.type(FULL_TURN), bearing)
+
+
+def points_before(point: np.ndarray, bearing: np.ndarray) -> np.ndarray:
+    """Return the numbers of points of a scan whose bearings are less than some bearings."""
+    return np.searchsorted(point[:, 2], bearing, side="left")
+
+
+def nearest_point(point: np.ndarray, place: np.ndarray, squared: float) -> np.ndarray:
+    """Return the nearest points of a scan that are nearer than the square root of ``squared``, -1 without one."""
+    d = point[None, :, :2] - place[:, None]
+    distance = d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1]
+    which = distance.argmin(axis=1)
+    return np.where(distance[np.arange(len(place)), which] < squared, which, -1)
+
+
+def add_pairing(
+    line: np.ndarray, place: np.ndarray, arm: np.ndarray, scale: np.floating, last: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return sums over pairs of a line and a place: information, gradient, errors of the lines, and three numbers.
+
+    The numbers are the sum of weights, the weighted sum of squared errors, and the number of pairs. ``arm`` is the
+    place relative to the second scan's origin.
+    """
+    x, y = line[:, 0], line[:, 1]
+    error = x * place[:, 0] + y * place[:, 1] - line[:, 2]
+    weight = 1 / (1 + (error / scale) ** 2)
+    if last:
+        weight = weight * weight
+    jacobian = np.stack([x, y, y * arm[:, 0] - x * arm[:, 1]])
+    across = np.stack([-y, x, x * arm[:, 0] + y * arm[:, 1]])
+    information = (weight * jacobian) @ jacobian.T
+    doubt = (weight * line[:, 3] * across) @ across.T
+    return (
+        information, -(jacobian @ (weight * error)), doubt,
+        np.array([weight.sum(), (weight * error * error).sum(), len(error)], line.dtype),
+    )  # fmt: skip
+
+
+def solve(information: np.ndarray, gradient: np.ndarray) -> np.ndarray | None:
+    """Solve the damped normal equations: the step in x, y and theta, None without one."""
+    real = information.dtype.type
+    damped = information.copy()
+    damping = real(1e-5) * (damped[0, 0] + damped[1, 1]) + real(1e-9)
+    damped[0, 0] += damping
+    damped[1, 1] += damping
+    damped[2, 2] = damped[2, 2] * real(1.00001) + real(1e-9)
+    try:
+        factor = np.linalg.cholesky(damped)
+    except np.linalg.LinAlgError:
+        return None
+    return np.linalg.solve(factor.T, np.linalg.solve(factor, gradient)).astype(real)
+
+
+def agreement(
+    point: np.ndarray, line: np.ndarray, other: np.ndarray, stride: int, pose: np.ndarray, near: float, gap: float
+) -> np.ndarray:
+    """Return how well every stride-th point of one scan agrees with another scan.
+
+    The four numbers are the sum of agreements, points that the other scan should see, points that contradict it because
+    it saw through them, and points that it did not see. ``pose`` is (x, y, cos, sin).
+    """
+    p = other[::stride]
+    x = pose[2] * p[:, 0] - pose[3] * p[:, 1] + pose[0]
+    y = pose[3] * p[:, 0] + pose[2] * p[:, 1] + pose[1]
+    place = np.stack([x, y], axis=1)
+    which = nearest_point(point, place, near * near)
+    at = line[which]
+    ratio = (at[:, 0] * x + at[:, 1] * y - at[:, 2]) / (near / 3)
+    ahead, count = points_before(point, bearing_of(place)), len(point)
+    low, high = point[np.where(ahead > 0, ahead - 1, count - 1)], point[np.where(ahead < count, ahead, 0)]
+    between = high[:, 2] - low[:, 2]
+    between = np.where(between < 0, between + point.dtype.type(FULL_TURN), between)
+    range_ = np.minimum(low[:, 3], high[:, 3])
+    paired, through = which >= 0, (between <= gap) & (x * x + y * y < range_ * range_)
+    agreements = np.where(paired, 1 / (1 + ratio * ratio), 0).sum()
+    counts = [np.count_nonzero(mask) for mask in (paired, ~paired & through, ~paired & ~through)]
+    return np.array([agreements, *counts], point.dtype)
+
+
+def fit_lines(
+    flags: frozenset[str],
+    point: np.ndarray,
+    start: np.ndarray,
+    line: np.ndarray,
+    scans: int,
+    points: int,
+    reach: int,
+    most: int,
+    ratio: float,
+    slack: float,
+    width: float,
+) -> None:
+    """Fit a line to each point and ``reach`` neighbours on either side, up to ``most`` within a distance of ``width``.
+
+    None of them is farther from the last one than ``slack`` plus ``ratio`` times its range. A line is a unit normal, an
+    offset, and 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam,
+    -1 in place of that sum, and no pairs.
+    """
+    for scan in range(scans):
+        mine = point[start[scan] : start[scan + 1]]
+        count = len(mine)
+        sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)
+        for direction in (-1, 1):
+            last, joined = mine, np.ones(count, bool)
+            for j in range(1, most + 1):
+                if 2 * j >= count:
+                    break
+                following = mine[(np.arange(count) + direction * j) % count]
+                between = following[:, :2] - last[:, :2]
+                joined = joined & ((between**2).sum(axis=1) <= (slack + ratio * last[:, 3]) ** 2)
+                if j > reach:
+                    joined = joined & (((following[:, :2] - mine[:, :2]) ** 2).sum(axis=1) <= width * width)
+                x, y = (np.where(joined, following[:, i] - mine[:, i], 0) for i in (0, 1))
+                sums += np.stack([x, y, x * x, x * y, y * y])
+                size += joined
+                last = following
+        mean_x, mean_y = sums[0] / size, sums[1] / size
+        a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
+        d = sums[4] - size * mean_y * mean_y
+        middle = (a - d) / 2
+        root = np.sqrt(middle * middle + b * b)
+        length = (a + d) / 2 + root
+        along = np.where(middle >= 0, [middle + root, b], [b, root - middle])
+        is_line = (length > 0) & ((along**2).sum(axis=0) > 0)
+        along = np.where(is_line, along, [-mine[:, 1], mine[:, 0]])
+        along = along / np.where(is_line, np.hypot(*along), mine[:, 3])
+        offset = -along[1] * (mine[:, 0] + mean_x) + along[0] * (mine[:, 1] + mean_y)
+        doubt = np.where(is_line, 1 / np.where(is_line, length, 1), -1)
+        line[start[scan] : start[scan + 1]] = np.stack([-along[1], along[0], offset, doubt], axis=1)
+
+
+def match_scans(
+    flags: frozenset[str],
+    point: np.ndarray,
+    start: np.ndarray,
+    line: np.ndarray,
+    pair: np.ndarray,
+    guess: np.ndarray,
+    result: np.ndarray,
+    scans: int,
+    points: int,
+    pairs: int,
+    starts: int,
+    rules: structs.MatchRules,
+) -> None:
+    """Match pairs of scans (reference, second scan) from guesses (x, y, theta).
+
+    A guess is the pose of the second scan in the reference's frame. Every ``stride``-th point takes part until capture
+    radius and scale have shrunk, with ``thin`` also afterwards. A result is the pose (3), the score, iterations,
+    whether the last step was below ten tolerances, the information (6), its part that is due to errors of the lines
+    (6), pairs, sum of weights, weighted sum of squared errors, points that the other scan should see, points that
+    contradict it, and points that it did not see.
+    """
+    out = result[: MATCH_RESULT * pairs * starts].reshape(-1, MATCH_RESULT)
+    upper = np.triu_indices(3)
+    for n in range(pairs * starts):
+        first, second = (slice(start[scan], start[scan + 1]) for scan in pair[n // starts])
+        one, other, lines = point[first], point[second], line[first]
+        pose, iteration, calm, information, doubt, numbers = _refine(one, other, lines, guess[n, :3], rules)
+        both = np.zeros(4, point.dtype)
+        if len(one) and len(other):
+            (x, y), c, s = pose[:2], np.cos(pose[2]), np.sin(pose[2])
+            inverse = np.array([-c * x - s * y, s * x - c * y, c, -s])
+            step, near, gap = rules.score_stride, rules.near, rules.gap
+            both += agreement(one, lines, other, step, np.array([x, y, c, s]), near, gap)
+            both += agreement(other, line[second], one, step, inverse, near, gap)
+        everything = both[1] + both[2] + UNSEEN * both[3]
+        out[n, :3] = pose
+        out[n, 3] = (both[0] - 0.5 * both[2]) / everything if everything > 0 else 0
+        out[n, 4:6] = iteration, calm
+        out[n, 6:12], out[n, 12:18] = information[upper], doubt[upper]
+        out[n, 18:] = numbers[2], numbers[0], numbers[1], *both[1:]
+
+
+def _refine(
+    one: np.ndarray, other: np.ndarray, lines: np.ndarray, guess: np.ndarray, rules: structs.MatchRules
+) -> tuple[np.ndarray, int, bool, np.ndarray, np.ndarray, np.ndarray]:
+    """Return pose, iterations, whether its last step was small, and the sums of the last iteration."""
+    real, pose = one.dtype.type, guess.copy()
+    capture, scale = real(rules.capture), real(rules.scale)
+    information = doubt = np.zeros((3, 3), real)
+    numbers, iteration, settled, calm = np.zeros(3, real), 0, False, False
+    while iteration < rules.iterations and not settled and len(one):
+        last = bool(capture <= rules.least_capture and scale <= rules.least_scale)
+        p = other[:: 1 if last and not rules.thin else rules.stride]
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        arm = np.stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1]], axis=1)
+        place = arm + pose[:2]
+        near = nearest_point(one, place, capture * capture)
+        used = (near >= 0) & (lines[near, 3] > 0)
+        information, gradient, doubt, numbers = add_pairing(lines[near[used]], place[used], arm[used], scale, last)
+        iteration += 1
+        step = solve(information, gradient)
+        if step is None:
+            break
+        length, most = np.hypot(step[0], step[1]), real(0.5) * real(rules.capture)
+        if length > most:
+            step[:2] *= most / length
+        step[2] = np.clip(step[2], real(-0.3), real(0.3))
+        pose = pose + step
+        change = max(length, abs(step[2]))
+        settled = bool(last and change < rules.tolerance)
+        calm = bool(last and change < 10 * rules.tolerance)
+        quiet = length < real(0.1) * scale and abs(step[2]) < real(0.03) * scale
+        factor = real(rules.shrink) ** (2 if quiet and not last else 1)
+        capture, scale = max(capture * factor, rules.least_capture), max(scale * factor, rules.least_scale)
+    return pose, iteration, calm, information, doubt, numbers

@@ -1,0 +1,93 @@
+// Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose. With d the
+// distance of an end point, r = z_hit N(d) / p its share of the hit density, and J the derivatives of d:
+// d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which leaves out second
+// derivatives of d and of r.
+// requires: field
+
+#define GRADIENT_NUMBERS 10
+
+// Return the share of the hit density in the density at a distance.
+real hit_share(const real2 distance, global const real *terms) {
+    const real2 exponent = field_exponent(distance, terms);
+#if LINEAR
+#if HIT
+    const real hit = terms[0] * exp(-exponent.x) * (1 - exponent.y);
+    return hit / (hit + terms[2]);
+#else
+    return 0;
+#endif
+#else
+    const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
+    return 1 / (1 + exp(terms[2] - hit));
+#endif
+}
+
+// Return the distance at an end point, and its derivatives in x and y, in metres per cell.
+real4 distance_slope(global const real *table, const int2 cell, const EndPoint end, const Window window) {
+    const real a = table[field_cell(cell.x, cell.y, window)], b = table[field_cell(cell.x + 1, cell.y, window)];
+    const real c = table[field_cell(cell.x, cell.y + 1, window)], d = table[field_cell(cell.x + 1, cell.y + 1, window)];
+    const real2 distance = bilinear(table, cell, end, window);
+    const real x = end.to_next_y.x * (b - a) + end.rest_y.x * (d - c);
+    const real y = end.to_next_x.x * (c - a) + end.rest_x.x * (d - b);
+    return (real4)(distance.x, distance.y, x, y);
+}
+
+// Write log p, its gradient (3) and the information (6) of poses in the grid's frame, each times the temperature. One
+// work-item takes a particle. mount is the sensor's place on the robot in cells.
+kernel void field_gradient(global const real *table, global const int2 *pose_cell, global const real4 *pose,
+                           global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
+                           global const real *terms, global const int *start, global const real *constant_terms,
+                           global real *gradient, const Window window, const int particles, const int readings,
+                           const real guard, const real mount_x, const real mount_y, const real resolution,
+                           const Score score, const ScanBatch batch) {
+    const int n = get_global_id(0);
+    if (n >= particles) return;
+#if SCANS
+    const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
+    const real constant_term = constant_terms[scan];
+    point += start[scan];
+    point_low += start[scan];
+#else
+    const int size = readings;
+    const real constant_term = score.constant_term;
+#endif
+    const int2 origin = pose_cell[n];
+    const real4 at = pose[n];
+#if CAREFUL
+    const real4 low = pose_low[n];
+#else
+    const real4 low = (real4)(0);
+#endif
+    real2 total = (real2)(constant_term, 0);
+    real sums[9];
+    for (int i = 0; i < 9; ++i) sums[i] = 0;
+    for (int k = 0; k < size; ++k) {
+        const real2 to = point[k];
+#if ALL_READINGS
+        if (!isfinite(to.x)) {
+            if (isinf(to.x)) total = add_term(total, terms[3]);
+            continue;
+        }
+#endif
+        const EndPoint end = end_point(at, low, to, point_low[k], (real)0.5, guard);
+        const real4 slope = distance_slope(table, origin + end.cell, end, window);
+        const real2 distance = (real2)(slope.x, slope.y);
+        total = add_term(total, log_field(distance, terms));
+        const real2 arm = to + (real2)(mount_x, mount_y);
+        const real x = slope.z / resolution, y = slope.w / resolution;
+        const real turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y);
+        const real weight = 2 * terms[1] * hit_share(distance, terms), pull = -weight * slope.x;
+        sums[0] += pull * x;
+        sums[1] += pull * y;
+        sums[2] += pull * turn;
+        sums[3] += weight * x * x;
+        sums[4] += weight * x * y;
+        sums[5] += weight * x * turn;
+        sums[6] += weight * y * y;
+        sums[7] += weight * y * turn;
+        sums[8] += weight * turn * turn;
+    }
+    global real *out = gradient + (long)GRADIENT_NUMBERS * n;
+    out[0] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
+    for (int i = 0; i < 9; ++i) out[1 + i] = score.temperature * sums[i];
+}

@@ -1,0 +1,242 @@
+// Scan matching by point-to-line ICP. The nearest point is exact: the points of a scan are sorted by bearing, and a
+// search from the bearing of a place outwards ends where no point farther in bearing can be nearer.
+// Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
+// Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+
+// Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
+// and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
+// that the other scan should see, points that contradict it, points that it did not see.
+#define MATCH_RESULT 24
+// Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
+#define MATCH_SUMS 18
+#define FULL_TURN ((real)6.283185307179586)
+// Rounding errors of bounds are far below this share.
+#define ALMOST ((real)0.999)
+// Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+#define UNSEEN ((real)0.13)
+
+// Return the bearing of a place in [0, 2 pi).
+real bearing_of(const real2 place) {
+    const real bearing = atan2(place.y, place.x);
+    return bearing < 0 ? bearing + FULL_TURN : bearing;
+}
+
+// Return the number of points of a scan whose bearing is less than a bearing.
+int points_before(global const real4 *point, const int count, const real bearing) {
+    const real span = point[count - 1].z - point[0].z;
+    const real share = span > 0 ? (bearing - point[0].z) / span : 0;
+    int i = share <= 0 ? 0 : share >= 1 ? count : (int)(share * (count - 1));
+    while (i < count && point[i].z < bearing) ++i;
+    while (i > 0 && point[i - 1].z >= bearing) --i;
+    return i;
+}
+
+// Return the nearest point of a scan that is nearer than the square root of squared, -1 without one; ahead points have
+// a smaller bearing than the place.
+int nearest_point(global const real4 *point, const int count, const int ahead, const real2 place, const real squared) {
+    const real length = dot(place, place);
+    real best = squared;
+    int which = -1;
+    for (int direction = 1; direction >= -1; direction -= 2) {
+        int i = direction > 0 ? ahead : ahead - 1;
+        for (int k = 0; k < count; ++k) {
+            i = i >= count ? i - count : i < 0 ? i + count : i;
+            const real2 p = point[i].xy, d = p - place;
+            const real distance = d.x * d.x + d.y * d.y;
+            if (distance < best) {
+                best = distance;
+                which = i;
+            } else {
+                const real cross = place.x * p.y - place.y * p.x;
+                const int beside = place.x * p.x + place.y * p.y > 0;
+                if (beside ? ALMOST * cross * cross > best * (p.x * p.x + p.y * p.y) : ALMOST * length > best) break;
+            }
+            i += direction;
+        }
+    }
+    return which;
+}
+
+// Add a pair of a line and a place; arm is the place relative to the second scan's origin.
+void add_pairing(real *sums, const real4 line, const real2 place, const real2 arm, const real scale, const int last) {
+    const real error = line.x * place.x + line.y * place.y - line.z;
+    const real ratio = error / scale;
+    real weight = 1 / (1 + ratio * ratio);
+    if (last) weight *= weight;
+    const real turn = line.y * arm.x - line.x * arm.y, along = line.x * arm.x + line.y * arm.y;
+    const real doubt = weight * line.w;
+    sums[0] += weight * line.x * line.x;
+    sums[1] += weight * line.x * line.y;
+    sums[2] += weight * line.x * turn;
+    sums[3] += weight * line.y * line.y;
+    sums[4] += weight * line.y * turn;
+    sums[5] += weight * turn * turn;
+    sums[6] -= weight * line.x * error;
+    sums[7] -= weight * line.y * error;
+    sums[8] -= weight * turn * error;
+    sums[9] += doubt * line.y * line.y;
+    sums[10] -= doubt * line.x * line.y;
+    sums[11] -= doubt * line.y * along;
+    sums[12] += doubt * line.x * line.x;
+    sums[13] += doubt * line.x * along;
+    sums[14] += doubt * along * along;
+    sums[15] += weight;
+    sums[16] += weight * error * error;
+    sums[17] += 1;
+}
+
+// Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
+real4 solve(const real *sums) {
+    const real damping = (real)1e-5 * (sums[0] + sums[3]) + (real)1e-9;
+    const real xx = sums[0] + damping, yy = sums[3] + damping, tt = sums[5] * (real)1.00001 + (real)1e-9;
+    const real a = sqrt(xx), b = sums[1] / a, c = sums[2] / a;
+    const real second = yy - b * b;
+    if (!(second > 0)) return (real4)(0);
+    const real d = sqrt(second), e = (sums[4] - b * c) / d, third = tt - c * c - e * e;
+    if (!(third > 0)) return (real4)(0);
+    const real f = sqrt(third);
+    const real u = sums[6] / a, v = (sums[7] - b * u) / d, w = (sums[8] - c * u - e * v) / f;
+    const real theta = w / f, y = (v - e * theta) / d, x = (u - b * y - c * theta) / a;
+    return (real4)(x, y, theta, 1);
+}
+
+// Return how well every stride-th point of one scan agrees with another scan: sum of agreements, points that the other
+// scan should see, points that contradict it because it saw through them, and points that it did not see. pose is
+// (x, y, cos, sin).
+real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
+                const int others, const int stride, const real4 pose, const real near, const real gap) {
+    const real scale = near / 3;
+    real4 sum = (real4)(0);
+    for (int i = 0; i < others; i += stride) {
+        const real2 p = other[i].xy;
+        const real2 place = (real2)(pose.z * p.x - pose.w * p.y + pose.x, pose.w * p.x + pose.z * p.y + pose.y);
+        const int ahead = points_before(point, count, bearing_of(place));
+        const int which = nearest_point(point, count, ahead, place, near * near);
+        if (which >= 0) {
+            const real ratio = (line[which].x * place.x + line[which].y * place.y - line[which].z) / scale;
+            sum.x += 1 / (1 + ratio * ratio);
+            sum.y += 1;
+        } else {
+            const real4 low = point[ahead > 0 ? ahead - 1 : count - 1], high = point[ahead < count ? ahead : 0];
+            const real between = high.z < low.z ? high.z - low.z + FULL_TURN : high.z - low.z;
+            const real range = fmin(low.w, high.w);
+            if (between <= gap && dot(place, place) < range * range)
+                sum.z += 1;
+            else
+                sum.w += 1;
+        }
+    }
+    return sum;
+}
+
+// Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
+// farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
+// distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and no
+// pairs. One work-item takes a point of a scan.
+kernel void fit_lines(global const real4 *point, global const int *start, global real4 *line, const int scans,
+                      const int points, const int reach, const int most, const real ratio, const real slack,
+                      const real width) {
+    const int k = get_global_id(0), scan = get_global_id(1);
+    const int first = start[scan], count = start[scan + 1] - first;
+    if (k >= count) return;
+    const real4 centre = point[first + k];
+    real2 sum = (real2)(0);
+    real xx = 0, xy = 0, yy = 0;
+    int size = 1;
+    for (int direction = -1; direction <= 1; direction += 2) {
+        real4 last = centre;
+        for (int j = 1; j <= most && 2 * j < count; ++j) {
+            int i = k + direction * j;
+            i = i >= count ? i - count : i < 0 ? i + count : i;
+            const real4 next = point[first + i];
+            const real2 between = next.xy - last.xy, d = next.xy - centre.xy;
+            const real farthest = slack + ratio * last.w;
+            if (between.x * between.x + between.y * between.y > farthest * farthest) break;
+            if (j > reach && d.x * d.x + d.y * d.y > width * width) break;
+            sum += d;
+            xx += d.x * d.x;
+            xy += d.x * d.y;
+            yy += d.y * d.y;
+            size += 1;
+            last = next;
+        }
+    }
+    const real2 mean = sum / (real)size;
+    const real a = xx - size * mean.x * mean.x, b = xy - size * mean.x * mean.y, d = yy - size * mean.y * mean.y;
+    const real middle = (real)0.5 * (a - d), root = sqrt(middle * middle + b * b), length = (real)0.5 * (a + d) + root;
+    real2 along = middle >= 0 ? (real2)(middle + root, b) : (real2)(b, root - middle);
+    real size_along = sqrt(along.x * along.x + along.y * along.y);
+    const int is_line = length > 0 && size_along > 0;
+    if (!is_line) {
+        along = (real2)(-centre.y, centre.x);
+        size_along = centre.w;
+    }
+    const real2 normal = (real2)(-along.y / size_along, along.x / size_along);
+    const real offset = normal.x * (centre.x + mean.x) + normal.y * (centre.y + mean.y);
+    line[first + k] = (real4)(normal.x, normal.y, offset, is_line ? 1 / length : -1);
+}
+
+// Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
+// scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with thin
+// also afterwards.
+kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
+                        global const int2 *pair, global const real4 *guess, global real *result, const int scans,
+                        const int points, const int pairs, const int starts, const MatchRules rules) {
+    const int n = get_global_id(0);
+    if (n >= pairs * starts) return;
+    const int2 which = pair[n / starts];
+    const int first = start[which.x], count = start[which.x + 1] - first;
+    const int second = start[which.y], others = start[which.y + 1] - second;
+    real4 pose = guess[n];
+    real sums[MATCH_SUMS];
+    real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
+    int iteration = 0, settled = 0, calm = 0;
+    for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
+    while (iteration < rules.iterations && !settled && count > 0) {
+        const int last = capture <= rules.least_capture && scale <= rules.least_scale;
+        for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
+        for (int i = 0; i < others; i += last && !rules.thin ? 1 : rules.stride) {
+            const real2 p = point[second + i].xy;
+            const real2 arm = (real2)(cosine * p.x - sine * p.y, sine * p.x + cosine * p.y), place = arm + pose.xy;
+            const int ahead = points_before(point + first, count, bearing_of(place));
+            const int near = nearest_point(point + first, count, ahead, place, capture * capture);
+            if (near >= 0 && line[first + near].w > 0) add_pairing(sums, line[first + near], place, arm, scale, last);
+        }
+        ++iteration;
+        real4 step = solve(sums);
+        if (step.w == 0) break;
+        const real length = sqrt(step.x * step.x + step.y * step.y), most = (real)0.5 * rules.capture;
+        if (length > most) step.xy *= most / length;
+        step.z = fmax(fmin(step.z, (real)0.3), (real)-0.3);
+        pose += step;
+        cosine = cos(pose.z);
+        sine = sin(pose.z);
+        const real change = fmax(length, fabs(step.z));
+        settled = last && change < rules.tolerance;
+        calm = last && change < 10 * rules.tolerance;
+        const int quiet = length < (real)0.1 * scale && fabs(step.z) < (real)0.03 * scale;
+        const real factor = quiet && !last ? rules.shrink * rules.shrink : rules.shrink;
+        capture = fmax(capture * factor, rules.least_capture);
+        scale = fmax(scale * factor, rules.least_scale);
+    }
+    global real *out = result + (long)MATCH_RESULT * n;
+    real4 there = (real4)(0), back = (real4)(0);
+    if (count > 0 && others > 0) {
+        const real4 inverse = (real4)(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine);
+        there = agreement(point + first, line + first, count, point + second, others, rules.score_stride,
+                          (real4)(pose.x, pose.y, cosine, sine), rules.near, rules.gap);
+        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, inverse,
+                         rules.near, rules.gap);
+    }
+    const real4 both = there + back;
+    const real all = both.y + both.z + UNSEEN * both.w;
+    out[0] = pose.x, out[1] = pose.y, out[2] = pose.z;
+    out[3] = all > 0 ? (both.x - (real)0.5 * both.z) / all : 0;
+    out[4] = iteration, out[5] = calm;
+    for (int i = 0; i < 6; ++i) {
+        out[6 + i] = sums[i];
+        out[12 + i] = sums[9 + i];
+    }
+    out[18] = sums[17], out[19] = sums[15], out[20] = sums[16];
+    out[21] = both.y, out[22] = both.z, out[23] = both.w;
+}

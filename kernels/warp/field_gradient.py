@@ -1,0 +1,166 @@
+"""Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose.
+
+With d the distance of an end point, r = z_hit N(d) / p its share of the hit density, and J the derivatives of d:
+d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which leaves out second
+derivatives of d and of r.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import end_point as end_points
+from . import error_free, field
+from .end_point import field_cell
+from .prelude import kernel, precision, reader, work_item
+
+GRADIENT_NUMBERS = wp.constant(10)
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    made = field.functions(flags)
+    bilinear, field_exponent = made.bilinear, made.field_exponent
+    EndPoint = end_points.functions(flags).EndPoint
+    number_at = reader(real)
+    HIT = "HIT" in flags
+    ZERO, ONE = real(0.0), real(1.0)
+
+    # Return the share of the hit density in the density at a distance.
+    if "LINEAR" in flags:
+
+        @wp.func
+        def hit_share(distance: vec2, terms: wp.array(dtype=real)):
+            hit = ZERO
+            if HIT:
+                exponent = field_exponent(distance, terms)
+                hit = terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
+            return hit / (hit + terms[2])
+
+    else:
+
+        @wp.func
+        def hit_share(distance: vec2, terms: wp.array(dtype=real)):
+            exponent = field_exponent(distance, terms)
+            hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
+            return ONE / (ONE + wp.exp(terms[2] - hit))
+
+    # Return the distance at an end point, and its derivatives in x and y, in metres per cell.
+    @wp.func
+    def distance_slope(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
+        a = number_at(table, field_cell(cell.x, cell.y, window))
+        b = number_at(table, field_cell(cell.x + 1, cell.y, window))
+        c = number_at(table, field_cell(cell.x, cell.y + 1, window))
+        d = number_at(table, field_cell(cell.x + 1, cell.y + 1, window))
+        distance = bilinear(table, cell, end, window)
+        x = end.to_next_y.x * (b - a) + end.rest_y.x * (d - c)
+        y = end.to_next_x.x * (c - a) + end.rest_x.x * (d - b)
+        return vec4(distance.x, distance.y, x, y)
+
+    return SimpleNamespace(hit_share=hit_share, distance_slope=distance_slope)
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    log_field = field.functions(flags).log_field
+    made = functions(flags)
+    hit_share, distance_slope = made.hit_share, made.distance_slope
+    end_point = end_points.functions(flags).end_point
+    add_term = error_free.functions(flags).add_term
+    Sums = wp.types.vector(length=9, dtype=real)
+    CAREFUL = "CAREFUL" in flags
+    ALL_READINGS = "ALL_READINGS" in flags
+    SCANS = "SCANS" in flags
+    ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
+
+    # Write log p, its gradient (3) and the information (6) of poses in the grid's frame, each times the temperature.
+    # One work-item takes a particle. mount is the sensor's place on the robot in cells.
+    @kernel
+    def field_gradient(
+        table: wp.array(dtype=real),
+        pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4),
+        pose_low: wp.array(dtype=vec4),
+        point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2),
+        terms: wp.array(dtype=real),
+        start: wp.array(dtype=wp.int32),
+        constant_terms: wp.array(dtype=real),
+        gradient: wp.array(dtype=real),
+        window: types.Window,
+        particles: wp.int32,
+        readings: wp.int32,
+        guard: real,
+        mount_x: real,
+        mount_y: real,
+        resolution: real,
+        score: types.Score,
+        batch: types.ScanBatch,
+    ):
+        n = work_item(wp.tid())
+        if n >= particles:
+            return
+        begin = int(0)
+        size = readings
+        constant_term = score.constant_term
+        if SCANS:
+            scan = (n + batch.ahead) // batch.per_scan
+            begin = start[scan]
+            size = start[scan + 1] - begin
+            constant_term = constant_terms[scan]
+        origin = pose_cell[n]
+        at = pose[n]
+        low = vec4()
+        if CAREFUL:
+            low = pose_low[n]
+        total = vec2(constant_term, ZERO)
+        sums = Sums()
+        k = int(0)
+        while k < size:
+            to = point[begin + k]
+            used = bool(True)
+            if ALL_READINGS:
+                used = wp.isfinite(to.x)
+                if wp.isinf(to.x):
+                    total = add_term(total, terms[3])
+            if used:
+                to_low = vec2()
+                if CAREFUL:
+                    to_low = point_low[begin + k]
+                end = end_point(at, low, to, to_low, HALF, guard)
+                slope = distance_slope(table, origin + end.cell, end, window)
+                distance = vec2(slope.x, slope.y)
+                total = add_term(total, log_field(distance, terms))
+                arm_x = to.x + mount_x
+                arm_y = to.y + mount_y
+                x = slope.z / resolution
+                y = slope.w / resolution
+                turn = slope.w * (at.z * arm_x - at.w * arm_y) - slope.z * (at.w * arm_x + at.z * arm_y)
+                weight = TWO * terms[1] * hit_share(distance, terms)
+                pull = -weight * slope.x
+                sums[0] += pull * x
+                sums[1] += pull * y
+                sums[2] += pull * turn
+                sums[3] += weight * x * x
+                sums[4] += weight * x * y
+                sums[5] += weight * x * turn
+                sums[6] += weight * y * y
+                sums[7] += weight * y * turn
+                sums[8] += weight * turn * turn
+            k += 1
+        out = n * GRADIENT_NUMBERS
+        if wp.isinf(total.x):
+            gradient[out] = total.x
+        else:
+            gradient[out] = score.temperature * (total.x + total.y)
+        for i in range(9):
+            gradient[out + 1 + i] = score.temperature * sums[i]
+
+    return {"field_gradient": field_gradient}[name]

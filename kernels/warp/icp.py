@@ -1,0 +1,415 @@
+"""Scan matching by point-to-line ICP.
+
+The nearest point is exact: the points of a scan are sorted by bearing, and a search from the bearing of a place
+outwards ends where no point farther in bearing can be nearer.
+
+Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
+Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import kernel, precision, work_item
+
+# Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
+# and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
+# that the other scan should see, points that contradict it, points that it did not see.
+MATCH_RESULT = wp.constant(24)
+# Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
+MATCH_SUMS = 18
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
+    ZERO, ONE, THREE = real(0.0), real(1.0), real(3.0)
+    FULL_TURN = real(6.283185307179586)
+    # Rounding errors of bounds are far below this share.
+    ALMOST = real(0.999)
+    DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
+
+    # Return the bearing of a place in [0, 2 pi).
+    @wp.func
+    def bearing_of(place: vec2):
+        bearing = wp.atan2(place.y, place.x)
+        if bearing < ZERO:
+            bearing += FULL_TURN
+        return bearing
+
+    # Return the number of points of a scan whose bearing is less than a bearing.
+    @wp.func
+    def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real):
+        low = point[first].z
+        span = point[first + count - 1].z - low
+        share = ZERO
+        if span > ZERO:
+            share = (bearing - low) / span
+        i = int(0)
+        if share >= ONE:
+            i = count
+        elif share > ZERO:
+            i = int(share * real(count - 1))
+        while i < count and point[first + wp.min(i, count - 1)].z < bearing:
+            i += 1
+        while i > 0 and point[first + wp.max(i - 1, 0)].z >= bearing:
+            i -= 1
+        return i
+
+    # Return the nearest point of a scan that is nearer than the square root of squared, -1 without one; ahead points
+    # have a smaller bearing than the place.
+    @wp.func
+    def nearest_point(
+        point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, ahead: wp.int32, place: vec2, squared: real
+    ):
+        length = place.x * place.x + place.y * place.y
+        best = squared
+        which = int(-1)
+        for side in range(2):
+            direction = int(1)
+            i = int(ahead)
+            if side == 1:
+                direction = -1
+                i = ahead - 1
+            k = int(0)
+            while k < count:
+                if i >= count:
+                    i -= count
+                if i < 0:
+                    i += count
+                p = point[first + i]
+                x = p.x - place.x
+                y = p.y - place.y
+                distance = x * x + y * y
+                if distance < best:
+                    best = distance
+                    which = i
+                else:
+                    cross = place.x * p.y - place.y * p.x
+                    if place.x * p.x + place.y * p.y > ZERO:
+                        if ALMOST * cross * cross > best * (p.x * p.x + p.y * p.y):
+                            k = count
+                    elif ALMOST * length > best:
+                        k = count
+                i += direction
+                k += 1
+        return which
+
+    # Return the sums with a pair of a line and a place; arm is the place relative to the second scan's origin.
+    @wp.func
+    def add_pairing(before: Sums, line: vec4, place: vec2, arm: vec2, scale: real, last: wp.bool):
+        sums = before
+        error = line.x * place.x + line.y * place.y - line.z
+        ratio = error / scale
+        weight = ONE / (ONE + ratio * ratio)
+        if last:
+            weight *= weight
+        turn = line.y * arm.x - line.x * arm.y
+        along = line.x * arm.x + line.y * arm.y
+        doubt = weight * line.w
+        sums[0] += weight * line.x * line.x
+        sums[1] += weight * line.x * line.y
+        sums[2] += weight * line.x * turn
+        sums[3] += weight * line.y * line.y
+        sums[4] += weight * line.y * turn
+        sums[5] += weight * turn * turn
+        sums[6] -= weight * line.x * error
+        sums[7] -= weight * line.y * error
+        sums[8] -= weight * turn * error
+        sums[9] += doubt * line.y * line.y
+        sums[10] -= doubt * line.x * line.y
+        sums[11] -= doubt * line.y * along
+        sums[12] += doubt * line.x * line.x
+        sums[13] += doubt * line.x * along
+        sums[14] += doubt * along * along
+        sums[15] += weight
+        sums[16] += weight * error * error
+        sums[17] += ONE
+        return sums
+
+    # Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
+    @wp.func
+    def solve(sums: Sums):
+        damping = DAMPING * (sums[0] + sums[3]) + LEAST_DAMPING
+        xx = sums[0] + damping
+        yy = sums[3] + damping
+        tt = sums[5] * DAMPED_TURN + LEAST_DAMPING
+        a = wp.sqrt(xx)
+        b = sums[1] / a
+        c = sums[2] / a
+        second = yy - b * b
+        if not second > ZERO:
+            return vec4()
+        d = wp.sqrt(second)
+        e = (sums[4] - b * c) / d
+        third = tt - c * c - e * e
+        if not third > ZERO:
+            return vec4()
+        f = wp.sqrt(third)
+        u = sums[6] / a
+        v = (sums[7] - b * u) / d
+        w = (sums[8] - c * u - e * v) / f
+        theta = w / f
+        y = (v - e * theta) / d
+        x = (u - b * y - c * theta) / a
+        return vec4(x, y, theta, ONE)
+
+    # Return how well every stride-th point of one scan agrees with another scan: sum of agreements, points that the
+    # other scan should see, points that contradict it because it saw through them, and points that it did not see.
+    # pose is (x, y, cos, sin).
+    @wp.func
+    def agreement(
+        point: wp.array(dtype=vec4),
+        line: wp.array(dtype=vec4),
+        first: wp.int32,
+        count: wp.int32,
+        second: wp.int32,
+        others: wp.int32,
+        stride: wp.int32,
+        pose: vec4,
+        near: real,
+        gap: real,
+    ):
+        scale = near / THREE
+        total = vec4()
+        i = int(0)
+        while i < others:
+            p = point[second + i]
+            x = pose.z * p.x - pose.w * p.y + pose.x
+            y = pose.w * p.x + pose.z * p.y + pose.y
+            place = vec2(x, y)
+            ahead = points_before(point, first, count, bearing_of(place))
+            which = nearest_point(point, first, count, ahead, place, near * near)
+            if which >= 0:
+                at = line[first + which]
+                ratio = (at.x * x + at.y * y - at.z) / scale
+                total += vec4(ONE / (ONE + ratio * ratio), ONE, ZERO, ZERO)
+            else:
+                low = point[first + wp.where(ahead > 0, ahead - 1, count - 1)]
+                high = point[first + wp.where(ahead < count, ahead, 0)]
+                between = high.z - low.z
+                if high.z < low.z:
+                    between += FULL_TURN
+                smaller = wp.min(low.w, high.w)
+                if between <= gap and x * x + y * y < smaller * smaller:
+                    total += vec4(ZERO, ZERO, ONE, ZERO)
+                else:
+                    total += vec4(ZERO, ZERO, ZERO, ONE)
+            i += stride
+        return total
+
+    return SimpleNamespace(
+        Sums=Sums, bearing_of=bearing_of, points_before=points_before, nearest_point=nearest_point,
+        add_pairing=add_pairing, solve=solve, agreement=agreement,
+    )  # fmt: skip
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    made = functions(flags)
+    Sums, bearing_of, points_before, nearest_point = (
+        made.Sums, made.bearing_of, made.points_before, made.nearest_point,
+    )  # fmt: skip
+    add_pairing, solve, agreement = made.add_pairing, made.solve, made.agreement
+    ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
+    TENTH, TEN, LARGEST_TURN, QUIET_TURN = real(0.1), real(10.0), real(0.3), real(0.03)
+    # Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+    UNSEEN = real(0.13)
+
+    # Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
+    # farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
+    # distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and
+    # no pairs. One work-item takes a point of a scan.
+    @kernel
+    def fit_lines(
+        point: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        line: wp.array(dtype=vec4),
+        scans: wp.int32,
+        points: wp.int32,
+        reach: wp.int32,
+        most: wp.int32,
+        ratio: real,
+        slack: real,
+        width: real,
+    ):
+        scan, k = wp.tid()
+        if scan >= scans:
+            return
+        first = start[scan]
+        count = start[scan + 1] - first
+        if k >= count:
+            return
+        centre = point[first + k]
+        sum_x = real(0.0)
+        sum_y = real(0.0)
+        xx = real(0.0)
+        xy = real(0.0)
+        yy = real(0.0)
+        size = int(1)
+        for side in range(2):
+            direction = 2 * side - 1
+            last = centre
+            j = int(1)
+            while j <= most and 2 * j < count:
+                i = k + direction * j
+                if i >= count:
+                    i -= count
+                if i < 0:
+                    i += count
+                following = point[first + i]
+                x = following.x - last.x
+                y = following.y - last.y
+                farthest = slack + ratio * last.w
+                dx = following.x - centre.x
+                dy = following.y - centre.y
+                if x * x + y * y > farthest * farthest or (j > reach and dx * dx + dy * dy > width * width):
+                    j = count
+                else:
+                    sum_x += dx
+                    sum_y += dy
+                    xx += dx * dx
+                    xy += dx * dy
+                    yy += dy * dy
+                    size += 1
+                    last = following
+                j += 1
+        weight = real(size)
+        mean_x = sum_x / weight
+        mean_y = sum_y / weight
+        a = xx - weight * mean_x * mean_x
+        b = xy - weight * mean_x * mean_y
+        d = yy - weight * mean_y * mean_y
+        middle = HALF * (a - d)
+        root = wp.sqrt(middle * middle + b * b)
+        length = HALF * (a + d) + root
+        along_x = b
+        along_y = root - middle
+        if middle >= ZERO:
+            along_x = middle + root
+            along_y = b
+        size_along = wp.sqrt(along_x * along_x + along_y * along_y)
+        doubt = MISSING
+        if length > ZERO and size_along > ZERO:
+            doubt = ONE / length
+        else:
+            along_x = -centre.y
+            along_y = centre.x
+            size_along = centre.w
+        normal_x = -along_y / size_along
+        normal_y = along_x / size_along
+        offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
+        line[first + k] = vec4(normal_x, normal_y, offset, doubt)
+
+    # Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
+    # scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with
+    # thin also afterwards.
+    @kernel
+    def match_scans(
+        point: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        line: wp.array(dtype=vec4),
+        pair: wp.array(dtype=wp.vec2i),
+        guess: wp.array(dtype=vec4),
+        result: wp.array(dtype=real),
+        scans: wp.int32,
+        points: wp.int32,
+        pairs: wp.int32,
+        starts: wp.int32,
+        rules: types.MatchRules,
+    ):
+        n = work_item(wp.tid())
+        if n >= pairs * starts:
+            return
+        which = pair[n // starts]
+        first = start[which.x]
+        count = start[which.x + 1] - first
+        second = start[which.y]
+        others = start[which.y + 1] - second
+        pose = guess[n]
+        sums = Sums()
+        capture = rules.capture
+        scale = rules.scale
+        cosine = wp.cos(pose.z)
+        sine = wp.sin(pose.z)
+        iteration = int(0)
+        settled = int(0)
+        calm = int(0)
+        running = int(1)
+        while running == 1 and iteration < rules.iterations and settled == 0 and count > 0:
+            last = capture <= rules.least_capture and scale <= rules.least_scale
+            sums = Sums()
+            stride = rules.stride
+            if last and rules.thin == 0:
+                stride = 1
+            i = int(0)
+            while i < others:
+                p = point[second + i]
+                arm = vec2(cosine * p.x - sine * p.y, sine * p.x + cosine * p.y)
+                place = vec2(arm.x + pose.x, arm.y + pose.y)
+                ahead = points_before(point, first, count, bearing_of(place))
+                near = nearest_point(point, first, count, ahead, place, capture * capture)
+                if near >= 0:
+                    at = line[first + near]
+                    if at.w > ZERO:
+                        sums = add_pairing(sums, at, place, arm, scale, last)
+                i += stride
+            iteration += 1
+            step = solve(sums)
+            if step.w == ZERO:
+                running = 0
+            else:
+                length = wp.sqrt(step.x * step.x + step.y * step.y)
+                most = HALF * rules.capture
+                share = ONE
+                if length > most:
+                    share = most / length
+                turn = wp.max(wp.min(step.z, LARGEST_TURN), -LARGEST_TURN)
+                pose = vec4(pose.x + share * step.x, pose.y + share * step.y, pose.z + turn, ZERO)
+                cosine = wp.cos(pose.z)
+                sine = wp.sin(pose.z)
+                change = wp.max(length, wp.abs(turn))
+                settled = int(last and change < rules.tolerance)
+                calm = int(last and change < TEN * rules.tolerance)
+                factor = rules.shrink
+                if length < TENTH * scale and wp.abs(turn) < QUIET_TURN * scale and not last:
+                    factor = rules.shrink * rules.shrink
+                capture = wp.max(capture * factor, rules.least_capture)
+                scale = wp.max(scale * factor, rules.least_scale)
+        both = vec4()
+        if count > 0 and others > 0:
+            forward = vec4(pose.x, pose.y, cosine, sine)
+            inverse = vec4(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine)
+            step_size = rules.score_stride
+            both = agreement(point, line, first, count, second, others, step_size, forward, rules.near, rules.gap)
+            both += agreement(point, line, second, others, first, count, step_size, inverse, rules.near, rules.gap)
+        everything = both.y + both.z + UNSEEN * both.w
+        score = real(0.0)
+        if everything > ZERO:
+            score = (both.x - HALF * both.z) / everything
+        out = n * MATCH_RESULT
+        result[out] = pose.x
+        result[out + 1] = pose.y
+        result[out + 2] = pose.z
+        result[out + 3] = score
+        result[out + 4] = real(iteration)
+        result[out + 5] = real(calm)
+        for i in range(6):
+            result[out + 6 + i] = sums[i]
+            result[out + 12 + i] = sums[9 + i]
+        result[out + 18] = sums[17]
+        result[out + 19] = sums[15]
+        result[out + 20] = sums[16]
+        result[out + 21] = both.y
+        result[out + 22] = both.z
+        result[out + 23] = both.w
+
+    return {"fit_lines": fit_lines, "match_scans": match_scans}[name]

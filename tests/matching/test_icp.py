@@ -1,0 +1,93 @@
+"""Point-to-line ICP: the kernels of each language, and their nearest points against all points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.matching_scenes import FRONT, RING, random_pairs
+
+from gpusense.backends import get_backend
+from gpusense.interface.structs import MatchRules
+from gpusense.matching.icp import IcpPairs, space_of
+from gpusense.matching.points import scan_points
+from gpusense.reference import icp as reference
+
+RULES = MatchRules(40, 2, 1, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4)
+# Sums are added in another order than by NumPy: information is compared relative to its largest number.
+TOLERANCE = {"float32": (2e-5, 2e-4), "float64": (1e-10, 1e-9)}
+
+
+def run(backend: str, precision: str, scanner, rules, guesses):
+    device, real = get_backend(backend), np.dtype(precision)
+    first, second, _ = random_pairs(4, scanner, seed=3)
+    second[1, 50:90] = np.inf
+    points = scan_points(np.concatenate([first, second]), scanner, real)
+    lock, space = space_of(device)
+    with lock, space:
+        pairs = IcpPairs(device, real, points, np.arange(8).reshape(2, 4).T, 0.01, space)
+        return pairs.run(np.arange(4), guesses, rules)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("scanner", [RING, FRONT], ids=["ring", "front"])
+@pytest.mark.parametrize("thin", [0, 1])
+def test_devices_agree_with_the_reference(device, precision, scanner, thin):
+    rng = np.random.default_rng(5)
+    truth = random_pairs(4, scanner, seed=3)[2]
+    guesses = truth[:, None] + rng.uniform(-0.1, 0.1, (4, 3, 3))
+    rules = RULES._replace(thin=thin, iterations=6 if thin else 40)
+    expected, found = (run(name, precision, scanner, rules, guesses) for name in ("numpy", device))
+    pose, sums = TOLERANCE[precision]
+    np.testing.assert_allclose(found[..., :6], expected[..., :6], atol=pose)
+    for part in (slice(6, 12), slice(12, 18)):
+        largest = np.abs(expected[..., part]).max(axis=-1, keepdims=True)
+        assert (np.abs(found - expected)[..., part] <= sums * largest).all()
+    np.testing.assert_allclose(found[..., 18:], expected[..., 18:], rtol=sums, atol=pose)
+
+
+def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):
+    """One iteration from far-off guesses: pairs and their sums are those of the comparison of all points."""
+    rng = np.random.default_rng(1)
+    guesses = np.column_stack([rng.uniform(-3, 3, (400, 2)), rng.uniform(-3, 3, 400)]).reshape(4, 100, 3)
+    rules = RULES._replace(iterations=1, capture=5.0)
+    expected = run("numpy", "float64", FRONT, rules, guesses)
+    found = run(device, "float64", FRONT, rules, guesses)
+    assert (found[..., 18] == expected[..., 18]).all()
+    np.testing.assert_allclose(found[..., 19], expected[..., 19], rtol=1e-12)
+    assert (found[..., 21:] == expected[..., 21:]).all()
+
+
+def test_lines_are_total_least_squares():
+    """Normals and offsets are those of the smallest singular vector of the centred neighbours."""
+    rng = np.random.default_rng(0)
+    z = 2 + 0.02 * rng.normal(size=(1, 360))
+    points = scan_points(z, RING, np.dtype(np.float64))
+    line = np.empty((360, 4))
+    reference.fit_lines(frozenset(), points.point, points.start, line, 1, 360, 2, 16, 0.1, 0.05, 0.0)
+    for k in (0, 1, 100, 359):
+        near = points.point[(k + np.arange(-2, 3)) % 360, :2]
+        centre = near.mean(axis=0)
+        _, sizes, axes = np.linalg.svd(near - centre)
+        assert abs(line[k, :2] @ axes[1]) == pytest.approx(1, abs=1e-9)
+        assert line[k, :2] @ centre == pytest.approx(line[k, 2], abs=1e-12)
+        assert line[k, 3] == pytest.approx(1 / sizes[0] ** 2)
+
+
+def test_the_step_is_gauss_newtons():
+    """Information and gradient are those of finite differences of weighted errors at fixed pairs and weights."""
+    rng = np.random.default_rng(2)
+    angle = rng.uniform(-3, 3, 20)
+    line = np.column_stack([np.cos(angle), np.sin(angle), rng.normal(size=20), np.ones(20)])
+    arm = rng.normal(size=(20, 2))
+    information, gradient, _, numbers = reference.add_pairing(line, arm, arm, 0.5, False)
+
+    def error(pose):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        place = arm @ np.array([[c, s], [-s, c]]) + pose[:2]
+        return (line[:, :2] * place).sum(axis=1) - line[:, 2]
+
+    jacobian = np.stack([(error(step) - error(-step)) / 2e-6 for step in 1e-6 * np.eye(3)], axis=1)
+    weight = 1 / (1 + (error(np.zeros(3)) / 0.5) ** 2)
+    np.testing.assert_allclose(information, jacobian.T @ (weight[:, None] * jacobian), atol=1e-8)
+    np.testing.assert_allclose(gradient, -jacobian.T @ (weight * error(np.zeros(3))), atol=1e-8)
+    assert numbers[0] == pytest.approx(weight.sum())

@@ -1,0 +1,168 @@
+"""Matches of scans: accuracy, honesty in stiff cases, and arguments."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, SQUARE, WALL, random_pairs, segments_scan
+
+import gpusense as gs
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return random_pairs(30, RING, seed=11)
+
+
+def test_exact_pairs_are_matched_from_poor_guesses(device, pairs):
+    first, second, truth = pairs
+    rng = np.random.default_rng(0)
+    guess = truth + np.column_stack([rng.uniform(-0.5, 0.5, (30, 2)), np.radians(rng.uniform(-10, 10, 30))])
+    match = gs.match_scan(first, second, RING, guess, backend=device)
+    assert match.converged.all()
+    error = match.pose - truth
+    # A tenth of a cell of 5 cm, and a fiftieth of a degree.
+    assert np.median(np.hypot(*error.T[:2])) < 0.005
+    assert np.degrees(np.median(np.abs(error[:, 2]))) < 0.02
+    assert np.hypot(*error.T[:2]).max() < 0.05
+
+
+def test_one_call_is_many_calls(pairs):
+    first, second, truth = (values[:3] for values in pairs)
+    together = gs.match_scan(first, second, RING, truth, backend="numpy")
+    for i in range(3):
+        alone = gs.match_scan(first[i], second[i], RING, truth[i], backend="numpy")
+        assert alone.pose.tolist() == together.pose[i].tolist()
+        assert alone.status == together.status[i]
+        np.testing.assert_allclose(together[i].covariance, alone.covariance, rtol=1e-9)
+    shared = gs.match_scan(first[0], np.stack([first[0]] * 2), RING, backend="numpy")
+    assert len(shared) == 2
+    np.testing.assert_allclose(shared.pose, 0, atol=1e-3)
+
+
+def test_the_mount_moves_the_frame(pairs):
+    """A scan from a sensor off the robot's centre gives the robot's pose, and its covariance."""
+    mount = (0.3, -0.2, 0.7)
+    scanner = gs.Scanner(RING.bearings, range_max=30.0, mount=mount)
+    robot = np.array([0.2, -0.1, 0.3])
+
+    def sensor(pose):
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        return (pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1], pose[2] + mount[2])
+
+    scans = [segments_scan(ROOM, sensor(pose), scanner) for pose in (np.zeros(3), robot)]
+    match = gs.match_scan(*scans, scanner, (0.1, 0.0, 0.2), backend="numpy")
+    np.testing.assert_allclose(match.pose, robot, atol=3e-3)
+    assert np.linalg.eigvalsh(match.covariance).min() > 0
+
+
+def test_covariance_is_that_of_the_errors():
+    """The mean normalised squared error of 150 noisy pairs of a room lies near its expectation, 3."""
+    rng = np.random.default_rng(4)
+    first, second, truth = random_pairs(150, RING, seed=5)
+    first, second = (scan + rng.normal(0, 0.01, scan.shape) for scan in (first, second))
+    match = gs.match_scan(first, second, RING, truth, backend="opencl", method="icp")
+    error = match.pose - truth
+    squared = np.einsum("si,sij,sj->s", error, np.linalg.inv(match.covariance), error) / 3
+    # Corners and occlusions make errors larger than those of noise alone.
+    assert 0.6 < np.median(squared) / 0.79 < 1.8
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("turn", [0.0, 0.5])
+def test_a_corridor_says_that_its_axis_is_not_observed(noise, turn):
+    rng = np.random.default_rng(1)
+    scans = [segments_scan(CORRIDOR, pose, RING) for pose in ((0.0, 0.0, -turn), (0.3, 0.05, 0.05 - turn))]
+    scans = [scan + rng.normal(0, noise, scan.shape) for scan in scans]
+    match = gs.match_scan(*scans, RING, (0.2 * math.cos(turn), 0.2 * math.sin(turn), 0.0), backend="numpy")
+    assert match.status == "unobservable"
+    axis = match.directions[0]
+    assert abs(axis[0] * math.cos(turn) + axis[1] * math.sin(turn)) > 0.99
+    assert np.isinf(match.covariance[0, 0])
+    assert match.eigenvalues[0] < 0.02 < match.eigenvalues[1]
+    # Heading is observed.
+    assert match.pose[2] == pytest.approx(0.05, abs=0.01)
+    assert match.covariance[2, 2] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "statuses"),
+    [
+        (WALL, WALL, {"unobservable"}),
+        (np.zeros((0, 4)), ROOM, {"few points", "no overlap"}),
+        (ROOM, np.zeros((0, 4)), {"few points", "no overlap"}),
+        (ROOM, ROOM + 60.0, {"few points", "no overlap"}),
+    ],
+    ids=["wall", "empty reference", "empty scan", "no overlap"],
+)
+def test_what_is_not_known_has_an_infinite_covariance(backend, first, second, statuses):
+    pose = (0.0, 0.0, 0.0)
+    scans = segments_scan(first, pose, FRONT), segments_scan(second, pose, FRONT)
+    match = gs.match_scan(*scans, FRONT, backend=backend)
+    assert match.status in statuses
+    assert np.isinf(match.covariance.diagonal()).any()
+    assert match.converged == (match.status == "unobservable")
+    assert not np.isnan(match.covariance).any()
+
+
+def test_three_beams_are_too_few():
+    scanner = gs.Scanner([-0.5, 0.0, 0.5], range_max=30.0)
+    scans = [segments_scan(ROOM, pose, scanner) for pose in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))]
+    match = gs.match_scan(*scans, scanner, backend="numpy")
+    assert match.status == "few points"
+    assert not match.converged
+    assert np.isinf(match.covariance.diagonal()).all()
+
+
+def test_identical_scans_do_not_move():
+    scan = segments_scan(ROOM, (0.0, 0.0, 0.4), FRONT)
+    match = gs.match_scan(scan, scan, FRONT, backend="numpy")
+    assert match.status == "converged"
+    # At corners lines do not pass through their points.
+    np.testing.assert_allclose(match.pose, 0, atol=1e-3)
+    assert match.score == pytest.approx(1, abs=1e-2)
+
+
+def test_a_symmetrical_room_stays_near_its_guess():
+    scans = [segments_scan(SQUARE, pose, RING) for pose in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.1))]
+    match = gs.match_scan(*scans, RING, (0.0, 0.0, math.pi / 2), backend="numpy")
+    np.testing.assert_allclose(match.pose[2], math.pi / 2 + 0.1, atol=2e-3)
+
+
+def test_what_the_reference_did_not_see_neither_attracts_nor_repels():
+    """A scan of 181 beams is matched to the part of it that the other one sees."""
+    first, second = (segments_scan(ROOM, pose, FRONT) for pose in ((0.0, 0.0, 0.0), (0.1, 0.1, 0.6)))
+    match = gs.match_scan(first, second, FRONT, (0.0, 0.0, 0.5), backend="numpy")
+    np.testing.assert_allclose(match.pose, (0.1, 0.1, 0.6), atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (dict(guess=(0.0, 0.0)), ValueError, "guess"),
+        (dict(guess=(math.nan, 0.0, 0.0)), ValueError, "guess"),
+        (dict(guess=(1e9, 0.0, 0.0)), ValueError, "guess"),
+        (dict(method="csm"), ValueError, "method"),
+        (dict(noise=-1.0), ValueError, "noise"),
+        (dict(capture=0.0), ValueError, "capture"),
+        (dict(window=(1.0,)), ValueError, "window"),
+        (dict(window=(100.0, 0.1)), ValueError, "window"),
+        (dict(reference=np.ones(3)), ValueError, "reference"),
+        (dict(ranges=np.ones((2, 5))), ValueError, "ranges"),
+        (dict(reference=np.ones((3, 360)), ranges=np.ones((2, 360))), ValueError, "reference"),
+        (dict(scanner="laser"), TypeError, "scanner"),
+        (dict(ranges="scan"), TypeError, "ranges"),
+    ],
+)
+def test_bad_arguments_are_named(change, error, message):
+    arguments = dict(reference=np.ones(360), ranges=np.ones(360), scanner=RING) | change
+    with pytest.raises(error, match=message):
+        gs.match_scan(**arguments, backend="numpy")
+
+
+def test_no_scans_give_no_matches():
+    match = gs.match_scan(np.ones((0, 360)), np.ones((0, 360)), RING, backend="numpy")
+    assert len(match) == 0
+    assert match.pose.shape == (0, 3)

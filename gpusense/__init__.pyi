@@ -30,9 +30,9 @@ from gpusense.logs import Scan as Scan
 from gpusense.logs import check_mount as check_mount
 from gpusense.logs import read_log as read_log
 from gpusense.mapping.build import build_map as build_map
-from gpusense.matching.locate import Location as Location
-from gpusense.matching.locate import PoseMode as PoseMode
 from gpusense.matching.locate import locate_scan as locate_scan
+from gpusense.matching.location import Location as Location
+from gpusense.matching.location import PoseMode as PoseMode
 from gpusense.matching.match import match_scan as match_scan
 from gpusense.matching.match_map import MapMatch as MapMatch
 from gpusense.matching.match_map import match_map as match_map

@@ -7,7 +7,13 @@ three to this table. ``real`` stands for the precision of a model, float32 or fl
 
 from __future__ import annotations
 
-from gpusense.interface.signatures import learning_kernels, map_kernels, point_kernels, scan_kernels
+from gpusense.interface.signatures import (
+    learning_kernels,
+    map_kernels,
+    particle_kernels,
+    point_kernels,
+    scan_kernels,
+)
 from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of
 
 __all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of"]
@@ -18,4 +24,5 @@ KERNELS: dict[str, Kernel] = {
     **scan_kernels.KERNELS,
     **point_kernels.KERNELS,
     **learning_kernels.KERNELS,
+    **particle_kernels.KERNELS,
 }

@@ -54,24 +54,26 @@ def draw_particles(
     target: np.ndarray,
     after: np.ndarray,
     particles: int,
+    drawn: int,
     stage: int,
 ) -> None:
     """Draw the particles of the next stage or step, or copy them where no resampling is due."""
-    poses, drawn = source[: 3 * particles].reshape(-1, 3), target[: 3 * particles].reshape(-1, 3)
+    poses, result = source[: 3 * particles].reshape(-1, 3), target[: 3 * drawn].reshape(-1, 3)
+    n, zero = np.arange(drawn), np.zeros(drawn, np.uint64)
     total = state[stage * STAGE + TOTAL]
-    if state[stage * STAGE + RESAMPLED] == 0.0 or not total > 0.0:
-        drawn[:] = poses
+    if (state[stage * STAGE + RESAMPLED] == 0.0 and drawn == particles) or not total > 0.0:
+        result[:] = poses[n % particles]
         mean = total / (settings[SCALE] * particles)
-        after[:particles] = np.maximum(weight[:particles] / mean, LEAST_WEIGHT) if total > 0.0 else 1.0
+        old = weight[n % particles]
+        after[:drawn] = np.where(old > 0.0, np.maximum(old / mean, LEAST_WEIGHT), 0.0) if total > 0.0 else 1.0
         return
-    n, zero = np.arange(particles), np.zeros(particles, np.uint64)
     step, key = zero + np.uint64(settings[STEP]), (int(settings[SEED]), int(settings[SEED + 1]))
     stream = DRAW_STREAM + DRAW_STREAMS * stage
     first = n if settings[STRATIFIED] > 0.0 else zero
     start = uniform_of(random_words((first, step, zero + np.uint64(stream), zero), *key)[0])
-    chosen = found_at(ends, mark_of((n + start) / float(particles), total), particles)
+    chosen = found_at(ends, mark_of((n + start) / float(drawn), total), particles)
     pose = poses[chosen].copy()
-    after[:particles] = 1.0
+    after[:drawn] = 1.0
     if state[stage * STAGE + LEFT] > 0.0:
         words = random_words((n, step, zero + np.uint64(stream + 1), zero), *key)
         one = poses[found_at(ends, mark_of(uniform_of(words[0]), total), particles)]
@@ -91,4 +93,4 @@ def draw_particles(
             spread = (2.0 * uniform_of(more[axis]) - 1.0) * settings[POOL + 1 + axis]
             value = pool[3 * row + axis] + spread
             pose[injected, axis] = (wrap_once(value) if axis == 2 else value)[injected]
-    drawn[:] = pose
+    result[:] = pose

@@ -61,8 +61,8 @@ def largest_of(largest: np.ndarray, blocks: int) -> float:
 
 
 def tempered(score: np.ndarray, largest: float, left: float) -> np.ndarray:
-    """Return the likelihoods of scores relative to the largest; 1 for all where no particle is possible."""
-    if largest == -np.inf:
+    """Return the likelihoods of scores relative to the largest; 1 for all where none is possible or nothing is left."""
+    if largest == -np.inf or left == 0.0:
         return np.ones_like(score)
     return exp_of(left * (score - largest))
 

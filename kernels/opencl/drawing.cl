@@ -40,23 +40,26 @@ double mark_of(const double fraction, const double total) {
 // Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a particle.
 kernel void draw_particles(global const double *source, global const double *weight, global const double *ends,
                            global const double *settings, global const double *state, global const double *pool,
-                           global double *target, global double *after, const int particles, const int stage) {
+                           global double *target, global double *after, const int particles, const int drawn,
+                           const int stage) {
     const int n = get_global_id(0);
-    if (n >= particles) return;
+    if (n >= drawn) return;
     const long place = 3 * (long)n;
     global const double *own = state + stage * STAGE;
     const double total = own[TOTAL];
-    if (own[RESAMPLED] == 0.0 || !(total > 0.0)) {
-        for (int axis = 0; axis < 3; axis++) target[place + axis] = source[place + axis];
-        const double relative = weight[n] / (total / (settings[SCALE] * (double)particles));
-        after[n] = total > 0.0 ? (relative > LEAST_WEIGHT ? relative : LEAST_WEIGHT) : 1.0;
+    if ((own[RESAMPLED] == 0.0 && drawn == particles) || !(total > 0.0)) {
+        const long from = 3 * (long)(n % particles);
+        for (int axis = 0; axis < 3; axis++) target[place + axis] = source[from + axis];
+        const double old = weight[n % particles], relative = old / (total / (settings[SCALE] * (double)particles));
+        const double kept = old > 0.0 ? (relative > LEAST_WEIGHT ? relative : LEAST_WEIGHT) : 0.0;
+        after[n] = total > 0.0 ? kept : 1.0;
         return;
     }
     const uint step = (uint)settings[STEP], key_0 = (uint)settings[SEED], key_1 = (uint)settings[SEED + 1];
     const uint stream = DRAW_STREAM + DRAW_STREAMS * stage;
     const uint first = settings[STRATIFIED] > 0.0 ? (uint)n : 0;
     const double start = uniform_of(random_words((uint4)(first, step, stream, 0), key_0, key_1).x);
-    const long chosen = 3 * (long)found_at(ends, mark_of(((double)n + start) / (double)particles, total), particles);
+    const long chosen = 3 * (long)found_at(ends, mark_of(((double)n + start) / (double)drawn, total), particles);
     double x = source[chosen], y = source[chosen + 1], theta = source[chosen + 2];
     after[n] = 1.0;
     if (own[LEFT] > 0.0) {

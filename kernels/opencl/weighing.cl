@@ -54,9 +54,9 @@ double largest_of(global const double *largest, const int blocks) {
     return high;
 }
 
-// Return the likelihood of a score relative to the largest; 1 where no particle is possible.
+// Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
 double tempered(const double score, const double largest, const double left) {
-    return largest == -INFINITY ? 1.0 : exp_of(left * (score - largest));
+    return largest == -INFINITY || left == 0.0 ? 1.0 : exp_of(left * (score - largest));
 }
 
 // Return the part of the temperature that earlier stages have left.

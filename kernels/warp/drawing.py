@@ -59,18 +59,22 @@ def make(name, flags):
         target: wp.array(dtype=wp.float64),
         after: wp.array(dtype=wp.float64),
         particles: wp.int32,
+        drawn: wp.int32,
         stage: wp.int32,
     ):
         n = wp.tid()
-        if n >= particles:
+        if n >= drawn:
             return
         total = state[stage * STAGE + TOTAL]
-        if state[stage * STAGE + RESAMPLED] == ZERO or not total > ZERO:
+        if (state[stage * STAGE + RESAMPLED] == ZERO and drawn == particles) or not total > ZERO:
+            copied = n % particles
             for axis in range(3):
-                target[3 * n + axis] = source[3 * n + axis]
+                target[3 * n + axis] = source[3 * copied + axis]
             kept = ONE
             if total > ZERO:
-                kept = wp.max(weight[n] / (total / (settings[SCALE] * wp.float64(particles))), LEAST_WEIGHT)
+                kept = wp.max(weight[copied] / (total / (settings[SCALE] * wp.float64(particles))), LEAST_WEIGHT)
+                if weight[copied] == ZERO:
+                    kept = weight[copied]
             after[n] = kept
             return
         step = wp.uint32(settings[STEP])
@@ -81,7 +85,7 @@ def make(name, flags):
         if settings[STRATIFIED] > ZERO:
             first = wp.uint32(n)
         start = random_words(first, step, stream, key_0, key_1)
-        fraction = (wp.float64(n) + uniform_of(start[0])) / wp.float64(particles)
+        fraction = (wp.float64(n) + uniform_of(start[0])) / wp.float64(drawn)
         chosen = 3 * found_at(ends, mark_of(fraction, total), particles)
         x = source[chosen]
         y = source[chosen + 1]

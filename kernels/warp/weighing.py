@@ -68,11 +68,11 @@ def make(name, flags):
             high = wp.max(high, largest[b])
         return high
 
-    # Return the likelihood of a score relative to the largest; 1 where no particle is possible.
+    # Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
     @wp.func
     def tempered(score: wp.float64, largest: wp.float64, left: wp.float64):
         value = ONE
-        if not wp.isinf(largest):
+        if not wp.isinf(largest) and left > ZERO:
             value = exp_of(left * (score - largest))
         return value
 

@@ -32,8 +32,8 @@ KERNELS: dict[str, Kernel] = {
     ),
     "draw_particles": kernel(
         "drawing", "pose", "double source [3 * particles]", "double weight [particles]", "double ends [particles]",
-        _SETTINGS, _STATE, "double pool [3]", "out double target [3 * particles]", "out double after [particles]",
-        "int particles", "int stage",
+        _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]", "out double after [drawn]",
+        "int particles", "int drawn", "int stage",
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [12]",

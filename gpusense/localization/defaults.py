@@ -1,0 +1,40 @@
+"""Defaults of localisation that the filter and the commands share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Defaults(NamedTuple):
+    """Options of a particle filter; ``docs/localization.md`` has the measurements behind them.
+
+    Attributes:
+        particles: Their number.
+        beams: Beams of a scan that commands use; None for all.
+        threshold: Resample below this share of the particles.
+        stages: Most stages of a correction.
+        share: Least effective sample size of a stage, as a share of the particles.
+        jitter: Share of the difference of two particles by which a drawn one moves between stages.
+        farthest: Largest such difference [m].
+        farthest_turn: Largest such difference of headings [rad].
+        slow: Rate of the slow average of the likelihood.
+        fast: Rate of the fast average.
+        most_injected: Largest share of injected particles.
+        temperature: Of the filter and of ``gpusense score``.
+    """
+
+    particles: int = 2000
+    beams: int | None = None
+    threshold: float = 0.5
+    stages: int = 4
+    share: float = 0.2
+    jitter: float = 0.2
+    farthest: float = 1.0
+    farthest_turn: float = 0.5
+    slow: float = 0.02
+    fast: float = 0.3
+    most_injected: float = 0.2
+    temperature: str = "auto"
+
+
+DEFAULTS = Defaults()

@@ -21,6 +21,7 @@ class Defaults(NamedTuple):
         fast: Rate of the fast average.
         most_injected: Largest share of injected particles.
         temperature: Of the filter and of ``gpusense score``.
+        calibrations: Corrections from which the temperature is learned at first; later two of ten.
     """
 
     particles: int = 2000
@@ -35,6 +36,7 @@ class Defaults(NamedTuple):
     fast: float = 0.3
     most_injected: float = 0.2
     temperature: str = "auto"
+    calibrations: int = 60
 
 
 DEFAULTS = Defaults()

@@ -384,13 +384,15 @@ class ParticleFilter:
     def _calibrate(self, given: list[tuple[int, tuple[Any, ...]]]) -> None:
         """Learn the correlation of beams at the estimate, often at first and seldom later."""
         due = [(i, reading) for i, reading in given if self._sensors[i].calibrates]
-        if not due or (self._verdict.corrections > 20 and self._verdict.corrections % 10):
+        count = self._verdict.corrections
+        if not due or (count > DEFAULTS.calibrations and count % 10 > 1):
             return
         if self._cloud.summary().effective_sample_size < 2:
             return
         pose = self._cloud.estimate(self._shown)[:3]
         for index, reading in due:
-            self._sensors[index].correlate(pose, reading)
+            follows = count <= DEFAULTS.calibrations or count % 10 == 1
+            self._sensors[index].correlate(pose, reading, follows=follows)
 
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""

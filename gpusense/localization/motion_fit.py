@@ -3,7 +3,9 @@
 The difference between reference and odometry over a step is, to first order, normal: (along, across, heading) = (trans
 noise, trans * first turn's noise, sum of both turns' noises). Steps that fit better with the odometer's translation
 reversed are counted, and give the probability of a reverse. A Student t density with 4 degrees of freedom keeps single
-slips from inflating the noise of all steps.
+slips from inflating the noise of all steps. Errors of an odometer repeat from step to step (a wheel's radius, a slope),
+while a filter draws new noise at each step: variances are multiplied by 1 + 2 sum rho_l, the inflation of the variance
+of a sum by the autocorrelation rho_l of standardised errors.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ _FREEDOM = 4.0
 _LEAST_ALPHA, _MOST_ALPHA = 1e-6, 1.0
 # A reversed translation must fit better by this distance [m] to count.
 _CLEAR = 0.05
+# Longest lag of the autocorrelation, and the largest inflation.
+_LAGS, _MOST_INFLATION = 10, 10.0
 
 
 @dataclass(frozen=True)
@@ -32,12 +36,14 @@ class MotionFit:
         motion: The model.
         steps: Number of steps.
         reversed_steps: Steps in which the odometer's translation had the wrong sign.
-        log_likelihood: Of all steps, natural logarithm.
+        inflation: Factor of the variances, by the autocorrelation of errors; ``motion`` has it.
+        log_likelihood: Of all steps before the inflation, natural logarithm up to a constant.
     """
 
     motion: OdometryMotion
     steps: int
     reversed_steps: int
+    inflation: float
     log_likelihood: float
 
 
@@ -57,7 +63,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray) -> MotionFit:
         >>> truth[:, 0] = np.arange(400)
         >>> odometry = truth + np.cumsum(rng.normal(0, [0.1, 0, 0], (400, 3)), axis=0)
         >>> fit = gs.fit_odometry_motion(odometry, truth)
-        >>> 0.005 < fit.motion.alpha[2] < 0.02
+        >>> 0.005 < fit.motion.alpha[2] / fit.inflation < 0.02
         True
     """
     from scipy.optimize import minimize
@@ -82,9 +88,11 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray) -> MotionFit:
         key=lambda found: found.fun,
     )
     alpha = np.exp(np.clip(best.x, np.log(_LEAST_ALPHA), np.log(_MOST_ALPHA)))
+    inflation = _inflation(alpha, turns, residual, least)
+    alpha = alpha * inflation
     count, wrong = len(turns), int(flipped.sum())
     motion = OdometryMotion(tuple(float(a) for a in alpha), (wrong + 0.5) / (count + 1), least)
-    return MotionFit(motion, count, wrong, -float(best.fun))
+    return MotionFit(motion, count, wrong, inflation, -float(best.fun))
 
 
 def _distance(turns: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -100,6 +108,21 @@ def _residuals(turns: np.ndarray, truth: np.ndarray) -> np.ndarray:
     cosine, sine = np.cos(turns[:, 0]), np.sin(turns[:, 0])
     heading = wrap_angle(truth[:, 2] - turns[:, 0] - turns[:, 2])
     return np.stack([cosine * x + sine * y, cosine * y - sine * x, heading], axis=1)
+
+
+def _inflation(alpha: np.ndarray, turns: np.ndarray, residual: np.ndarray, least: tuple[float, float]) -> float:
+    """Return the largest inflation of variance by autocorrelation, of errors along and of the heading."""
+    first, trans, second = turns.T
+    squares = first**2 + second**2
+    along = alpha[2] * trans**2 + alpha[3] * squares + least[0] ** 2
+    heading = alpha[0] * squares + 2 * alpha[1] * trans**2 + 2 * least[1] ** 2
+    factors = [1.0]
+    for error in (residual[:, 0] / np.sqrt(along), residual[:, 2] / np.sqrt(heading)):
+        held = np.clip(error, -4, 4)
+        products = [held[lag:] @ held[: len(held) - lag] for lag in range(min(_LAGS, len(held) - 1) + 1)]
+        if products[0] > 0:
+            factors.append(1 + 2 * sum(max(product, 0.0) for product in products[1:]) / products[0])
+    return float(min(max(factors), _MOST_INFLATION))
 
 
 def _cost(alpha: np.ndarray, turns: np.ndarray, residual: np.ndarray, least: tuple[float, float]) -> float:

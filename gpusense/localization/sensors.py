@@ -52,9 +52,9 @@ class Sensor:
             return 1.0
         return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen
 
-    def correlate(self, pose: np.ndarray, reading: tuple[Any, ...]) -> None:
+    def correlate(self, pose: np.ndarray, reading: tuple[Any, ...], *, follows: bool) -> None:
         """Learn the correlation of beams from a scan at the estimated pose."""
-        self._correlation.add(self.parts(pose[None], reading)[0])
+        self._correlation.add(self.parts(pose[None], reading)[0], follows=follows)
 
     def parts(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray:
         """Return (N, K) log-likelihoods of the beams of a scan, in float64."""

@@ -12,7 +12,7 @@ from . import elementary, heading, motion
 from .prelude import kernel
 
 ESTIMATE_SUMS = wp.constant(13)
-ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 totals = wp.types.vector(length=11, dtype=wp.float64)
 
 
@@ -47,7 +47,7 @@ def make(name, flags):
             y0 = estimate[1]
             theta0 = estimate[2]
         total = totals()
-        largest = wp.float64(MINUS_ONE)
+        largest = wp.float64(0.0) - ONE
         best = int(begin)
         for n in range(begin, wp.min(begin + block, particles)):
             w = weight[n]
@@ -87,8 +87,8 @@ def make(name, flags):
         if i > 0:
             return
         total = totals()
-        largest = wp.float64(MINUS_ONE)
-        best = wp.float64(ZERO)
+        largest = wp.float64(0.0) - ONE
+        best = wp.float64(0.0)
         for b in range(blocks):
             row = b * ESTIMATE_SUMS
             for k in range(11):

@@ -51,7 +51,7 @@ def make(name, flags):
         if begin >= particles:
             return
         temperature = settings[TEMPERATURE + sensor]
-        high = wp.float64(NEVER)
+        high = wp.float64(0.0) + NEVER
         for n in range(begin, wp.min(begin + block, particles)):
             value = temperature * wp.float64(log_p[n])
             if sensor > 0:

@@ -14,7 +14,7 @@ from typing import NoReturn
 from gpusense._version import __version__
 
 # Modules of gpusense.commands, in the order of the help.
-COMMANDS = ("devices", "selftest", "demo", "score", "fit", "landmarks", "bench")
+COMMANDS = ("devices", "selftest", "demo", "score", "localize", "fit", "landmarks", "bench")
 
 BAD_INPUT = 2
 INTERRUPTED = 130

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 
 class Defaults(NamedTuple):
@@ -10,6 +12,7 @@ class Defaults(NamedTuple):
 
     Attributes:
         particles: Their number.
+        particles_everywhere: Their number where the filter begins anywhere on a map.
         beams: Beams of a scan that commands use; None for all.
         threshold: Resample below this share of the particles.
         stages: Most stages of a correction.
@@ -22,9 +25,11 @@ class Defaults(NamedTuple):
         most_injected: Largest share of injected particles.
         temperature: Of the filter and of ``gpusense score``.
         calibrations: Corrections from which the temperature is learned at first; later two of ten.
+        field: Parameters of the likelihood field of ``gpusense localize``.
     """
 
     particles: int = 2000
+    particles_everywhere: int = 20_000
     beams: int | None = None
     threshold: float = 0.5
     stages: int = 4
@@ -37,6 +42,9 @@ class Defaults(NamedTuple):
     most_injected: float = 0.2
     temperature: str = "auto"
     calibrations: int = 60
+    field: Mapping[str, Any] = MappingProxyType(
+        dict(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.07, interpolation="bilinear")
+    )
 
 
 DEFAULTS = Defaults()

@@ -41,6 +41,7 @@ from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion, settings_of
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import Verdict
+from gpusense.world.grid import OccupancyGrid
 
 _MOST_SENSORS = SETTINGS - TEMPERATURE
 _STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
@@ -237,7 +238,7 @@ class ParticleFilter:
         self._check_started()
         sampled = self.motion.sampled(*motion)
         if self._pending is not _STILL:
-            self._flush()
+            self.flush()
         # The next correction begins with the move: one program has both.
         self._pending = sampled
 
@@ -292,8 +293,8 @@ class ParticleFilter:
         kept[:: max(len(kept) // count, 1)][:count] = chosen[: len(kept[:: max(len(kept) // count, 1)][:count])]
         self._place(kept)
 
-    def _flush(self) -> None:
-        """Run the pending motion as a step of its own."""
+    def flush(self) -> None:
+        """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
         if self._pending is _STILL:
             return
         motion, self._pending = self._pending, _STILL
@@ -418,7 +419,7 @@ class ParticleFilter:
         """
         self._check_started()
         checks.choice("method", method, ("mean", "cluster", "best"))
-        self._flush()
+        self.flush()
         numbers, summary = self._cloud.estimate(self._shown), self._cloud.summary()
         pose, covariance = numbers[:3].copy(), covariance_of(numbers)
         if method != "mean":
@@ -440,17 +441,40 @@ class ParticleFilter:
         return tuple(sensor.temperature(self.temperature) for sensor in self._sensors)
 
     @property
+    def scoring_seconds(self) -> float:
+        """Seconds that the models' log-likelihoods have taken; 0 where a step is one recorded program."""
+        return sum(sensor.seconds for sensor in self._sensors)
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map of the first model that has one.
+
+        Raises:
+            ValueError: none has one.
+        """
+        for sensor in self._sensors:
+            if hasattr(sensor.model, "grid"):
+                return sensor.model.grid
+        raise ValueError("models: must have a map, got none with one")
+
+    def host_particles(self) -> np.ndarray:
+        """Return a copy of the (N, 3) poses after the last step in host memory."""
+        self._check_started()
+        self.flush()
+        return self._cloud.host_poses(self._cloud.shown, self._shown)
+
+    @property
     def particles(self) -> Any:
         """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
         self._check_started()
-        self._flush()
+        self.flush()
         return self._array(self._cloud.poses[self._cloud.shown], (self._shown, 3))
 
     @property
     def weights(self) -> Any:
         """(N,) weights of the particles, with a mean near 1 on a GPU, and with the sum 1 as a NumPy array."""
         self._check_started()
-        self._flush()
+        self.flush()
         if self._backend.info.kind == "gpu":
             return self._array(self._cloud.weight, (self._shown,))
         weights = self._cloud.host_weights(self._shown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ class Sensor:
         backend: Its device.
         precision: Precision of its log-likelihoods.
         beams: Beams that a scan uses; 0 for other models.
+        seconds: Time of all calls of ``log_likelihood``.
         calibrates: Whether temperature="auto" learns from it.
 
     Raises:
@@ -45,6 +47,7 @@ class Sensor:
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()
         self._ranges: Any = None
+        self.seconds = 0.0
 
     def temperature(self, chosen: float | str, reading: object = None) -> float:
         """Return the temperature of the log-likelihood now."""
@@ -62,7 +65,10 @@ class Sensor:
 
     def log_likelihood(self, poses: Any, reading: tuple[Any, ...], out: Any = None) -> Any:
         """Return the log-likelihoods of poses."""
-        return self.model.log_likelihood(poses, *reading, out=out)
+        begin = time.perf_counter()
+        result = self.model.log_likelihood(poses, *reading, out=out)
+        self.seconds += time.perf_counter() - begin
+        return result
 
     # ---- recorded steps
 

@@ -32,9 +32,9 @@ HELP = "Localise a robot along a recorded log with a particle filter."
 LOST = 1
 
 _EPILOG = """\
-The filter begins around the first logged pose, or with --global anywhere in the free space of the map. It moves with the
-log's odometry and weighs each chosen scan. Errors are those of the weighted mean against the logged poses, where the log
-has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate.
+The filter begins around the first logged pose, or with --global anywhere in the free space of the map. It moves with
+the log's odometry and weighs each chosen scan. Errors are those of the weighted mean against the logged poses, where
+the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate.
 
 The verdict at the end does not need logged poses: it is 'lost' if the estimates of the last tenth of the scans explain
 too few of their beams, as on a wrong map.
@@ -146,9 +146,10 @@ def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
     from gpusense.localization.motion_fit import fit_odometry_motion
 
     if args.fit_motion:
-        if any(step.scan.pose is None for step in steps):
+        poses = [step.scan.pose for step in steps if step.scan.pose is not None]
+        if len(poses) < len(steps):
             raise ValueError("--fit-motion: needs a log with poses, got one without")
-        return fit_odometry_motion([step.odometry for step in steps], [step.scan.pose for step in steps]).motion
+        return fit_odometry_motion([step.odometry for step in steps], poses).motion
     plain = OdometryMotion()
     alpha = plain.alpha if args.motion_noise is None else tuple(args.motion_noise)
     return OdometryMotion(alpha, plain.reverse if args.reverse is None else args.reverse)

@@ -195,7 +195,7 @@ def summary(track: Track) -> dict[str, float | int | bool | None]:
     result |= dict(zip(("ms_predict", "ms_score", "ms_resample", "ms_estimate"), map(float, means), strict=True))
     errors, squared, truth = track.errors(), track.squared_distances(), track.truth
     if errors is None or squared is None or truth is None:
-        return result | {name: None for name in _WITH_TRUTH}
+        return result | dict.fromkeys(_WITH_TRUTH)
     position, heading = errors
     relative = pose_difference(np.array(track.poses)[:-1], np.array(track.poses)[1:])
     relative = pose_difference(pose_difference(truth[:-1], truth[1:]), relative) if count > 1 else np.zeros((1, 3))

@@ -35,6 +35,8 @@ BEACON, BEACON_TERMS = 6, 13
 def strands_in(terms: int) -> int:
     """Return the strands of a number of terms: STRANDS of each whole block, and at most as many of the rest."""
     return terms // BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS)
+
+
 # Kernel files motion, weighing, drawing and estimate: numbers of a step's settings by place. SEED takes 2 places, MEAN
 # and DEVIATION 4, POOL 4 (their number, and the half widths in which they are spread), and TEMPERATURE one per sensor.
 SEED, STEP, MEAN, DEVIATION, REVERSE, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = 0, 2, 3, 7, 11, 12, 13, 14, 15

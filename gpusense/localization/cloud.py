@@ -69,7 +69,7 @@ class Cloud:
     def __init__(self, backend: Backend, capacity: int, sensors: int, precision: np.dtype) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.shown, self.next = capacity, 0, 0
-        self.block = max(int(math.ceil(math.sqrt(capacity))), 16)
+        self.block = max(math.ceil(math.sqrt(capacity)), 16)
         most = -(-capacity // 16)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
@@ -93,7 +93,7 @@ class Cloud:
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
         self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = max(int(math.ceil(math.sqrt(self.count))), 16)
+        self.block = max(math.ceil(math.sqrt(self.count)), 16)
         w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
         self.backend.synchronize()
         self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
@@ -232,7 +232,7 @@ class Cloud:
     def resized(self, drawn: int) -> None:
         """Set the number of particles, after a step that has drawn so many."""
         self.count = drawn
-        self.block = max(int(math.ceil(math.sqrt(drawn))), 16)
+        self.block = max(math.ceil(math.sqrt(drawn)), 16)
 
     # ---- what crosses to the host
 

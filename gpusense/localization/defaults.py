@@ -20,6 +20,8 @@ class Defaults(NamedTuple):
         jitter: Share of the difference of two particles by which a drawn one moves between stages.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].
+        wide_scans: Corrections after a start anywhere on the map that use a lower temperature.
+        wide_share: Factor of the temperature there: particles that lie apart must not be judged as precisely.
         slow: Rate of the slow average of the likelihood.
         fast: Rate of the fast average.
         most_injected: Largest share of injected particles.
@@ -37,6 +39,8 @@ class Defaults(NamedTuple):
     jitter: float = 0.2
     farthest: float = 1.0
     farthest_turn: float = 0.5
+    wide_scans: int = 5
+    wide_share: float = 0.3
     slow: float = 0.02
     fast: float = 0.3
     most_injected: float = 0.2

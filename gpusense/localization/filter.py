@@ -33,6 +33,7 @@ from gpusense.interface.constants import (
     TEMPERATURE,
     THRESHOLD,
 )
+from gpusense.interface.launches import Program
 from gpusense.localization import starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud import Cloud
@@ -51,8 +52,8 @@ _MOST = 1 << 24
 class ParticleFilter:
     """Monte Carlo localisation: particles that move with the odometry and are weighed by sensors.
 
-    All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed gives
-    the same particles on every backend, but for roundings of log-likelihoods. A correction has up to ``stages`` stages:
+    All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed
+    gives the same particles on every backend, but for roundings of log-likelihoods. A correction has up to ``stages`` stages:
     each takes as much of the temperature as leaves a share of the particles with weight, draws, and lets drawn
     particles differ a little (annealing). So a few hundred particles track a precise scanner.
 
@@ -127,7 +128,7 @@ class ParticleFilter:
         self.recovery = None if recovery is None else checks.choice("recovery", recovery, ("augmented", "sensor"))
         self._cloud = Cloud(self._backend, self._most, len(self._sensors), self._sensors[0].precision)
         self._step, self._started, self._pending = 0, False, _STILL
-        self._shown = self._most
+        self._shown, self._wide = self._most, 0
         self._pool_size, self._spread = 0, (0.0, 0.0, 0.0)
         self._verdict = Verdict(self._sensors, self._random_poses)
         self._last: dict[int, tuple[Any, ...]] = {}
@@ -177,6 +178,7 @@ class ParticleFilter:
         """
         pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
         self._place(starts.spread(pool, spread, self._number(particles), self._key()))
+        self._wide = DEFAULTS.wide_scans
 
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
         """Draw particles from a likelihood over poses.
@@ -198,7 +200,7 @@ class ParticleFilter:
     def _place(self, poses: np.ndarray) -> None:
         """Replace all particles, and forget what was learned about the likelihood of scans."""
         self._cloud.place(poses)
-        self._shown, self._started, self._pending = len(poses), True, _STILL
+        self._shown, self._started, self._pending, self._wide = len(poses), True, _STILL, 0
         self._backend.upload(np.zeros(STATE), self._cloud.state)
         self._verdict.reset()
         if self.recovery == "augmented" and not self._pool_size:
@@ -266,6 +268,7 @@ class ParticleFilter:
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
         self._last = dict(given)
+        self._wide = max(self._wide - 1, 0)
         self._verdict.corrected()
         if self.temperature == "auto":
             self._calibrate(given)
@@ -328,7 +331,9 @@ class ParticleFilter:
 
     def _programs(self, source: int, given: list[tuple[int, tuple[Any, ...]]]) -> tuple[Any, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
-        cloud, program, owners = self._cloud, (), []
+        cloud = self._cloud
+        program: Program = ()
+        owners: list[object] = []
         cloud.use(len(given))
         poses = cloud.lent(cloud.poses[source], (cloud.count, 3))
         for place, (index, _) in enumerate(given):
@@ -374,10 +379,10 @@ class ParticleFilter:
         if self.recovery == "augmented":
             s[SLOW_RATE], s[FAST_RATE] = DEFAULTS.slow, DEFAULTS.fast
             s[MOST_INJECTED] = DEFAULTS.most_injected
-        total = 0.0
+        total, wide = 0.0, DEFAULTS.wide_share if self._wide and self.temperature == "auto" else 1.0
         for place, index in enumerate(given):
             sensor = self._sensors[index]
-            s[TEMPERATURE + place] = sensor.temperature(self.temperature)
+            s[TEMPERATURE + place] = sensor.temperature(self.temperature) * (wide if sensor.calibrates else 1.0)
             total += s[TEMPERATURE + place] * max(sensor.beams, 1)
         s[PER_BEAM_SCALE] = 1 / total if total > 0 else 0.0
         return s
@@ -499,4 +504,3 @@ def _counts(particles: Any) -> tuple[int, int]:
     if least > most:
         raise ValueError(f"particles: least must be at most the largest, got {checks.show(particles)}")
     return least, most
-

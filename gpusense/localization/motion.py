@@ -126,7 +126,9 @@ class OdometryMotion:
         deviations = [math.sqrt(a1 * turn * turn + a2 * trans * trans + ar * ar) for turn in (first, second)]
         length = math.sqrt(a3 * trans * trans + a4 * (first * first + second * second) + at * at)
         reverse = self.reverse if abs(trans) >= _SHORTEST else 0.0
-        return SampledMotion((first, trans, 0.0, second), (deviations[0], length, 0.0, deviations[1]), STRAIGHT, reverse)
+        return SampledMotion(
+            (first, trans, 0.0, second), (deviations[0], length, 0.0, deviations[1]), STRAIGHT, reverse
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,9 +210,7 @@ class VelocityMotion:
         length = math.hypot(math.sqrt(a1 * v * v + a2 * w * w) * seconds, at)
         half = math.sqrt(a3 * v * v + a4 * w * w) * seconds / 2
         last = math.hypot(math.sqrt(a5 * v * v + a6 * w * w) * seconds, ar)
-        return SampledMotion(
-            (w * seconds / 2, v * seconds, 0.0, 0.0), (half, length, 0.0, last), VELOCITY_MODEL
-        )
+        return SampledMotion((w * seconds / 2, v * seconds, 0.0, 0.0), (half, length, 0.0, last), VELOCITY_MODEL)
 
 
 def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:

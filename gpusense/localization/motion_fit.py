@@ -10,6 +10,7 @@ of a sum by the autocorrelation rho_l of standardised errors.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,7 +73,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray) -> MotionFit:
     reference = checks.array("poses", poses, (len(reported), 3))
     if len(reported) < 3:
         raise ValueError(f"odometry: must hold at least 3 poses, got {len(reported)}")
-    turns = np.array([odometry_turns(a, b) for a, b in zip(reported[:-1], reported[1:], strict=True)])
+    turns = np.array([odometry_turns(a, b) for a, b in itertools.pairwise(reported)])
     truth = pose_difference(reference[:-1], reference[1:])
     flipped = _distance(turns * (1, -1, 1), truth) < _distance(turns, truth) - _CLEAR
     turns[flipped, 1] *= -1

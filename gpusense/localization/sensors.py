@@ -40,7 +40,7 @@ class Sensor:
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel, LandmarkModel)):
             raise TypeError(f"models: must be measurement models, got {checks.show(model)}")
-        self.model = model
+        self.model: Any = model
         self.calibrates = isinstance(model, ScanModel)
         self.backend: Backend = model.backend
         self.precision = np.dtype(model.precision)

@@ -17,7 +17,7 @@ import numpy as np
 from gpusense.localization.sensors import Sensor
 
 # Random poses; corrections over which the share is averaged; the least share of a filter that is not lost.
-_RANDOM, _MEMORY, LEAST_EXPLAINED = 64, 5, 0.6
+_RANDOM, _MEMORY, LEAST_EXPLAINED = 64, 5, 0.8
 
 
 class Verdict:

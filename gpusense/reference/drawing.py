@@ -3,7 +3,7 @@
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
 Robotics* table 4.4, and Kitagawa (1996). Between two stages of a correction a drawn pose moves by a fraction of the
 difference of two others, whose spread is that of the cloud (differential evolution: ter Braak 2006); differences
-between separate clusters are left out. Injected poses come from a pool: free cells, or the modes of a likelihood map.
+between separate clusters are shortened. Injected poses come from a pool: free cells, or the modes of a likelihood map.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ def draw_particles(
         other = poses[found_at(ends, mark_of(uniform_of(words[1]), total), particles)]
         d = one - other
         d[:, 2] = wrap_once(d[:, 2])
-        near = (np.abs(d[:, 0]) <= settings[FARTHEST_X]) & (np.abs(d[:, 1]) <= settings[FARTHEST_X])
-        near &= np.abs(d[:, 2]) <= settings[FARTHEST_THETA]
-        pose[near] += settings[JITTER] * d[near]
+        far = np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])) / settings[FARTHEST_X]
+        far = np.maximum(np.maximum(far, np.abs(d[:, 2]) / settings[FARTHEST_THETA]), 1.0)
+        pose += (settings[JITTER] / far)[:, None] * d
         pose[:, 2] = wrap_once(pose[:, 2])
     if stage == 0 and state[INJECTED] > 0.0 and settings[POOL] > 0.0:
         words = random_words((n, step, zero + np.uint64(stream + 2), zero), *key)

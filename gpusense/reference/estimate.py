@@ -30,6 +30,7 @@ def sum_poses(
     x, y = pose[:, 0] - reference[0], pose[:, 1] - reference[1]
     angle = wrap_once(pose[:, 2] - reference[2])
     cosine, sine = cos_sin(angle)
+    columns: tuple[np.ndarray, ...]
     columns = (w, w * x, w * y, w * cosine, w * sine, w * x * x, w * x * y, w * x * angle, w * y * y, w * y * angle)
     columns = (*columns, w * angle * angle)
     for b, begin in enumerate(range(0, particles, block)):

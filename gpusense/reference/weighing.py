@@ -101,8 +101,8 @@ def follow_evidence(total: float, before: float, largest: float, settings: np.nd
     """Update the averages of the likelihood per beam, and the share of particles to inject."""
     if largest == -np.inf or not total > 0.0 or not before > 0.0:
         return
-    evidence = largest + float(log_of(np.float64(total / before)))
-    mean = float(exp_of(np.float64(min(settings[PER_BEAM_SCALE] * evidence, 700.0))))
+    evidence = largest + float(log_of(np.array(total / before)))
+    mean = float(exp_of(np.array(min(settings[PER_BEAM_SCALE] * evidence, 700.0))))
     first = state[SLOW] == 0.0
     state[EVIDENCE] = evidence
     state[SLOW] = mean if first else state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW])

@@ -2,7 +2,7 @@
 // Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: "Probabilistic
 // Robotics" table 4.4, and Kitagawa (1996). Between two stages of a correction a drawn pose moves by a fraction of the
 // difference of two others, whose spread is that of the cloud (differential evolution: ter Braak 2006); differences
-// between separate clusters are left out. Injected poses come from a pool: free cells, or the modes of a likelihood map.
+// between separate clusters are shortened. Injected poses come from a pool: free cells, or the modes of a likelihood map.
 // requires: motion
 
 #define JITTER 12
@@ -68,11 +68,10 @@ kernel void draw_particles(global const double *source, global const double *wei
         const long other = 3 * (long)found_at(ends, mark_of(uniform_of(words.y), total), particles);
         const double dx = source[one] - source[other], dy = source[one + 1] - source[other + 1];
         const double turn = wrap_once(source[one + 2] - source[other + 2]);
-        if (fabs(dx) <= settings[FARTHEST_X] && fabs(dy) <= settings[FARTHEST_X] &&
-            fabs(turn) <= settings[FARTHEST_THETA]) {
-            x += settings[JITTER] * dx, y += settings[JITTER] * dy, theta += settings[JITTER] * turn;
-        }
-        theta = wrap_once(theta);
+        const double far_x = fmax(fabs(dx), fabs(dy)) / settings[FARTHEST_X];
+        const double far = fmax(fmax(far_x, fabs(turn) / settings[FARTHEST_THETA]), 1.0);
+        const double part = settings[JITTER] / far;
+        x += part * dx, y += part * dy, theta = wrap_once(theta + part * turn);
     }
     if (stage == 0 && state[INJECTED] > 0.0 && settings[POOL] > 0.0) {
         const uint4 words = random_words((uint4)((uint)n, step, stream + 2, 0), key_0, key_1);

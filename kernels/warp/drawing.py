@@ -3,7 +3,7 @@
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
 Robotics* table 4.4, and Kitagawa (1996). Between two stages of a correction a drawn pose moves by a fraction of the
 difference of two others, whose spread is that of the cloud (differential evolution: ter Braak 2006); differences
-between separate clusters are left out. Injected poses come from a pool: free cells, or the modes of a likelihood map.
+between separate clusters are shortened. Injected poses come from a pool: free cells, or the modes of a likelihood map.
 """
 
 import functools
@@ -98,12 +98,12 @@ def make(name, flags):
             dx = source[one] - source[other]
             dy = source[one + 1] - source[other + 1]
             turn = wrap_once(source[one + 2] - source[other + 2])
-            near = wp.abs(dx) <= settings[FARTHEST_X] and wp.abs(dy) <= settings[FARTHEST_X]
-            if near and wp.abs(turn) <= settings[FARTHEST_THETA]:
-                x += settings[JITTER] * dx
-                y += settings[JITTER] * dy
-                theta += settings[JITTER] * turn
-            theta = wrap_once(theta)
+            far_x = wp.max(wp.abs(dx), wp.abs(dy)) / settings[FARTHEST_X]
+            far = wp.max(wp.max(far_x, wp.abs(turn) / settings[FARTHEST_THETA]), ONE)
+            part = settings[JITTER] / far
+            x += part * dx
+            y += part * dy
+            theta = wrap_once(theta + part * turn)
         if stage == 0 and state[INJECTED] > ZERO and settings[POOL] > ZERO:
             some = random_words(wp.uint32(n), step, stream + wp.uint32(2), key_0, key_1)
             more = random_words(wp.uint32(n), step, stream + wp.uint32(3), key_0, key_1)

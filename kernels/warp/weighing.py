@@ -84,7 +84,8 @@ def make(name, flags):
             left = state[(stage - 1) * STAGE + LEFT]
         return left
 
-    # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a block.
+    # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a
+    # block.
     @kernel
     def weigh_particles(
         score: wp.array(dtype=wp.float64),
@@ -174,14 +175,12 @@ def make(name, flags):
     @wp.func
     def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), least: wp.float64):
         rung = int(0)
-        while rung < RUNGS - 1 and not (
-            totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]
-        ):
+        while rung < RUNGS - 1 and not (totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]):
             rung += 1
         return rung
 
-    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first writes the
-    # stage's state.
+    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first writes
+    # the stage's state.
     @kernel
     def set_weights(
         score: wp.array(dtype=wp.float64),

@@ -138,7 +138,8 @@ def main() -> None:
         if args.coverage:
             for words, temperature, options in (
                 ("plain product", 1.0, {}), ("temperature 0.1", 0.1, {}), ("20 beams, product", 1.0, dict(beams=20)),
-                ("60 beams, product", 1.0, dict(beams=60)), ("auto", "auto", {}), ("60 beams, auto", "auto", dict(beams=60)),
+                ("60 beams, product", 1.0, dict(beams=60)), ("auto", "auto", {}),
+                ("60 beams, auto", "auto", dict(beams=60)),
             ):  # fmt: skip
                 other = field(grid, scans[0].scanner, args.backend, **options)
                 run = track(data, other, args.limit, particles=2000, seed=0, temperature=temperature)

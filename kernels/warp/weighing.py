@@ -179,8 +179,8 @@ def make(name, flags):
             rung += 1
         return rung
 
-    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first writes
-    # the stage's state.
+    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
+    # writes the stage's state.
     @kernel
     def set_weights(
         score: wp.array(dtype=wp.float64),

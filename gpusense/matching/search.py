@@ -24,6 +24,8 @@ _NO_FLAGS: frozenset[str] = frozenset()
 _FIRST, _GROWTH = 16, 8
 # Most sums of one launch, and most poses that are kept.
 _MOST_SUMS, _MOST_KEPT = 1 << 27, 1 << 18
+# Most items of one launch: some drivers allow 65535 groups along the last axis.
+_MOST_ITEMS = 1 << 15
 
 
 class Search:
@@ -116,7 +118,7 @@ class _Run:
         height, width = (-(-size >> self._level) for size in (self._grid.height, self._grid.width))
         point, image = self._folded_points(period)
         bounds = np.empty((items, height, width), np.int32)
-        each = max(_MOST_SUMS // (height * width), 1)
+        each = min(max(_MOST_SUMS // (height * width), 1), _MOST_ITEMS)
         flags = widened(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
         for begin in range(0, items, each):
             count = min(each, items - begin)

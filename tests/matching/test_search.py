@@ -124,6 +124,16 @@ def test_poses_beyond_the_memory_are_dropped_and_reported(monkeypatch):
     assert not found.complete[0] and len(found.scan) <= 50
 
 
+def test_bounds_are_the_same_in_several_launches(monkeypatch):
+    scores, points, grid = scene(3)
+    search = Search(ScoreTables(get_backend("numpy"), scores, levels=2))
+    whole = search.find(points, grid, slack=20)
+    monkeypatch.setattr("gpusense.matching.search._MOST_ITEMS", 4)
+    parts = search.find(points, grid, slack=20)
+    for name in ("scan", "row", "col", "heading", "score"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+
+
 def test_scores_are_rounded_by_at_most_half_a_step():
     values = np.linspace(-3.7, 1.3, 1001)
     scores = quantized(values, -3.7, 1.3)

@@ -14,7 +14,9 @@ from typing import NoReturn
 from gpusense._version import __version__
 
 # Modules of gpusense.commands, in the order of the help.
-COMMANDS = ("devices", "selftest", "demo", "score", "fit", "match", "landmarks", "bench")
+COMMANDS = (
+    "devices", "selftest", "demo", "map", "score", "localize", "fit", "match", "likelihood-map", "landmarks", "bench",
+)  # fmt: skip
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -119,7 +121,7 @@ def _build(names: Sequence[str]) -> Parser:
     parser.add_argument("--version", action="version", version=f"gpusense {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands")
     for name in names:
-        module = importlib.import_module(f"gpusense.commands.{name}")
+        module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
         command = commands.add_parser(
             module.NAME, help=module.HELP, description=module.HELP, formatter_class=layout, allow_abbrev=False
         )

@@ -156,10 +156,10 @@ def _print(total: dict[str, Any]) -> None:
         print(f"  {count} {status}: {STATUSES[status]}")
     print(f"score: median {total['score_median']:.3f}")
     if total["wrong"] is not None:
-        place, turn = ([total[f"{name}_{part}"] for part in ("median", "p95")] for name in ("position", "heading"))
+        turn = {name: math.degrees(total[f"heading_{name}"]) for name in ("median", "p95")}
         print(
-            f"against the logged poses: {place[0]:.4f} m and {math.degrees(turn[0]):.3f} deg median, "
-            f"{place[1]:.4f} m and {math.degrees(turn[1]):.3f} deg at 95 %; {total['wrong']} wrong"
+            f"against the logged poses: {total['position_median']:.4f} m and {turn['median']:.3f} deg median, "
+            f"{total['position_p95']:.4f} m and {turn['p95']:.3f} deg at 95 %; {total['wrong']} wrong"
         )
 
 

@@ -41,3 +41,26 @@ GRADIENT_NUMBERS = 10
 def strands_in(terms: int) -> int:
     """Return the strands of a number of terms: STRANDS of each whole block, and at most as many of the rest."""
     return terms // BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS)
+
+
+# Kernel files motion, weighing, drawing and estimate: numbers of a step's settings by place. SEED takes 2 places, MEAN
+# and DEVIATION 4, POOL 4 (their number, and the half widths in which they are spread), and TEMPERATURE one per sensor.
+SEED, STEP, MEAN, DEVIATION, REVERSE, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = 0, 2, 3, 7, 11, 12, 13, 14, 15
+SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED, STRATIFIED = range(19, 27)
+TEMPERATURE = 27
+SETTINGS = 64
+# Streams of random numbers within a step; a stage of a correction has DRAW_STREAMS of its own.
+MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
+# Kinds of motion: a straight translation, or an arc.
+STRAIGHT, VELOCITY_MODEL = 0, 1
+# Rungs of the ladder of temperatures; columns of a block's sums: weights, their squares, and the weights before.
+RUNGS = 8
+WEIGHT_SUMS = 2 * RUNGS + 1
+# The state of a filter: numbers of each stage of a correction, and those that last.
+LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = range(6)
+STAGE = 8
+EVIDENCE, SLOW, FAST, INJECTED = 48, 49, 50, 51
+STATE = 64
+# Kernel file estimate: sums of a block, and numbers of an estimate: pose, covariance by rows of its upper half, the
+# sum of weights and the best particle.
+ESTIMATE_SUMS, ESTIMATE = 13, 12

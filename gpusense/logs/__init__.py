@@ -2,5 +2,6 @@
 
 from gpusense.logs.reader import read_log
 from gpusense.logs.records import LandmarkRun, Odometry, Pose, Scan
+from gpusense.logs.transforms import check_mount
 
-__all__ = ["LandmarkRun", "Odometry", "Pose", "Scan", "read_log"]
+__all__ = ["LandmarkRun", "Odometry", "Pose", "Scan", "check_mount", "read_log"]

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, overload
 
+from numpy.typing import ArrayLike
+
 from gpusense._util import checks
+from gpusense.logs.lines import numbered_lines
 from gpusense.logs.records import Odometry, Scan
 
 
@@ -21,20 +24,34 @@ class Format:
         name: Its name in messages, with an article.
         module: The module whose function ``read(file, *, range_max, odometry, rear)`` yields its records.
         suffixes: The ends of its files' names; empty for the format of all files that no other claims.
+        begins: The first bytes of its text files, in place of suffixes.
+        folder: Whether a folder with this file in it is a log of this format; "" for no folder.
+        topics: Whether ``read`` takes ``topic`` and ``mount``, too.
     """
 
     name: str
     module: str
     suffixes: tuple[str, ...] = ()
+    begins: tuple[bytes, ...] = ()
+    folder: str = ""
+    topics: bool = False
 
     def claims(self, file: Path) -> bool:
-        """Return whether a file has a name of this format."""
+        """Return whether a file has a name, or a beginning, of this format."""
+        if file.is_dir():
+            return bool(self.folder) and (file / self.folder).is_file()
+        if self.begins:
+            return next((line for _, line in numbered_lines(file)), b"").startswith(self.begins)
         return not self.suffixes or file.name.lower().endswith(self.suffixes)
 
 
 # The first format that claims a file reads it.
-FORMATS = (Format("a CARMEN log", "gpusense.logs.carmen"),)
-_OTHER_FORMATS = {".bag": "a ROS 1 bag", ".db3": "a ROS 2 bag", ".mcap": "an MCAP file"}
+FORMATS = (
+    Format("a ROS 1 bag", "gpusense.logs.ros", (".bag",), topics=True),
+    Format("a ROS 2 bag", "gpusense.logs.ros", (".db3", ".mcap"), folder="metadata.yaml", topics=True),
+    Format("a Wean Hall log", "gpusense.logs.wean", begins=(b"L ", b"O ")),
+    Format("a CARMEN log", "gpusense.logs.carmen"),
+)
 
 
 @overload
@@ -44,6 +61,8 @@ def read_log(
     range_max: float | None = None,
     odometry: Literal[False] = False,
     rear: bool = False,
+    topic: str | None = None,
+    mount: ArrayLike | None = None,
 ) -> Iterator[Scan]: ...
 
 
@@ -54,6 +73,8 @@ def read_log(
     range_max: float | None = None,
     odometry: bool,
     rear: bool = False,
+    topic: str | None = None,
+    mount: ArrayLike | None = None,
 ) -> Iterator[Scan | Odometry]: ...
 
 
@@ -63,20 +84,27 @@ def read_log(
     range_max: float | None = None,
     odometry: bool = False,
     rear: bool = False,
+    topic: str | None = None,
+    mount: ArrayLike | None = None,
 ) -> Iterator[Scan] | Iterator[Scan | Odometry]:
     """Read a log, one record at a time and in the file's order.
 
-    This version reads CARMEN logs, plain or compressed by gzip. The module of each format describes how messages become
-    records, such as :mod:`gpusense.logs.carmen`.
+    Formats are CARMEN and Wean Hall logs, plain or compressed by gzip, rosbags of ROS 1, and of ROS 2 with sqlite3 or
+    MCAP storage, as a folder or a single file. ROS is not needed, but the library rosbags is: ``pip install
+    'gpusense[ros]'``. The module of each format describes how messages become records, such as
+    :mod:`gpusense.logs.carmen` and :mod:`gpusense.logs.ros`.
 
     Args:
-        path: The file.
+        path: The file, or the folder of a ROS 2 bag.
         range_max: Readings of at least ``range_max`` are "no return" [m]. None takes the limit from the log: the value
             stated in each message, or, for old messages without one, the largest reading of the log. If that reading
             occurs at least three times, it is the scanner's code for "no return"; else the limit is the next float64
             above it, so that every reading is a return. This takes a first pass over the file.
         odometry: Whether to yield :class:`Odometry` records, too.
-        rear: Whether to yield the scans of the rear laser instead of those of the front laser.
+        rear: Whether to yield the scans of the rear laser of a CARMEN log instead of those of the front laser.
+        topic: Topic of the scans in a ROS bag; None takes ``/scan``, or the only one.
+        mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's fixed
+            transforms. A warning says where these contradict a given mount; see also :func:`check_mount`.
 
     Returns:
         An iterator of :class:`Scan`, and of :class:`Odometry` if ``odometry``.
@@ -85,7 +113,9 @@ def read_log(
         FileNotFoundError: The file is missing; raised by the call, as are the next two.
         TypeError: An argument has the wrong type.
         ValueError: ``range_max`` is not finite and > 0, or the file has another format.
-        ValueError: While reading, a message breaks the format; the error names the file and the line.
+        ImportError: While reading a ROS bag, the library rosbags is absent.
+        ValueError: While reading, a message breaks the format; the error names the file and the line, or the topic and
+            the message's number.
 
     Example:
         >>> import gpusense as gs, pathlib, tempfile
@@ -101,15 +131,31 @@ def read_log(
     for name, flag in (("odometry", odometry), ("rear", rear)):
         if not isinstance(flag, bool):
             raise TypeError(f"{name}: must be True or False, got {checks.show(flag)}")
-    other = _OTHER_FORMATS.get(file.suffix.lower())
-    if file.is_dir():
-        other = "a ROS 2 bag" if (file / "metadata.yaml").exists() else "a folder"
-    if other is not None:
+    if not file.is_dir():
+        checks.existing_file(file)
+    form = next((each for each in FORMATS if each.claims(file)), None)
+    if form is None:
         known = " or ".join(each.name for each in FORMATS)
-        raise ValueError(f"{file}: must be {known}, which is all that this version reads, got {other}")
-    checks.existing_file(file)
-    form = next(each for each in FORMATS if each.claims(file))
-    records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(
-        file, range_max=range_max, odometry=odometry, rear=rear
-    )
+        raise ValueError(f"{file}: must be {known}, got a folder without metadata.yaml")
+    options: dict[str, object] = dict(range_max=range_max, odometry=odometry, rear=rear)
+    options |= _ros_options(form, topic, mount)
+    records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(file, **options)
     return records
+
+
+def _ros_options(form: Format, topic: object, mount: ArrayLike | None) -> dict[str, object]:
+    """Return the checked options of ROS bags.
+
+    Raises:
+        TypeError: ``topic`` is no string, or ``mount`` does not hold numbers.
+        ValueError: ``mount`` has another shape, or the format has no topics.
+    """
+    if topic is not None and not isinstance(topic, str):
+        raise TypeError(f"topic: must be a string or None, got {checks.show(topic)}")
+    place = None if mount is None else tuple(checks.array("mount", mount, (3,)).tolist())
+    if form.topics:
+        return dict(topic=topic, mount=place)
+    for name, value in (("topic", topic), ("mount", mount)):
+        if value is not None:
+            raise ValueError(f"{name}: must be None for {form.name}, got {checks.show(value)}")
+    return {}

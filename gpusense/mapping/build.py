@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense.backends import Selection, get_backend
-from gpusense.mapping.counts import RayCounts, RayEnds, batches, extent
+from gpusense.mapping.counts import SCANS, RayCounts, RayEnds, batches, extent
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 from gpusense.world.windows import LONGEST_SIDE
@@ -30,7 +30,6 @@ def build_map(
     p_prior: float = 0.5,
     occupied_threshold: int = 65,
     backend: Selection = "auto",
-    progress: Callable[[OccupancyGrid], object] | None = None,
 ) -> OccupancyGrid:
     """Build an occupancy grid from scans at known poses.
 
@@ -55,7 +54,6 @@ def build_map(
         p_prior: Occupancy before any ray, in (0, 1).
         occupied_threshold: Least occupancy of an occupied cell [per cent].
         backend: The device, see :func:`gpusense.devices`.
-        progress: Is called with the map so far after each launch, on some 1000 scans.
 
     Returns:
         The map; occupancy is rounded to per cent.
@@ -71,27 +69,68 @@ def build_map(
         >>> grid.cells.tolist()
         [[-1, -1, -1, -1, -1, -1, -1], [-1, 45, 45, 45, 45, 85, -1], [-1, -1, -1, -1, -1, -1, -1]]
     """
-    if not isinstance(scanner, Scanner):
-        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
-    placed = checks.array("poses", poses, ("S", 3))
-    readings = checks.array("scans", scans, (len(placed), scanner.count), finite=False)
-    cell = checks.real("resolution", resolution, above=0)
-    limit = scanner.range_max if range_limit is None else checks.real("range_limit", range_limit, above=0)
-    if not isinstance(clear_max, bool):
-        raise TypeError(f"clear_max: must be True or False, got {checks.show(clear_max)}")
-    occupancy = _occupancy(p_hit, p_miss, p_prior)
-    checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
-    device = get_backend(backend)
-    parts = [
-        RayEnds(readings[part], placed[part], scanner, min(limit, scanner.range_max), clear_max=clear_max)
-        for part in batches(len(placed))
-    ]
-    counts = RayCounts(device, cell, *_frame(parts, cell, origin, shape))
-    for part in parts:
-        counts.add(part)
-        if progress is not None:
-            progress(counts.grid(*occupancy, occupied_threshold))
-    return counts.grid(*occupancy, occupied_threshold)
+    builder = MapBuilder(
+        scans, poses, scanner, resolution=resolution, origin=origin, shape=shape, range_limit=range_limit,
+        clear_max=clear_max, p_hit=p_hit, p_miss=p_miss, p_prior=p_prior, occupied_threshold=occupied_threshold,
+        backend=backend,
+    )  # fmt: skip
+    for _ in builder.steps():
+        pass
+    return builder.grid()
+
+
+class MapBuilder:
+    """Builds a map in steps, after each of which the map so far can be read; see :func:`build_map`."""
+
+    def __init__(
+        self,
+        scans: ArrayLike,
+        poses: ArrayLike,
+        scanner: Scanner,
+        *,
+        resolution: float,
+        origin: ArrayLike | None,
+        shape: tuple[int, int] | None,
+        range_limit: float | None,
+        clear_max: bool,
+        p_hit: float,
+        p_miss: float,
+        p_prior: float,
+        occupied_threshold: int,
+        backend: Selection,
+        each: int = SCANS,
+    ) -> None:
+        if not isinstance(scanner, Scanner):
+            raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+        placed = checks.array("poses", poses, ("S", 3))
+        readings = checks.array("scans", scans, (len(placed), scanner.count), finite=False)
+        cell = checks.real("resolution", resolution, above=0)
+        limit = scanner.range_max if range_limit is None else checks.real("range_limit", range_limit, above=0)
+        if not isinstance(clear_max, bool):
+            raise TypeError(f"clear_max: must be True or False, got {checks.show(clear_max)}")
+        self._occupancy = _occupancy(p_hit, p_miss, p_prior)
+        self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
+        device = get_backend(backend)
+        self._parts = [
+            RayEnds(readings[part], placed[part], scanner, min(limit, scanner.range_max), clear_max=clear_max)
+            for part in batches(len(placed), each)
+        ]
+        self._counts = RayCounts(device, cell, *_frame(self._parts, cell, origin, shape))
+
+    def steps(self) -> Iterator[float]:
+        """Count rays, some scans at a time, and yield the share of scans that are done."""
+        for i, part in enumerate(self._parts):
+            self._counts.add(part)
+            yield (i + 1) / len(self._parts)
+
+    @property
+    def rays(self) -> int:
+        """Rays that have been counted."""
+        return self._counts.rays
+
+    def grid(self) -> OccupancyGrid:
+        """Return the map so far."""
+        return self._counts.grid(*self._occupancy, self._threshold)
 
 
 def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, float, float]:

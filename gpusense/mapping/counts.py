@@ -16,7 +16,7 @@ from gpusense.world.windows import LONGEST_SIDE
 
 _INT = np.dtype(np.int32)
 # Scans whose rays are counted in one launch.
-_SCANS = 1024
+SCANS = 1024
 
 
 class RayEnds:
@@ -143,6 +143,6 @@ def extent(parts: list[RayEnds], resolution: float) -> tuple[tuple[float, float,
     return (x, y, 0.0), (int(size[1]), int(size[0]))
 
 
-def batches(count: int) -> list[slice]:
+def batches(count: int, each: int = SCANS) -> list[slice]:
     """Return the scans of each launch."""
-    return [slice(first, min(first + _SCANS, count)) for first in range(0, count, _SCANS)]
+    return [slice(first, min(first + each, count)) for first in range(0, count, each)]

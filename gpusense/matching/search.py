@@ -8,13 +8,15 @@ so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.lanes import widened
+from gpusense.matching.pose_grid import Found, PoseGrid, end_cells
 from gpusense.matching.score_tables import ScoreTables
+
+__all__ = ["Found", "PoseGrid", "Search"]
 
 _INT = np.dtype(np.int32)
 _NO_FLAGS: frozenset[str] = frozenset()
@@ -22,94 +24,6 @@ _NO_FLAGS: frozenset[str] = frozenset()
 _FIRST, _GROWTH = 16, 8
 # Most sums of one launch, and most poses that are kept.
 _MOST_SUMS, _MOST_KEPT = 1 << 27, 1 << 18
-
-
-@dataclass(frozen=True, eq=False)
-class PoseGrid:
-    """Poses to search: for each of S scans A headings and H x W positions.
-
-    Attributes:
-        start: (S, 2) x and y of the position with row and column 0 [cells of the table].
-        headings: (S, A) headings in the table's frame [rad].
-        height: Rows of positions.
-        width: Columns of positions; neighbours are ``stride`` cells of the tables apart.
-    """
-
-    start: np.ndarray
-    headings: np.ndarray
-    height: int
-    width: int
-
-    @classmethod
-    def around(cls, poses: np.ndarray, reach: tuple[int, int], turns: int, angle: float, stride: int = 1) -> PoseGrid:
-        """Return the poses around (S, 3) poses [cells, cells, rad] in the table's frame.
-
-        Args:
-            poses: The centres.
-            reach: Positions on either side, along y and along x.
-            turns: Headings on either side.
-            angle: Angle between neighbouring headings [rad].
-            stride: Cells between neighbouring positions.
-        """
-        rows, cols = reach
-        start = poses[:, :2] - stride * np.array([cols, rows])
-        headings = poses[:, 2:] + angle * np.arange(-turns, turns + 1)
-        return cls(start, headings, 2 * rows + 1, 2 * cols + 1)
-
-    @property
-    def count(self) -> int:
-        """Number of poses of all scans."""
-        return self.headings.size * self.height * self.width
-
-    def poses(self, found: Found, stride: int) -> np.ndarray:
-        """Return (M, 3) poses [cells, cells, rad] in the table's frame of poses that were found."""
-        start = self.start[found.scan]
-        return np.stack(
-            [start[:, 0] + stride * found.col, start[:, 1] + stride * found.row,
-             self.headings[found.scan, found.heading]], axis=1,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Poses of a search, those of each scan by falling score; ties by row, then column, then heading.
-
-    Attributes:
-        scan: (M,) scan of each pose.
-        row: (M,) its row.
-        col: (M,) its column.
-        heading: (M,) index of its heading.
-        score: (M,) its score, the sum of cells over the scan's points.
-        evaluated: Poses and blocks that were evaluated.
-        complete: (S,) whether all poses of a scan within ``slack`` of its best one are here.
-    """
-
-    scan: np.ndarray
-    row: np.ndarray
-    col: np.ndarray
-    heading: np.ndarray
-    score: np.ndarray
-    evaluated: int
-    complete: np.ndarray
-
-    @property
-    def best(self) -> np.ndarray:
-        """(S,) index of the best pose of each scan."""
-        return np.searchsorted(self.scan, np.arange(len(self.complete)))
-
-
-def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (A, K, 2) int32 columns and rows of the end points at each heading, at the position ``start``.
-
-    Args:
-        points: (K, 2) end points in the robot's frame [cells].
-        headings: (A,) [rad].
-        start: (2,) x and y [cells].
-    """
-    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-    x, y = points[:, 0], points[:, 1]
-    cells = np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
-    return np.floor(cells).astype(np.int32)
 
 
 class Search:
@@ -132,6 +46,7 @@ class Search:
         slack: int = 0,
         level: int | None = None,
         allowed: np.ndarray | None = None,
+        images: Sequence[np.ndarray] | None = None,
     ) -> Found:
         """Return the best pose of each scan, and all poses whose scores are at most ``slack`` lower.
 
@@ -142,16 +57,17 @@ class Search:
             level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: all levels
                 of the tables.
             allowed: (height, width) bool: positions that may be found. None: all.
+            images: (K_s,) table of each point. None: those of the scans.
 
         Returns:
             The poses. A scan without points scores 0 everywhere. Without an allowed position there is no pose.
         """
         level = self.tables.levels if level is None else level
         run = _Run(self, grid, slack, allowed, level)
-        run.upload(points)
+        run.upload(points, images)
         bounds = run.block_bounds()
         if level == 0:
-            run.keep(*run.above(bounds, np.full(len(grid.start), -1)), final=True)
+            run.keep_all(bounds)
         else:
             run.descend_best(bounds)
             run.descend_all(bounds)
@@ -173,7 +89,7 @@ class _Run:
         self._evaluated = 0
         self._allowed = None if allowed is None else _pooled_masks(allowed, level)
 
-    def upload(self, points: Sequence[np.ndarray]) -> None:
+    def upload(self, points: Sequence[np.ndarray], images: Sequence[np.ndarray] | None) -> None:
         """Place the end points of all scans at all headings, and copy them to the device."""
         grid, tables = self._grid, self._tables
         cells = [
@@ -183,8 +99,10 @@ class _Run:
         counts = np.repeat([len(part) for part in points], self._turns)
         self._first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         flat = np.concatenate([part.reshape(-1, 2) for part in cells]) if cells else np.empty((0, 2), np.int32)
-        images = np.zeros(len(points), np.int32) if tables.shape.tables == 1 else np.arange(len(points), dtype=np.int32)
-        image = np.repeat(images, [part.shape[0] * part.shape[1] for part in cells]).astype(np.int32)
+        if images is None:
+            several = tables.shape.tables > 1
+            images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
+        image = np.concatenate([np.tile(part, self._turns) for part in images]).astype(np.int32)
         self._host = flat, image
         upload = self._space.upload
         self._points = (
@@ -305,10 +223,14 @@ class _Run:
         np.maximum.at(self._best, candidates[:, 0] // self._turns, score)
         np.maximum(self._floor, np.where(self._best >= 0, self._best - self._slack, -1), out=self._floor)
 
-    def keep(self, candidates: np.ndarray, score: np.ndarray, *, final: bool = False) -> None:
+    def keep_all(self, scores: np.ndarray) -> None:
+        """Keep the best of all poses of each scan."""
+        self._best = scores.reshape(len(self._best), -1).max(axis=1, initial=-1).astype(np.int64)
+        self._floor = np.where(self._best >= 0, self._best - self._slack, -1)
+        self.keep(*self.above(scores, self._floor))
+
+    def keep(self, candidates: np.ndarray, score: np.ndarray) -> None:
         """Keep poses that reach the floor; with too many of them, raise the floor."""
-        if final:
-            self._raise(candidates, score)
         reached = score >= self._floor[candidates[:, 0] // self._turns]
         self._kept.append((candidates[reached], score[reached]))
         if sum(len(part) for _, part in self._kept) > _MOST_KEPT:

@@ -11,6 +11,12 @@ from gpusense.plots.drawing import (
 from gpusense.plots.localization import localization_figure
 from gpusense.plots.matches import match_figure
 from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
+from gpusense.plots.pose_maps import (
+    draw_likelihood_field,
+    draw_pose_likelihood,
+    draw_scan_field,
+    pose_likelihood_figure,
+)
 from gpusense.plots.positions import (
     draw_beacons,
     draw_fix,
@@ -25,17 +31,21 @@ __all__ = [
     "add_colour_bar",
     "draw_beacons",
     "draw_fix",
+    "draw_likelihood_field",
     "draw_map",
     "draw_particles",
     "draw_pose",
     "draw_pose_density",
+    "draw_pose_likelihood",
     "draw_position_density",
     "draw_scan",
+    "draw_scan_field",
     "draw_solution_set",
     "localization_figure",
     "match_figure",
     "new_figure",
     "pose_lattice",
+    "pose_likelihood_figure",
     "position_log_density",
     "save",
     "set_view",

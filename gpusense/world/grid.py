@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense.world.messages import field, planar_pose, real_field
 
 
 class OccupancyGrid:
@@ -56,6 +57,40 @@ class OccupancyGrid:
         self._origin: tuple[float, float, float] = (x, y, yaw)
         self._occupied_threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         self._occupied: NDArray[np.bool] | None = None
+
+    @classmethod
+    def from_message(cls, message: Any, *, occupied_threshold: int = 65) -> OccupancyGrid:
+        """Make the map of a ``nav_msgs/OccupancyGrid``, without ROS.
+
+        Args:
+            message: Any object or mapping with the message's fields ``data`` (H * W values, row by row) and ``info``,
+                which has ``resolution``, ``width``, ``height`` and ``origin``, a pose with position and orientation.
+            occupied_threshold: Least occupancy of an occupied cell [per cent].
+
+        Raises:
+            TypeError: A field is absent or has the wrong type.
+            ValueError: The number of cells differs from width times height, the origin is tilted, or a value breaks a
+                rule of :class:`OccupancyGrid`.
+
+        Example:
+            >>> import gpusense as gs
+            >>> origin = dict(position=dict(x=1.0, y=2.0, z=0.0), orientation=dict(x=0.0, y=0.0, z=0.0, w=1.0))
+            >>> info = dict(resolution=0.1, width=3, height=2, origin=origin)
+            >>> gs.OccupancyGrid.from_message(dict(info=info, data=[0, 0, 100, -1, 0, 0])).origin
+            (1.0, 2.0, 0.0)
+        """
+        width, height = (
+            checks.integer(f"message.info.{name}", field("message", message, f"info.{name}"), low=0)
+            for name in ("width", "height")
+        )
+        raw = field("message", message, "data")
+        data = np.frombuffer(raw, np.int8) if isinstance(raw, (bytes, bytearray)) else raw
+        cells = checks.as_array("message.data", data).ravel()
+        if cells.size != width * height:
+            raise ValueError(f"message.data: must hold width * height = {width * height} cells, got {cells.size}")
+        origin = planar_pose("message.info.origin", field("message", message, "info.origin"))
+        resolution = real_field("message", message, "info.resolution")
+        return cls(cells.reshape(height, width), resolution, origin, occupied_threshold=occupied_threshold)
 
     @property
     def cells(self) -> NDArray[np.int8]:

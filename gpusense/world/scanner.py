@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense.world.messages import laser_geometry
 
 
 class Reading(enum.IntEnum):
@@ -135,6 +136,31 @@ class Scanner:
             first + step * np.arange(beams), range_max, range_min, mount, cone=cone, cone_rays=cone_rays,
             critical_incidence=critical_incidence,
         )  # fmt: skip
+
+    @classmethod
+    def from_laser_scan(cls, message: Any, mount: ArrayLike = (0.0, 0.0, 0.0)) -> Scanner:
+        """Make the scanner of a ``sensor_msgs/LaserScan``, without ROS.
+
+        Beam k has the bearing ``angle_min + k angle_increment``. There is one for each of ``ranges``, also for a last
+        beam that points where the first one does, so that ``message.ranges`` are readings of this scanner. REP-117's
+        infinities and NaN are classified by :func:`classify`.
+
+        Args:
+            message: Any object or mapping with the message's fields angle_min, angle_increment, range_min, range_max
+                and ranges. ``angle_max`` is not read, because it follows from the others.
+            mount: Pose (x, y, theta) of the laser in the robot's frame [m, m, rad].
+
+        Raises:
+            TypeError: A field is absent or has the wrong type.
+            ValueError: A value is not finite or breaks a rule of :class:`Scanner`, or beams coincide.
+
+        Example:
+            >>> import gpusense as gs
+            >>> message = dict(angle_min=-1.5, angle_increment=0.5, range_min=0.1, range_max=8.0, ranges=[2.0] * 7)
+            >>> gs.Scanner.from_laser_scan(message, mount=(0.2, 0.0, 0.0))
+            Scanner(7 beams over 171.9 deg, range_max=8.0, range_min=0.1, mount=(0.2, 0.0, 0.0))
+        """
+        return cls.uniform(**laser_geometry(message), mount=mount)
 
     @property
     def bearings(self) -> NDArray[np.float64]:

@@ -11,7 +11,10 @@ int padded_stride(const ScoreTable scores) { return scores.cols + 2 * scores.mar
 
 // Return the index of a cell in its table; cells beyond the margin have the value of the margin's outer cells.
 int cell_index(const ScoreTable scores, const int row, const int col) {
-    const int line = min(max(row, -scores.margin), scores.rows + scores.margin - 1) + scores.margin;
-    const int begin = min(max(col, -scores.margin), scores.cols + scores.margin - RUN) + scores.margin;
+    // Comparisons, since PoCL compiles min and max as calls.
+    const int low = -scores.margin, last_line = scores.rows + scores.margin - 1;
+    const int last_col = scores.cols + scores.margin - RUN;
+    const int line = (row < low ? low : row > last_line ? last_line : row) + scores.margin;
+    const int begin = (col < low ? low : col > last_col ? last_col : col) + scores.margin;
     return line * padded_stride(scores) + begin;
 }

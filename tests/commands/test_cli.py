@@ -49,7 +49,7 @@ def test_command_help_has_an_example(name, capsys):
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
 def test_command_modules_keep_the_contract(name):
-    module = importlib.import_module(f"gpusense.commands.{name}")
+    module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
     assert name == module.NAME
     assert module.HELP.endswith(".") and "\n" not in module.HELP
 

@@ -11,6 +11,7 @@ from support.kernel_scenes import run
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.mapping.build import MapBuilder
 
 UNIT = 4096
 
@@ -119,15 +120,19 @@ def test_far_and_max_readings():
     assert known(np.inf, clear_max=True) == (51, 0) and known(5.0, clear_max=True, range_limit=1.02) == (11, 0)
 
 
-def test_the_extent_holds_all_rays_and_progress_sees_each_launch(monkeypatch):
-    monkeypatch.setattr("gpusense.mapping.counts._SCANS", 2)
+def test_the_extent_holds_all_rays_and_a_map_is_built_in_steps():
     scanner = gs.Scanner([0.0, math.pi / 2], range_max=5.0)
-    seen = []
-    grid = gs.build_map(np.full((3, 2), 2.0), [(1, 1, 0), (-4, 7, 1), (3, 3, 2)], scanner, resolution=0.5,
-                        backend="numpy", progress=seen.append)  # fmt: skip
-    assert len(seen) == 2 and seen[-1] == grid
+    arguments = np.full((3, 2), 2.0), [(1, 1, 0), (-4, 7, 1), (3, 3, 2)], scanner
+    grid = gs.build_map(*arguments, resolution=0.5, backend="numpy")
     assert not (~grid.unknown)[[0, -1]].any() and not (~grid.unknown)[:, [0, -1]].any()
     assert all(value % 0.5 == 0 for value in grid.origin[:2])
+    builder = MapBuilder(
+        *arguments, resolution=0.5, origin=None, shape=None, range_limit=None, clear_max=False, p_hit=0.85,
+        p_miss=0.45, p_prior=0.5, occupied_threshold=65, backend="numpy", each=2,
+    )  # fmt: skip
+    known = [(~builder.grid().unknown).sum() for _ in builder.steps()]
+    assert known[0] < known[1] and len(known) == 2 and builder.rays == 6
+    assert builder.grid() == grid
 
 
 def test_bad_arguments_are_named():

@@ -1,4 +1,4 @@
-"""Matches of scans to maps, and methods on maps of single scans."""
+"""Local maps in global ones: with and without a guess, other resolutions and frames, symmetrical and foreign maps."""
 
 from __future__ import annotations
 
@@ -6,100 +6,80 @@ import math
 
 import numpy as np
 import pytest
-from support.matching_scenes import FRONT, RING, random_pairs
 
 import gpusense as gs
-from gpusense.backends import get_backend
-from gpusense.matching.options import MatchOptions
-from gpusense.matching.to_map import MapMatcher
 
 
-def drawn(origin=(0.0, 0.0, 0.0)):
-    """Return a map of 5 cm of a room with two blocks in a frame anywhere."""
-    cells = np.zeros((150, 190), int)
-    cells[[0, -1]] = 100
-    cells[:, [0, -1]] = 100
-    cells[70:95, 120:140] = 100
-    cells[30:50, 40:55] = 100
-    return gs.OccupancyGrid(cells, resolution=0.05, origin=origin)
+def house() -> np.ndarray:
+    """Return cells of a house of three rooms with unlike furniture."""
+    cells = np.pad(np.zeros((60, 90), int), 1, constant_values=100)
+    cells[1:40, 30], cells[20:61, 60], cells[30, 60:80] = 100, 100, 100
+    cells[10:14, 8:12], cells[45:48, 20:30], cells[12:20, 70:73], cells[50:52, 75] = 100, 100, 100, 100
+    return cells
 
 
-def poses_in(grid, local):
-    """Return poses of the world from poses in the grid's frame."""
-    x0, y0, yaw = grid.origin
-    c, s = math.cos(yaw), math.sin(yaw)
-    x, y, theta = local.T
-    return np.column_stack([x0 + c * x - s * y, y0 + s * x + c * y, theta + yaw])
+def cut(grid: gs.OccupancyGrid, pose, shape=(40, 50), resolution=0.1) -> gs.OccupancyGrid:
+    """Return the part of a map that a local map at a pose of its frame holds."""
+    local = gs.OccupancyGrid(np.zeros(shape, int), resolution, (-1.5, -2.0, 0.0))
+    rows, cols = (index.ravel() for index in np.indices(shape))
+    xy = local.cell_centers(rows, cols)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    world = np.stack([pose[0] + cos * xy[:, 0] - sin * xy[:, 1], pose[1] + sin * xy[:, 0] + cos * xy[:, 1]], axis=1)
+    col, row = np.floor(grid.world_to_cells(world)).astype(int).T
+    inside = (row >= 0) & (row < grid.shape[0]) & (col >= 0) & (col < grid.shape[1])
+    cells = np.full(len(row), -1)
+    cells[inside] = grid.cells[row[inside], col[inside]]
+    return gs.OccupancyGrid(cells.reshape(shape), resolution, local.origin)
 
 
-@pytest.fixture(scope="module")
-def local():
-    rng = np.random.default_rng(7)
-    return np.column_stack([rng.uniform(3.0, 5.5, 12), rng.uniform(2.6, 3.3, 12), rng.uniform(-3, 3, 12)])
+def off(pose, truth) -> tuple[float, float]:
+    return float(np.hypot(*(np.asarray(pose) - truth)[:2])), abs(math.remainder(pose[2] - truth[2], 2 * math.pi))
 
 
-def scans_at(grid, poses):
-    return gs.RayCaster(grid, range_max=30.0, backend="numpy", precision="float64").cast(poses, RING.bearings)
+@pytest.mark.parametrize("resolution", [0.1, 0.05])
+def test_a_part_of_a_map_is_found(backend, resolution):
+    grid = gs.OccupancyGrid(house(), 0.1, (5e5, -1e6, 0.7))
+    (center,) = grid.cell_centers([25], [35])
+    truth = np.array([*center, 1.1])
+    local = cut(grid, truth, (round(4 / resolution), round(5 / resolution)), resolution)
+    everywhere = gs.match_map(local, grid, angle=0.05, backend=backend)
+    near = gs.match_map(local, grid, guess=truth + np.array([0.3, -0.4, 0.15]), window=(0.5, 0.5, 0.2), backend=backend)
+    for match, turn in ((everywhere, 0.05), (near, 0.0175)):
+        position, heading = off(match.pose, truth)
+        assert match.status == "found" and match.found
+        assert position < 0.25 and heading <= turn
+        assert match.correlation > 0.5 and match.overlap > 0.7
+        assert match.evaluated < match.poses
+    assert near.poses < everywhere.poses
 
 
-def errors(match, truth):
-    turn = np.angle(np.exp(1j * (match.pose[:, 2] - truth[:, 2])))
-    return np.hypot(*(match.pose - truth).T[:2]), np.abs(turn)
+def test_a_symmetrical_map_is_ambiguous():
+    grid = gs.OccupancyGrid(np.pad(np.zeros((41, 61), int), 1, constant_values=100), 0.1)
+    match = gs.match_map(grid, grid, angle=0.1, backend="numpy")
+    assert match.status == "ambiguous" and len(match.modes) >= 2
+    found = [min(off(mode, truth)[0] for mode in match.modes) for truth in ((0, 0, 0), (6.3, 4.3, math.pi))]
+    assert max(found) < 0.15
 
 
-@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e6, -4e6, 0.6)], ids=["near", "far and yawed"])
-def test_poor_guesses_in_a_map_are_corrected_to_a_fraction_of_a_cell(device, local, origin):
-    grid = drawn(origin)
-    truth = poses_in(grid, local)
-    rng = np.random.default_rng(1)
-    guess = truth + np.column_stack([rng.uniform(-0.5, 0.5, (12, 2)), np.radians(rng.uniform(-10, 10, 12))])
-    match = gs.match_scan(grid, scans_at(grid, truth), RING, guess, backend=device)
-    assert match.converged.all()
-    distance, turn = errors(match, truth)
-    assert np.median(distance) < 0.1 * grid.resolution
-    assert distance.max() < 0.5 * grid.resolution
-    assert np.degrees(np.median(turn)) < 0.02
+def test_a_foreign_map_has_no_match():
+    grid = gs.OccupancyGrid(house(), 0.1)
+    cells = np.where(np.random.default_rng(1).random((30, 30)) < 0.3, 100, 0)
+    match = gs.match_map(gs.OccupancyGrid(cells, 0.1), grid, angle=0.2, backend="numpy")
+    assert match.status == "no match" and not match.found
 
 
-@pytest.mark.parametrize(("method", "cells"), [("gauss_newton", 1.0), ("correlative", 2.5)])
-def test_fields_find_poses_to_the_cell(device, local, method, cells):
-    grid = drawn((1.0, 2.0, 0.3))
-    truth = poses_in(grid, local)
-    match = gs.match_scan(
-        grid, scans_at(grid, truth), RING, truth + np.array([0.15, -0.1, 0.05]), method, backend=device
-    )
-    distance, turn = errors(match, truth)
-    assert np.median(distance) < cells * grid.resolution
-    assert np.median(turn) < 0.02
-    assert (np.linalg.eigvalsh(match.covariance) > 0).all()
-
-
-def test_the_search_returns_the_best_pose_of_its_grid(local):
-    """A correlative match is as good as every other pose of the window by its own integer scores: brute force."""
-    grid = drawn()
-    matcher = MapMatcher(grid, RING, get_backend("numpy"), "float32", MatchOptions(0.01, 1.0, (0.3, 0.1)))
-    scans = scans_at(grid, local[:2])
-    guess = local[:2] + np.array([0.1, 0.1, 0.05])
-    pose = matcher.searched(scans, guess)
-    original = matcher._search.find
-    matcher._search.find = lambda points, poses: original(points, poses, level=0)
-    np.testing.assert_array_equal(pose, matcher.searched(scans, guess))
-
-
-@pytest.mark.parametrize("method", ["gauss_newton", "correlative"])
-def test_methods_of_maps_match_scans_to_scans(method):
-    first, second, truth = random_pairs(2, FRONT, seed=8)
-    match = gs.match_scan(first, second, FRONT, truth + np.array([0.05, 0.05, 0.02]), method, backend="numpy")
-    distance, turn = errors(match, truth)
-    assert distance.max() < 0.1
-    assert turn.max() < 0.05
-
-
-def test_a_single_scan_gives_a_single_match(local):
-    grid = drawn()
-    scan = scans_at(grid, local[:1])[0]
-    match = gs.match_scan(grid, scan, RING, local[0], backend="numpy")
-    assert isinstance(match.status, str)
-    assert match.pose.shape == (3,)
-    with pytest.raises(ValueError, match="method"):
-        gs.match_scan(grid, scan, RING, local[0], "icp", backend="numpy")
+def test_bad_arguments_are_named():
+    grid = gs.OccupancyGrid(house(), 0.1)
+    empty = gs.OccupancyGrid([[0]], 0.1)
+    for call, name in [
+        (lambda: gs.match_map(empty, grid), "local_grid"),
+        (lambda: gs.match_map(grid, grid, window=(1, 1, 1)), "window"),
+        (lambda: gs.match_map(grid, grid, (0, 0, 0), (-1, 1, 1)), "window"),
+        (lambda: gs.match_map(grid, grid, (0, 0)), "guess"),
+        (lambda: gs.match_map(grid, grid, angle=0), "angle"),
+        (lambda: gs.match_map(grid, grid, min_correlation=2), "min_correlation"),
+    ]:
+        with pytest.raises(ValueError, match=f"^{name}:"):
+            call()
+    with pytest.raises(TypeError, match=r"^grid:"):
+        gs.match_map(grid, [[0]])

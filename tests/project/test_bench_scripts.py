@@ -322,6 +322,14 @@ def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_p
         assert row["filter"]["error_median"] < 0.2
 
 
+def test_offsets_of_beacons_run(data_dir: Path, tmp_path: Path) -> None:
+    arguments = ("--data", str(data_dir), "--set", "simulated")
+    report = run_script("studies/beacon_offsets.py", *arguments, output=tmp_path / "beacon_offsets")
+    (found,) = report["sets"]
+    none, common, each = found["rows"]
+    assert each["nees"] < 3 < each["raw"] and each["held_out"] > common["held_out"] > none["held_out"]
+
+
 def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
     arguments = ["--figures", str(tmp_path / "drawn"), "--most", "64"]
     report = run_script("accuracy/discrete_convergence.py", *arguments, output=tmp_path / "discrete")
@@ -381,6 +389,17 @@ def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script("speed/whole_calls.py", "--backend", needs("opencl"), *small, output=tmp_path / "small")
     assert {row["way"] for row in report["rows"]} >= {"launches alone", "log_likelihood", "bound"}
     assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])
+
+
+def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
+    report = run_script(
+        "studies/global_matching.py", "--data", str(data_dir), "--backend", needs("opencl"), "--part", "window",
+        "--part", "olin", "--scans", "2", "--repeats", "1", output=tmp_path / "matching",
+    )  # fmt: skip
+    assert [row["level"] for row in report["window"]] == [0, 1, 2, 3]
+    assert report["window"][0]["evaluated"] == 1 > report["window"][3]["evaluated"]
+    (olin,) = report["olin"]
+    assert olin["right"] == 1 and olin["found_wrong"] == 0
 
 
 def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:

@@ -12,6 +12,8 @@ from gpusense.logs.reader import FORMATS
 
 GOOD_LINE = "FLASER 3 1.0 2.0 3.0 1 2 3 4 5 6 12.5 robot 0.5"
 
+WEAN_LINE = "L 0 0 0 25 0 0 " + "100 " * 180 + "0.5"
+
 
 def log_with(*lines: str, name: str = "run.log", **options: Any) -> Action:
     """Read a whole log of these lines."""
@@ -34,20 +36,41 @@ LOG_CASES = [
         FileNotFoundError,
         "{tmp}/absent.log: must exist, got no such file",
     ),
-    *[
-        (
-            f"log-{suffix}",
-            log_with("data", name=f"run.{suffix}"),
-            ValueError,
-            f"{{tmp}}/input/run.{suffix}: must be {KNOWN}, which is all that this version reads, got {what}",
-        )
-        for suffix, what in [("bag", "a ROS 1 bag"), ("db3", "a ROS 2 bag"), ("mcap", "an MCAP file")]
-    ],
     (
-        "log-rosbag2",
-        lambda tmp: read_log(put(tmp, "metadata.yaml", "").parent),
+        "log-folder",
+        lambda tmp: read_log(put(tmp, "readme.txt", "").parent),
         ValueError,
-        f"{{tmp}}/input: must be {KNOWN}, which is all that this version reads, got a ROS 2 bag",
+        f"{{tmp}}/input: must be {KNOWN}, got a folder without metadata.yaml",
+    ),
+    ("log-topic", log_with(GOOD_LINE, topic="/scan"), ValueError, "topic: must be None for a CARMEN log, got '/scan'"),
+    ("log-topic-type", log_with(GOOD_LINE, topic=1), TypeError, "topic: must be a string or None, got 1"),
+    (
+        "log-mount",
+        log_with(GOOD_LINE, mount=(0, 0, 0)),
+        ValueError,
+        "mount: must be None for a CARMEN log, got (0, 0, 0)",
+    ),
+    (
+        "log-bag-rear",
+        log_with("data", name="run.bag", rear=True),
+        ValueError,
+        "rear: must be False for a ROS bag, whose lasers have topics (topic=), got True",
+    ),
+    bad_lines("log-wean-letter", ":2: must begin with L or O, got 'X'", WEAN_LINE, "X 1 2"),
+    bad_lines("log-wean-short", ":2: O: must have 5 fields, got 3", WEAN_LINE, "O 1 2"),
+    bad_lines("log-wean-word", ":1: O: field 2 must be a finite number, got '1_0'", "O 0 1_0 0 1"),
+    bad_lines("log-wean-nan", ":1: O: field 4 must be a finite number, got 'nan'", "O 0 0 0 nan"),
+    bad_lines(
+        "log-wean-moved",
+        ":2: L: the laser must stay at (0.25, 0.0, 0.0) on the robot, got (0.5, 0.0, 0.0)",
+        WEAN_LINE,
+        WEAN_LINE.replace("25 0 0", "50 0 0"),
+    ),
+    (
+        "log-wean-rear",
+        log_with("O 0 0 0 1", rear=True),
+        ValueError,
+        "rear: must be False for a Wean Hall log, whose robot has one laser, got True",
     ),
     (
         "log-range-max",

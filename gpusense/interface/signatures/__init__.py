@@ -12,6 +12,7 @@ from gpusense.interface.signatures import (
     map_kernels,
     mapping_kernels,
     matching_kernels,
+    particle_kernels,
     point_kernels,
     scan_kernels,
     search_kernels,
@@ -29,4 +30,5 @@ KERNELS: dict[str, Kernel] = {
     **learning_kernels.KERNELS,
     **matching_kernels.KERNELS,
     **search_kernels.KERNELS,
+    **particle_kernels.KERNELS,
 }

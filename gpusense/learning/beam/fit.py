@@ -19,6 +19,7 @@ from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.book import climb_book
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
+from gpusense.learning.beam.growth import fit_growth
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
@@ -45,6 +46,7 @@ def fit_beam_parameters(
     restarts: int = 0,
     seed: int = 0,
     range_bias: bool = False,
+    sigma_growth: bool = False,
     responsibilities: bool = False,
     blocks: ArrayLike | None = None,
     sigma_bounds: tuple[float, float] | None = None,
@@ -75,6 +77,8 @@ def fit_beam_parameters(
         seed: Seed of the random starts and of ``"genetic"``.
         range_bias: Whether the parameters contain an offset b of correct ranges, too: z = z* + b. p_hit then has its
             mean at z* + b, clamped to [0, range_max].
+        sigma_growth: Whether the deviation of correct ranges grows with range, too: it is sigma_hit + sigma_growth z*.
+            All parameters are then fitted together on the host, from the fit without growth.
         responsibilities: Whether to return each reading's probabilities of the four causes, too.
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
             independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
@@ -110,10 +114,14 @@ def fit_beam_parameters(
     bounds = make_bounds(pairs, sigma_bounds, lambda_bounds)
     if initial is not None and not isinstance(initial, BeamParameters):
         raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
+    if not isinstance(sigma_growth, bool):
+        raise TypeError(f"sigma_growth: must be True or False, got {checks.show(sigma_growth)}")
+    if sigma_growth and method == "em-book":
+        raise ValueError("sigma_growth: must be False with method 'em-book', which has no growth, got True")
     device = DeviceSums(*open_device(backend, precision), pairs)
-    if initial is None:
-        return fit_pairs(device, pairs, bounds, first_guess(pairs, bounds), options)
-    return fit_pairs(device, pairs, bounds, start_of(initial, pairs, bounds), options, chosen=True)
+    start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds)
+    fit = fit_pairs(device, pairs, bounds, start, options, chosen=initial is not None)
+    return fit_growth(fit, pairs, bounds, options.tolerance, options.responsibilities) if sigma_growth else fit
 
 
 def fit_pairs(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gpusense.world.parameters import _Parameters
 
@@ -69,6 +69,10 @@ class DiscreteFit:
     """The number of missing readings, left out."""
     status: str
     """The reason of the search's end and the undetermined parameters, in words."""
+    independent_errors: Mapping[str, float] = field(default_factory=dict)
+    """The standard errors as if readings were independent; those of ``standard_errors`` without blocks."""
+    blocks: int = 0
+    """The number of blocks over which ``standard_errors`` are computed; 0 without blocks."""
 
     def __repr__(self) -> str:
         return (

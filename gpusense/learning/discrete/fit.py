@@ -13,6 +13,7 @@ from gpusense._util import checks
 from gpusense.learning.discrete.causes import DiscreteCauses, DiscreteFit
 from gpusense.learning.discrete.probabilities import separate_causes
 from gpusense.learning.discrete.readings import MOST_BINS, bins_of, check_pairs
+from gpusense.learning.information import errors_of, scatter_of
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +29,8 @@ _FLAT = 2e-6
 _FEW = 100
 # Number of starts that are searched from, and of restarts of a search that ends before the gradient vanishes.
 _BEST, _RESTARTS = 3, 3
+# Standard errors over fewer blocks are rough.
+_FEW_BLOCKS = 10
 # Information below this share of the largest, scaled to a diagonal of 1, counts as none.
 _FLAT_SHARE = 1e-6
 
@@ -95,7 +98,9 @@ def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -
     return Counts(cells // (bins + 1), cells % (bins + 1), table[cells].astype(float), missing, bins, range_max / bins)
 
 
-def learn_causes(ranges: object, expected: object, range_max: float, bins: int) -> tuple[DiscreteCauses, DiscreteFit]:
+def learn_causes(
+    ranges: object, expected: object, range_max: float, bins: int, blocks: object = None
+) -> tuple[DiscreteCauses, DiscreteFit]:
     """Learn the most likely causes; see ``DiscreteBeamModel.learn``.
 
     The search is a quasi-Newton search over the logarithms of rates and sigma_hit and the log odds of detection, within
@@ -103,6 +108,7 @@ def learn_causes(ranges: object, expected: object, range_max: float, bins: int) 
     the result; for many steps, the ends of the same searches with few steps are further starts.
     """
     data = count_pairs(ranges, expected, range_max, bins)
+    labels = None if blocks is None else _block_counts(data, ranges, expected, float(range_max), blocks)
     starts = _starts(data)
     if bins > 2 * _FEW:
         coarse = data.coarser(_FEW)
@@ -112,7 +118,46 @@ def learn_causes(ranges: object, expected: object, range_max: float, bins: int) 
             starts.append(theta)
         starts.sort(key=lambda theta: _loss(data, theta))
     value, theta, trace = min((_search(data, start) for start in starts[:_BEST]), key=lambda result: result[0])
-    return _causes(theta), _fit(data, value, theta, trace)
+    return _causes(theta), _fit(data, value, theta, trace, labels)
+
+
+def _block_counts(data: Counts, ranges: object, expected: object, range_max: float, blocks: object) -> Floats:
+    """Return (3, E) block, index of the cell among the counts, and number of readings, of all that occur.
+
+    Raises:
+        TypeError: The labels are not integers.
+        ValueError: The shape differs from that of the readings, or fewer than 2 blocks have a reading.
+    """
+    z, z_exp = (checks.as_array(name, value) for name, value in (("ranges", ranges), ("expected", expected)))
+    labels = checks.array("blocks", blocks, z.shape, dtype=np.int64).ravel()
+    readings, expected_ranges = check_pairs(z.ravel(), z_exp.ravel(), range_max)
+    i, j = (bins_of(each, range_max, data.bins) for each in (readings, expected_ranges))
+    known = i >= 0
+    numbers = np.unique(labels[known], return_inverse=True)[1].ravel()
+    count = int(numbers.max(initial=-1)) + 1
+    if count < 2:
+        raise ValueError(f"blocks: must be at least 2 with a reading that is not missing, got {count}")
+    cells = np.searchsorted(data.rows * (data.bins + 1) + data.steps, j[known] * (data.bins + 1) + i[known])
+    both, times = np.unique(np.stack([numbers, cells]), axis=1, return_counts=True)
+    return np.vstack([both, times]).astype(np.float64)
+
+
+def _block_errors(data: Counts, theta: Floats, free: NDArray[np.bool], labels: Floats) -> dict[str, float]:
+    """Compute standard errors over blocks, see ``learning.information``; NaN where independent ones are."""
+    (block, cell), times = labels[:2].astype(np.int64), labels[2]
+    places = np.flatnonzero(free)
+    slopes = []
+    for step in (_FIRST * np.eye(len(theta)))[places]:
+        ends = [separate_causes(data.bins, data.width, **_causes(theta + sign * step).to_dict(), rows=data.rows,
+                                steps=data.steps) for sign in (1, -1)]  # fmt: skip
+        slope = (ends[0] - ends[1]) / (2 * _FIRST)
+        slopes.append(np.bincount(block, times * slope[cell]))
+    errors = np.full(len(theta), np.nan)
+    errors[places] = errors_of(
+        _information(data, theta, places), np.eye(len(places)), scatter_of(np.array(slopes, np.float64).T)
+    )
+    errors[~np.isfinite(errors)] = np.nan
+    return _in_units(theta, errors)
 
 
 def _search(data: Counts, start: Floats) -> tuple[float, Floats, list[float]]:
@@ -152,11 +197,15 @@ def _gradient(data: Counts, theta: Floats) -> Floats:
     return np.array([(_loss(data, theta + step) - _loss(data, theta - step)) / (2 * _FIRST) for step in steps])
 
 
-def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> DiscreteFit:
+def _fit(data: Counts, value: float, theta: Floats, trace: list[float], labels: Floats | None) -> DiscreteFit:
     low, high = np.transpose(_bounds(data))
     at_low, at_high = theta <= low + 1e-9, theta >= high - 1e-9
     converged = _is_flat(data, theta)
-    errors = _standard_errors(data, theta, ~(at_low | at_high))
+    errors = independent = _standard_errors(data, theta, ~(at_low | at_high))
+    blocks = 0 if labels is None else int(labels[0].max()) + 1
+    if labels is not None:
+        found = _block_errors(data, theta, ~(at_low | at_high), labels)
+        errors = {name: found[name] if math.isfinite(independent[name]) else math.nan for name in NAMES}
     status = "the gradient vanishes" if converged else "the search ended before the gradient vanished"
     ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
     unknown = [name for name, error in errors.items() if math.isnan(error) and name not in ends]
@@ -164,6 +213,8 @@ def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> Discr
         status += f"; at a bound: {', '.join(ends)}"
     if unknown:
         status += f"; the readings do not determine {', '.join(unknown)}"
+    if 0 < blocks < _FEW_BLOCKS:
+        status += f"; standard errors are rough, from {blocks} blocks"
     none = data.steps == data.bins
     return DiscreteFit(
         log_likelihood=-value * data.total,
@@ -174,6 +225,8 @@ def _fit(data: Counts, value: float, theta: Floats, trace: list[float]) -> Discr
         max=int(data.counts[none].sum()),
         missing=data.missing,
         status=status,
+        independent_errors=independent,
+        blocks=blocks,
     )
 
 
@@ -212,11 +265,25 @@ def _starts(data: Counts) -> list[Floats]:
 
 def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dict[str, float]:
     """Compute standard errors from the observed information, in the parameters' units; NaN if undetermined."""
+    places = np.flatnonzero(free)
+    errors = np.full(len(theta), np.nan)
+    errors[places] = _errors(_information(data, theta, places))
+    return _in_units(theta, errors)
+
+
+def _in_units(theta: Floats, errors: Floats) -> dict[str, float]:
+    """Return errors of the search's parameters in the units of the model's."""
+    causes = _causes(theta)
+    scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
+    return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}
+
+
+def _information(data: Counts, theta: Floats, places: NDArray[np.intp]) -> Floats:
+    """Return the (m, m) observed information of some parameters of the search."""
 
     def loss(*shifts: Floats) -> float:
         return _loss(data, theta + np.sum(shifts, axis=0))
 
-    places = np.flatnonzero(free)
     steps = _SECOND * np.eye(len(theta))[places]
     information = np.zeros((len(places), len(places)))
     middle = _loss(data, theta)
@@ -225,11 +292,7 @@ def _standard_errors(data: Counts, theta: Floats, free: NDArray[np.bool]) -> dic
         for b, two in enumerate(steps[:a]):
             mixed = loss(one, two) - loss(one, -two) - loss(-one, two) + loss(-one, -two)
             information[a, b] = information[b, a] = mixed / (4 * _SECOND**2)
-    errors = np.full(len(theta), np.nan)
-    errors[places] = _errors(information * data.total)
-    causes = _causes(theta)
-    scale = {name: getattr(causes, name) for name in NAMES} | {"p_detect": causes.p_detect * (1 - causes.p_detect)}
-    return {name: float(error * scale[name]) for name, error in zip(NAMES, errors, strict=True)}
+    return information * data.total
 
 
 def _errors(information: Floats) -> Floats:

@@ -74,7 +74,15 @@ class DiscreteBeamModel(SensorTable):
             raise TypeError(f"fit: must be a DiscreteFit or None, got {checks.show(self.fit)}")
 
     @classmethod
-    def learn(cls, ranges: ArrayLike, expected: ArrayLike, range_max: float, bins: int = 100) -> Self:
+    def learn(
+        cls,
+        ranges: ArrayLike,
+        expected: ArrayLike,
+        range_max: float,
+        bins: int = 100,
+        *,
+        blocks: ArrayLike | None = None,
+    ) -> Self:
         """Learn the :class:`DiscreteCauses` of maximum likelihood.
 
         Readings are first counted in a table of ``bins`` times ``bins``, so that the search takes no longer for
@@ -86,6 +94,8 @@ class DiscreteBeamModel(SensorTable):
             expected: Expected ranges of the same shape, >= 0 [m]; at least range_max if the map has no obstacle.
             range_max: Readings of at least ``range_max`` are "no return", > 0 [m].
             bins: Number of steps along the beam, 1 to 4096.
+            blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
+                independent; those of one block (a scan) need not be. Standard errors are then computed over blocks.
 
         Returns:
             The model; its ``fit`` has standard errors and status.
@@ -96,7 +106,7 @@ class DiscreteBeamModel(SensorTable):
         """
         from gpusense.learning.discrete.fit import learn_causes  # loads SciPy
 
-        causes, fit = learn_causes(ranges, expected, range_max, bins)
+        causes, fit = learn_causes(ranges, expected, range_max, bins, blocks)
         return cls(causes, range_max, bins, fit)
 
     def to_dict(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ _WIDEST_SUM, _WRAPS, _WAVES = 1.5, 3, 6
 
 
 def truncated(
-    residual: Floats, mean: Floats, range_max: float, scale: float, nu: int | None
+    residual: Floats, mean: Floats, range_max: float, scale: float | Floats, nu: int | None
 ) -> tuple[Floats, Floats, Floats]:
     """Return the log density of a normal, or of a Student t, truncated to [0, range_max], and its derivatives.
 
@@ -23,7 +23,7 @@ def truncated(
         residual: (n,) range minus mean [m].
         mean: (n,) mean before it is clamped to [0, range_max] [m].
         range_max: Longest range [m].
-        scale: Standard deviation or scale [m].
+        scale: Standard deviation or scale, one or (n,) [m].
         nu: Degrees of freedom of a t, or None for a normal.
 
     Returns:
@@ -43,7 +43,7 @@ def truncated(
         log_shape, pull = -power * np.log1p(u * u / nu), (nu + 1) * u / (nu + u * u)
         mass = stdtr(nu, x_1) - stdtr(nu, -x_0)
         edges = [np.exp(log_peak - power * np.log1p(x * x / nu)) for x in (x_0, x_1)]
-    log_p = log_peak - math.log(scale) + log_shape - np.log(mass)
+    log_p = log_peak - np.log(scale) + log_shape - np.log(mass)
     by_scale = u * pull - 1 + (x_0 * edges[0] + x_1 * edges[1]) / mass
     by_mean = (pull + np.where(near == mean, (edges[1] - edges[0]) / mass, 0)) / scale
     return log_p, by_scale, by_mean

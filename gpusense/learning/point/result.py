@@ -9,9 +9,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
 
-P = TypeVar("P", BeaconParameters, BumperParameters, HeadingParameters, PositionParameters)
+P = TypeVar("P", BeaconParameters, BeamParameters, BumperParameters, HeadingParameters, PositionParameters)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.typing import Precision
 from gpusense.backends import BackendInfo, Selection, get_backend
-from gpusense.backends.base import Buffer
+from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
@@ -75,6 +75,11 @@ class PointModel(ABC):
     def device(self) -> BackendInfo:
         """The device the model is compiled for."""
         return self._backend.info
+
+    @property
+    def backend(self) -> Backend:
+        """The backend that holds the model's buffers."""
+        return self._backend
 
     @property
     def precision(self) -> Precision:

@@ -140,6 +140,12 @@ class DeviceCall(BoundCall):
         """Start the recording, as part of the call gathered by this thread."""
         self._pipeline.backend.replay(self._current())
 
+    @property
+    def program(self) -> Program:
+        """All launches of a call, for a program of its owner."""
+        self._current()
+        return self._program()
+
     def check(self) -> None:
         """See BoundCall.check."""
         self._pipeline.backend.check_process()

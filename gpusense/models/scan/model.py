@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision
-from gpusense.backends import BackendInfo, Selection, get_backend
+from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Omission, Plan, share
 from gpusense.models.arguments import check_scene, map_words, real_dtype
@@ -105,6 +105,21 @@ class ScanModel(ABC):
     def device(self) -> BackendInfo:
         """The device the model is compiled for."""
         return self._setting.backend.info
+
+    @property
+    def backend(self) -> Backend:
+        """The backend that holds the model's buffers."""
+        return self._setting.backend
+
+    @property
+    def used_beams(self) -> int:
+        """Most beams of a scan that the model evaluates."""
+        return self._setting.rules.choice.most
+
+    @property
+    def table_version(self) -> int:
+        """Number of the map's table on the device, which changes with the map."""
+        return self._pipeline.map.version
 
     @property
     def precision(self) -> Precision:

@@ -9,22 +9,25 @@ kernel void shift_scores(global const uchar *table, global const int2 *point, gl
     const int col = LANES * get_global_id(0), row = get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
     const int size = padded_lines(scores) * padded_stride(scores), last = first[item + 1];
-    ilanes total = (ilanes)0;
+    uint total[LANES] = {0};
     for (int begin = first[item]; begin < last; begin += 256) {
-        const int end = min(begin + 256, last);
-        ushort16 sum = (ushort16)0;
+        const int end = begin + 256 < last ? begin + 256 : last;
+        // Two neighbouring bytes are one number of 16 bits, so that no byte is converted.
+        ushort8 even = (ushort8)0, odd = (ushort8)0;
         for (int k = begin; k < end; ++k) {
             global const uchar *cells = table + image[k] * size;
-            sum += convert_ushort16(vload16(0, cells + cell_index(scores, point[k].y + row, point[k].x + col)));
+            const ushort8 two = as_ushort8(vload16(0, cells + cell_index(scores, point[k].y + row, point[k].x + col)));
+            even += two & (ushort8)0xff;
+            odd += two >> (ushort8)8;
         }
-        total += convert_int16(sum);
+        ushort evens[8], odds[8];
+        vstore8(even, 0, evens);
+        vstore8(odd, 0, odds);
+        for (int i = 0; i < 8; ++i) {
+            total[2 * i] += evens[i];
+            total[2 * i + 1] += odds[i];
+        }
     }
     global int *out = score + (item * height + row) * width + col;
-    if (col + LANES <= width) {
-        vstore16(total, 0, out);
-        return;
-    }
-    int single[LANES];
-    vstore16(total, 0, single);
-    for (int i = 0; col + i < width; ++i) out[i] = single[i];
+    for (int i = 0; i < LANES && col + i < width; ++i) out[i] = total[i];
 }

@@ -1,0 +1,1 @@
+"""A thin node for ROS 2 around gpusense's particle filter."""

@@ -1,0 +1,109 @@
+"""The localiser behind the node, without ROS: map, scans and odometry in; estimate, cloud and transform out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.world.messages import spread_readings
+from gpusense_localization.conversions import Pose, host_array, map_to_odometry, moved_enough
+
+# Beams of the scanner of scans whose beams vary.
+PLACES = 1440
+
+
+class Localizer:
+    """A particle filter that is made as soon as map, scanner and first pose are known.
+
+    Args:
+        options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
+        backend: The device.
+        seed: Seed of the filter.
+    """
+
+    def __init__(self, options: gs.compat.Nav2Options, *, backend: str = "auto", seed: int = 0) -> None:
+        self.options = options
+        self.backend, self.seed = backend, seed
+        self.grid: gs.OccupancyGrid | None = None
+        self.filter: Any = None
+        self._scanner: gs.Scanner | None = None
+        self.estimate: Any = None
+        self._last: Pose | None = None
+        self._start: tuple[np.ndarray, np.ndarray] | None = None
+        if options.initial_pose is not None:
+            self.start_at(options.initial_pose, np.diag([0.25, 0.25, (math.pi / 12) ** 2]))
+
+    def set_map(self, message: Any) -> None:
+        """Take a nav_msgs/OccupancyGrid; the filter begins anew."""
+        self.grid = gs.OccupancyGrid.from_message(message)
+        self.filter = self.estimate = self._last = None
+
+    def start_at(self, pose: Pose, covariance: np.ndarray) -> None:
+        """Begin around a pose."""
+        self._start, self._last = (np.array(pose), np.asarray(covariance)), None
+        if self.filter is not None:
+            self.filter.initialize(mean=self._start[0], covariance=self._start[1])
+
+    def update(self, message: Any, odometry: Pose, mount: Pose) -> bool:
+        """Take a sensor_msgs/LaserScan at an odometry pose; return whether it counted.
+
+        As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did.
+        """
+        if self.grid is None:
+            return False
+        ranges = self._readings(message, mount)
+        if self._last is not None and not moved_enough(self._last, odometry, self.options.update_min):
+            return False
+        if self._last is not None:
+            self.filter.predict(np.array(self._last), np.array(odometry))
+        self.filter.correct(ranges)
+        self._last, self.estimate = odometry, self.filter.estimate()
+        return True
+
+    def map_to_odometry(self) -> Pose:
+        """Return the pose of the odometry frame in the map, by the last scan that counted."""
+        x, y, yaw = (float(value) for value in self.estimate.pose)
+        return map_to_odometry((x, y, yaw), self._last)
+
+    def cloud(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (N, 3) particles and their (N,) weights."""
+        return host_array(self.filter.particles), host_array(self.filter.weights)
+
+    def _readings(self, message: Any, mount: Pose) -> np.ndarray:
+        """Return the readings for the filter's scanner; make the filter where there is none for it.
+
+        The first scan's geometry is the scanner. Once a scan has another one, all are spread on common bearings, so
+        that a laser whose beams vary needs a second model only.
+        """
+        scanner = gs.Scanner.from_laser_scan(message, mount)
+        if self.filter is None:
+            self._make(scanner)
+        elif scanner != self._scanner and self._scanner.count != PLACES:
+            self._make(gs.Scanner.uniform(
+                angle_min=-math.pi, angle_increment=2 * math.pi / PLACES, count=PLACES, range_max=scanner.range_max,
+                range_min=scanner.range_min, mount=mount,
+            ))  # fmt: skip
+        if scanner == self._scanner:
+            return np.array(message.ranges, np.float64)
+        return spread_readings(message, PLACES)
+
+    def _make(self, scanner: gs.Scanner) -> None:
+        model = self.options.make_model(self.grid, scanner, backend=self.backend)
+        noise = self.options.alpha
+        motion = gs.OdometryMotion(alpha=noise[:4]) if self.options.motion == "differential" else gs.OmniMotion(noise)
+        recovery = "augmented" if all(self.options.recovery) else None
+        before = self.filter
+        self.filter = gs.ParticleFilter(
+            model, motion=motion, particles=self.options.particles, seed=self.seed, recovery=recovery
+        )
+        self._scanner = scanner
+        if before is not None and self.estimate is not None:
+            estimate = before.estimate()
+            self.filter.initialize(mean=estimate.pose, covariance=estimate.covariance)
+        elif self._start is not None:
+            self.filter.initialize(mean=self._start[0], covariance=self._start[1])
+        else:
+            self.filter.initialize_uniform()

@@ -1,0 +1,122 @@
+"""Run ``gpusense likelihood-map``: P(z | x, m) of one scan over all positions and headings of a map."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import (
+    BACKEND_HELP,
+    add_json,
+    output_path,
+    positive_number,
+    whole_number,
+)
+from gpusense.commands.output import print_json, print_table
+from gpusense.evaluation.machine import machine
+
+if TYPE_CHECKING:
+    from gpusense.logs import Scan
+
+NAME = "likelihood-map"
+HELP = "Draw the likelihood of a scan over all positions and headings of a map."
+
+INTERRUPTED = 130
+# Modes that are printed.
+_MODES = 5
+
+_EPILOG = """\
+The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses that
+are no neighbours of a better one. The entropy is that of the pose for a uniform prior.
+
+Ctrl-C ends the run; the picture then shows the positions so far.
+
+Exit codes: 0 success, 2 bad input, 130 interrupted.
+
+example:
+  gpusense likelihood-map --map map.yaml --log run.log.gz --scan 101 --out likelihood.png
+  gpusense likelihood-map --map map.yaml --log run.log.gz --model beam --temperature 0.1 --out beam.pdf"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
+    add("--log", required=True, type=Path, metavar="FILE", help="a log with scans, plain or .gz")
+    add("--scan", type=whole_number(low=0), default=0, metavar="I", help="index of the scan (default: 0)")
+    add("--out", required=True, type=output_path(".png", ".pdf", ".svg"), metavar="FILE", help="the picture")
+    add("--model", choices=("beam", "field"), default="field", help="measurement model (default: %(default)s)")
+    add("--resolution", type=positive_number, default=0.1, metavar="M",
+        help="distance between neighbouring positions [m] (default: %(default)s)")  # fmt: skip
+    add("--headings", type=whole_number(low=1), default=72, metavar="A", help="headings (default: %(default)s)")
+    add("--positions", choices=("free", "all"), default="free", help="cells that are evaluated (default: %(default)s)")
+    add("--beams", type=whole_number(low=1), metavar="B", help="thin the scan evenly to B beams (default: all)")
+    add("--temperature", type=positive_number, default=1.0, metavar="T",
+        help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
+    add("--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add("--backend", default="auto", metavar="DEVICE", help=f"{BACKEND_HELP} (default: auto)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compute and draw the likelihoods, after Ctrl-C those so far."""
+    from gpusense.matching.pose_likelihood import prepare_tiles
+    from gpusense.models.scan.beam import BeamModel
+    from gpusense.models.scan.field import LikelihoodFieldModel
+    from gpusense.world.map_files import read_map
+
+    grid = read_map(args.map)
+    scan = _scan(args)
+    kind = BeamModel if args.model == "beam" else LikelihoodFieldModel
+    model = kind(grid, scan.scanner, backend=args.backend, beams=args.beams, temperature=args.temperature)
+    result, tiles = prepare_tiles(
+        model, scan.ranges, resolution=args.resolution, headings=args.headings, positions=args.positions
+    )
+    done = 0.0
+    with progress(100) as step:
+        try:
+            for done in tiles:
+                step(f"{100 * done:.0f}%")
+        except KeyboardInterrupt:
+            pass
+    result.plot(args.out)
+    poses, log_p = result.modes(_MODES)
+    if args.json:
+        print_json({
+            "picture": str(args.out), "done": done, "rows": result.log_p.shape[0], "cols": result.log_p.shape[1],
+            "headings": result.log_p.shape[2], "resolution": result.resolution, "entropy": result.entropy,
+            "log_evidence": result.log_evidence, "modes": [
+                {"pose": pose, "log_likelihood": value} for pose, value in zip(poses.tolist(), log_p, strict=True)
+            ], "machine": machine(),
+        })  # fmt: skip
+    else:
+        columns = ("x [m]", "y [m]", "theta [rad]", "log p")
+        rows = [[*(f"{v:.3f}" for v in pose), f"{value:.2f}"] for pose, value in zip(poses, log_p, strict=True)]
+        print_table(columns, rows, right=columns)
+        print(f"\n{args.out}: {result.log_p.size} poses, entropy {result.entropy:.2f} nats")
+    if done < 1:
+        sys.stderr.write(f"gpusense: interrupted: {100 * done:.0f}% of the positions are done\n")
+        return INTERRUPTED
+    return 0
+
+
+def _scan(args: argparse.Namespace) -> Scan:
+    """Return the scan of the log that the arguments choose.
+
+    Raises:
+        ValueError: the log has fewer scans.
+    """
+    from gpusense.logs import Scan, read_log
+
+    index = 0
+    for record in read_log(args.log, range_max=args.range_max):
+        if isinstance(record, Scan):
+            if index == args.scan:
+                return record
+            index += 1
+    raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {args.scan}")

@@ -1,0 +1,224 @@
+"""Run ``gpusense localize``: localise a robot along a recorded log with a particle filter."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import (
+    add_backend,
+    add_json,
+    add_seed,
+    not_negative_number,
+    output_path,
+    positive_number,
+    whole_number,
+)
+from gpusense.commands.output import print_json
+from gpusense.evaluation.machine import machine, machine_line
+from gpusense.localization.defaults import DEFAULTS
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.tracking import Step, Track
+    from gpusense.localization.filter import ParticleFilter
+    from gpusense.localization.motion import MotionModel
+
+NAME = "localize"
+HELP = "Localise a robot along a recorded log with a particle filter."
+
+LOST = 1
+
+_EPILOG = """\
+The filter begins around the first logged pose, or with --global anywhere in the free space of the map. It moves with
+the log's odometry and weighs each chosen scan. Errors are those of the weighted mean against the logged poses, where
+the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate.
+
+The verdict at the end does not need logged poses: it is 'lost' if the estimates of the last tenth of the scans explain
+too few of their beams, as on a wrong map.
+
+Ctrl-C ends the run with the results so far, and writes the files.
+
+Exit codes: 0 success, 1 lost at the end, 2 bad input, 130 interrupted.
+
+example:
+  gpusense localize --map map.yaml --log run.log.gz
+  gpusense localize --map map.yaml --log run.log.gz --global --particles 20000 --tum run.tum --plot run.png
+  gpusense localize --map map.yaml --log run.log.gz --every 2 --offset 1 --parameters fitted/parameters.yaml"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
+    add("--log", required=True, type=Path, metavar="FILE", help="a log with odometry, plain or .gz")
+    add("--particles", type=whole_number(low=1), metavar="N",
+        help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
+    add("--global", dest="everywhere", action="store_true", help="begin anywhere in the free space of the map")
+    add("--parameters", "--params", type=Path, metavar="YAML",
+        help="a file with beam_model, such as 'gpusense fit --out' writes (default: a likelihood field)")  # fmt: skip
+    add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
+    add("--temperature", type=_temperature, default=DEFAULTS.temperature, metavar="T",
+        help="factor of log-likelihoods in (0, 1], or auto: learned from the scans (default: %(default)s)")  # fmt: skip
+    add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
+        help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
+        "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
+        "(default: 0.02 each)")  # fmt: skip
+    add("--reverse", type=not_negative_number, metavar="P",
+        help="probability that a translation went the other direction (default: 0.02)")  # fmt: skip
+    add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
+    add("--recovery", choices=("augmented", "sensor"), help="inject particles when the filter is lost")
+    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
+    add("--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_backend(parser)
+    add_seed(parser)
+    add_json(parser)
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
+    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
+        help="draw map, particles, estimated and logged poses")  # fmt: skip
+
+
+def _temperature(text: str) -> float | str:
+    return text if text == "auto" else positive_number(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Localise, and print the results; after Ctrl-C those so far."""
+    from gpusense.evaluation.tracking import Track, follow, read_steps, start
+
+    steps = read_steps(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
+    pf = _filter(args, steps)
+    start(pf, steps, everywhere=args.everywhere)
+    track = Track()
+    try:
+        with progress(len(steps)) as step:
+            step("starting")
+            for one in follow(pf, steps, track):
+                step(_text(track, one))
+    except KeyboardInterrupt:
+        if track.steps:
+            _report(args, pf, track, len(steps))
+        raise
+    return LOST if _report(args, pf, track, len(steps))["lost"] else 0
+
+
+def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
+    """Make the filter and its model.
+
+    Raises:
+        ValueError: an option breaks its rule, a file its format, or the backend is absent.
+    """
+    from gpusense.commands.score import read_beam_parameters
+    from gpusense.localization.filter import ParticleFilter
+    from gpusense.models.scan.beam import BeamModel
+    from gpusense.models.scan.field import LikelihoodFieldModel
+    from gpusense.world.map_files import read_map
+    from gpusense.world.parameters import LikelihoodFieldParameters
+
+    grid, scanner = read_map(args.map), steps[0].scan.scanner
+    beams = DEFAULTS.beams if args.beams is None else args.beams
+    model: Any
+    if args.parameters is not None:
+        model = BeamModel(grid, scanner, read_beam_parameters(args.parameters), beams=beams, backend=args.backend)
+    else:
+        field = LikelihoodFieldParameters(**DEFAULTS.field)
+        model = LikelihoodFieldModel(grid, scanner, field, beams=beams, backend=args.backend)
+    particles = DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles
+    return ParticleFilter(
+        model, motion=_motion(args, steps), particles=particles if args.particles is None else args.particles,
+        seed=args.seed, temperature=args.temperature, recovery=args.recovery,
+    )  # fmt: skip
+
+
+def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
+    """Return the motion model of the options.
+
+    Raises:
+        ValueError: there are no logged poses to learn from, or a number breaks its rule.
+    """
+    from gpusense.localization.motion import OdometryMotion
+    from gpusense.localization.motion_fit import fit_odometry_motion
+
+    if args.fit_motion:
+        poses = [step.scan.pose for step in steps if step.scan.pose is not None]
+        if len(poses) < len(steps):
+            raise ValueError("--fit-motion: needs a log with poses, got one without")
+        return fit_odometry_motion([step.odometry for step in steps], poses).motion
+    plain = OdometryMotion()
+    alpha = plain.alpha if args.motion_noise is None else tuple(args.motion_noise)
+    return OdometryMotion(alpha, plain.reverse if args.reverse is None else args.reverse)
+
+
+def _text(track: Track, step: Step) -> str:
+    errors = track.errors()
+    error = "" if errors is None else f", error {errors[0][-1]:.2f} m"
+    rate = 1 / max(sum(track.seconds[-1]), 1e-9)
+    return f"scan {step.index}{error}, {track.sizes[-1]:.0f} effective, {rate:.0f} scans/s"
+
+
+def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int) -> dict[str, Any]:
+    """Write the files, and print the results; return the summary."""
+    from gpusense.evaluation.tracking import summary, write_tum
+
+    result = summary(track)
+    if args.tum is not None:
+        write_tum(track, args.tum)
+    if args.plot is not None:
+        _draw(args.plot, pf, track)
+    if args.json:
+        options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
+        poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
+        document = {"options": options, "filter": repr(pf), "summary": result, "scans_chosen": chosen}
+        print_json(document | {"poses": poses, "machine": machine()})
+        return result
+    _print(pf, result, chosen)
+    for path in (args.tum, args.plot):
+        if path is not None:
+            print(f"written: {path}")
+    return result
+
+
+def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
+    """Print the summary."""
+    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items()}
+    print(f"{pf!r}\n")
+    if result["scans"] < chosen:
+        print(f"interrupted: results of {result['scans']} of {chosen} scans")
+    print(f"scans                 {s['scans']}, temperature {s['temperature']}")
+    if result["error_median"] is not None:
+        at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
+        print(
+            f"position error        median {s['error_median']} m, 95 % below {s['error_95']} m\n"
+            f"heading error         median {s['heading_median']} rad, 95 % below {s['heading_95']} rad\n"
+            f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m\n"
+            f"within 1 m, 20 deg    {at}\n"
+            f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
+            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)"
+        )
+    print(
+        f"effective sample size median {s['effective_sample_size_median']}\n"
+        f"ms per scan           predict {s['ms_predict']}, score {s['ms_score']}, resample {s['ms_resample']}, "
+        f"estimate {s['ms_estimate']}\n\n"
+        f"verdict: {_verdict(result)}\n\n{machine_line()}",
+    )
+    sys.stdout.flush()
+
+
+def _verdict(result: dict[str, Any]) -> str:
+    share = f"the estimates explain {100 * result['explained_median']:.0f} % of the beams of a scan"
+    if result["lost"]:
+        return f"LOST: {share}; is this the map of the log?"
+    return f"not lost: {share}"
+
+
+def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:
+    from gpusense.plots.drawing import save
+    from gpusense.plots.tracks import track_figure
+
+    save(track_figure(pf, track), path)

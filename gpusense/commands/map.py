@@ -1,0 +1,108 @@
+"""Run ``gpusense map``: build an occupancy grid from a log with corrected poses."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import (
+    BACKEND_HELP,
+    add_json,
+    number,
+    output_path,
+    positive_number,
+    whole_number,
+)
+from gpusense.commands.output import print_json
+from gpusense.evaluation.machine import machine
+
+if TYPE_CHECKING:
+    from gpusense.mapping.build import MapBuilder
+
+NAME = "map"
+HELP = "Build an occupancy grid from the scans of a log with corrected poses."
+
+INTERRUPTED = 130
+# Scans of a step of the progress bar.
+_SCANS = 64
+
+_EPILOG = """\
+Each ray makes the cells that it crosses more likely free, and the cell where it ends more likely occupied. Cells
+without a ray stay unknown. The map is written as map_server's YAML file with an image beside it.
+
+Ctrl-C ends the run; the map of the scans so far is written.
+
+Exit codes: 0 success, 2 bad input, 130 interrupted.
+
+example:
+  gpusense map --log run.log.gz --out map.yaml
+  gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses, plain or .gz")
+    add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
+    add("--resolution", type=positive_number, default=0.05, metavar="M", help="side of a cell [m] (default: 0.05)")
+    add("--range-limit", type=positive_number, metavar="M",
+        help="longer ranges clear cells up to it and mark no obstacle [m] (default: none)")  # fmt: skip
+    add("--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add("--clear-max", action="store_true", help="clear cells along 'no return' readings, up to --range-limit")
+    add("--p-hit", type=number, default=0.85, metavar="P", help="occupancy after one hit (default: %(default)s)")
+    add("--p-miss", type=number, default=0.45, metavar="P", help="occupancy after one miss (default: %(default)s)")
+    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
+    add("--backend", default="auto", metavar="DEVICE", help=f"{BACKEND_HELP} (default: auto)")
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Build and write the map, after Ctrl-C that of the scans so far."""
+    from gpusense.evaluation.scoring import logged_scans
+    from gpusense.mapping.build import MapBuilder
+    from gpusense.world.map_files import write_map
+
+    scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
+    builder = MapBuilder(
+        [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans], scans[0][1].scanner,
+        resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
+        p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
+    )  # fmt: skip
+    done = _build(builder, len(scans))
+    grid = builder.grid()
+    write_map(grid, args.out)
+    counted = round(done * len(scans))
+    rows, cols = grid.shape
+    free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
+    if args.json:
+        print_json({
+            "map": str(args.out), "scans": counted, "scans_chosen": len(scans), "rays": builder.rays, "rows": rows,
+            "cols": cols, "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
+            "machine": machine(),
+        })  # fmt: skip
+    else:
+        print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
+              f"{builder.rays} rays of {counted} scans")  # fmt: skip
+    if done < 1:
+        sys.stderr.write(f"gpusense: interrupted: the map holds {counted} of {len(scans)} scans\n")
+        return INTERRUPTED
+    return 0
+
+
+def _build(builder: MapBuilder, count: int) -> float:
+    """Count all rays, and return the share of scans that are done: less than 1 after an interrupt."""
+    done = 0.0
+    with progress(-(-count // _SCANS)) as step:
+        try:
+            for done in builder.steps():
+                step(f"{100 * done:.0f}%")
+        except KeyboardInterrupt:
+            pass
+    return done

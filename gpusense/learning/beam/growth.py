@@ -1,0 +1,167 @@
+"""Fit the growth of the deviation with range, together with all other parameters, on the host.
+
+A correct range has the deviation ``sigma_hit + sigma_growth z*``. The device's sums have one deviation, so that this
+search computes every pair's log p and gradient in NumPy, in float64: Newton steps within bounds from the fit without
+growth, with shares of its deviation turned into growth.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.learning.beam.pairs import Pairs
+from gpusense.learning.beam.point import Bounds, Floats
+from gpusense.learning.beam.result import BeamFit
+from gpusense.learning.point.densities import truncated
+from gpusense.learning.point.problem import Problem, mix, of_weight
+from gpusense.learning.point.report import report
+from gpusense.learning.point.search import Climb, climb, maximize
+from gpusense.world.parameters import BeamParameters
+from gpusense.world.scanner import Reading
+
+# Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
+_SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
+_TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
+
+
+@dataclass(frozen=True, eq=False)
+class _Growing(Problem):
+    """Likelihood by (z_max, share of rand, share of short in the rest, log sigma, growth, log rate[, bias]).
+
+    The first three split the weights: z_rand is the share of rand times 1 - z_max, and so on.
+    """
+
+    per_reading: ClassVar[tuple[str, ...]] = ("reading", "expected", "none")
+    reading: Floats
+    expected: Floats
+    none: NDArray[np.bool_]
+    range_max: float
+    limits: Bounds
+    start: BeamParameters
+    fit_bias: bool
+    reach: float
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        sigma, rate = (tuple(np.log(pair)) for pair in (self.limits.sigma, self.limits.rate))
+        pairs = [(0.0, 1.0)] * 3 + [sigma, (0.0, 1.0), rate] + [(-self.limits.bias, self.limits.bias)] * self.fit_bias
+        low, high = np.array(pairs).T
+        return low, high
+
+    def scales(self, theta: Floats) -> Floats:
+        sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.reach
+        shares = [of_weight(each) for each in theta[:_SIGMA]]
+        return np.array([*shares, 1.0, sigma / self.reach, 1.0, *([sigma] if self.fit_bias else [])])
+
+    def starts(self) -> list[Floats]:
+        p = self.start
+        rest = max(1 - p.z_max, 1e-300)
+        rand = min(max(p.z_rand / rest, 1e-3), 0.999)
+        short = min(max(p.z_short / max(p.z_hit + p.z_short, 1e-300), 1e-3), 0.999)
+        bias = [p.range_bias] if self.fit_bias else []
+        rate = math.log(max(p.lambda_short, self.limits.rate[0]))
+        return [
+            np.array([p.z_max, rand, short, math.log((1 - f) * p.sigma_hit), f * p.sigma_hit / self.reach, rate, *bias])
+            for f in _SHARES
+        ]
+
+    def parts(self, theta: Floats) -> tuple[list[tuple[float, Floats]], tuple[Floats, Floats, Floats], Floats, Floats]:
+        """Return weights and densities of hit, short and rand, and the derivatives by the shapes."""
+        z, expected = self.reading, self.expected
+        sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * expected
+        rate = math.exp(theta[_RATE])
+        moved = expected + (theta[_BIAS] if self.fit_bias else 0.0)
+        mean = np.clip(moved, 0, self.range_max)
+        hit = truncated(z - mean, mean, self.range_max, sigma, None)
+        x = np.clip(rate * expected, 1e-12, 700.0)
+        log_short = np.where(z <= expected, theta[_RATE] - rate * z - np.log(-np.expm1(-x)), -np.inf)
+        by_rate = 1 - x / np.expm1(x) - rate * z
+        rand, short = theta[_RAND], theta[_SHORT]
+        weights = ((1 - rand) * (1 - short), (1 - rand) * short, rand)
+        densities = hit[0], log_short, np.full(len(z), -math.log(self.range_max))
+        return list(zip(weights, densities, strict=True)), hit, by_rate, np.where(mean == moved, 1.0, 0.0)
+
+    def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
+        parts, (_, by_sigma, by_mean), by_rate, free = self.parts(theta)
+        log_p, (of_hit, of_short, _), (hit, short, rand) = mix(parts)
+        sigma, top = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.expected, theta[_TOP]
+        share = theta[_SHORT]
+        columns = [
+            np.full(len(log_p), -1 / max(1 - top, 1e-300)),
+            rand - (1 - share) * hit - share * short,
+            (1 - theta[_RAND]) * (short - hit),
+            of_hit * by_sigma * math.exp(theta[_SIGMA]) / sigma,
+            of_hit * by_sigma * self.expected / sigma,
+            of_short * by_rate,
+            *([of_hit * by_mean * free] if self.fit_bias else []),
+        ]
+        gradient = np.where(self.none[:, None], 0.0, np.stack(columns, axis=1))
+        gradient[self.none, _TOP] = 1 / max(top, 1e-300)
+        with np.errstate(divide="ignore"):
+            return np.where(self.none, np.log(top), log_p + np.log1p(-top)), gradient
+
+    def values(self, theta: Floats) -> dict[str, float]:
+        rest, rand, short = 1 - float(theta[_TOP]), float(theta[_RAND]), float(theta[_SHORT])
+        values = {
+            "z_hit": rest * (1 - rand) * (1 - short), "z_short": rest * (1 - rand) * short, "z_max": float(theta[_TOP]),
+            "z_rand": rest * rand, "sigma_hit": math.exp(theta[_SIGMA]), "lambda_short": math.exp(theta[_RATE]),
+            "sigma_growth": float(theta[_GROWTH]),
+        }  # fmt: skip
+        return values | ({"range_bias": float(theta[_BIAS])} if self.fit_bias else {})
+
+
+def fit_growth(fit: BeamFit, pairs: Pairs, bounds: Bounds, tolerance: float, responsibilities: bool) -> BeamFit:
+    """Fit the growth of the deviation, too, from a fit without it."""
+    if not pairs.hits or not pairs.expected.any():
+        return replace(fit, status=f"{fit.status}; sigma_growth: no range determines it",
+                       held=fit.held | {"sigma_growth": "no range determines it"})  # fmt: skip
+    known = pairs.kinds != Reading.MISSING
+    reading, expected = np.zeros(len(known)), np.full(len(known), 0.5 * pairs.range_max)
+    reading[pairs.places], expected[pairs.places] = pairs.reading, pairs.expected
+    none = pairs.kinds[known] == Reading.MAX
+    reach = float(np.mean(pairs.expected, dtype=np.float64))
+    problem = _Growing(
+        reading[known], expected[known], none, pairs.range_max, bounds, fit.parameters, fit.bias_fitted, reach
+    )
+    end = maximize(problem, _ITERATIONS, tolerance)
+    blocks = None if pairs.block is None else np.unique(pairs.block[known], return_inverse=True)[1].ravel()
+    values = problem.values(end.theta)
+    inner = report(problem, end, BeamParameters(**values), blocks, fit.missing)
+    names = (*fit.standard_errors, "sigma_growth")
+    if fit.bias_fitted:
+        bias, error = values["range_bias"], inner.standard_errors["range_bias"]
+    else:
+        bias, error = _offset(problem, end, tolerance, blocks)
+    rows = _causes(problem, end, known)
+    independent = dict(inner.independent_errors)
+    independent.setdefault("range_bias", fit.independent_errors["range_bias"])
+    return replace(
+        fit, parameters=inner.parameters, log_likelihood=end.value, trace=inner.trace, converged=end.converged,
+        status=inner.status, standard_errors={name: inner.standard_errors[name] for name in names},
+        independent_errors=independent, held=inner.held, range_bias=bias, range_bias_error=error,
+        iterations=inner.iterations, outliers=int((np.argmax(rows[known][~none][:, [0, 1, 3]], axis=1) == 2).sum()),
+        responsibilities=rows if responsibilities else None,
+    )  # fmt: skip
+
+
+def _offset(problem: _Growing, end: Climb, tolerance: float, blocks: NDArray[np.int64] | None) -> tuple[float, float]:
+    """Return the offset that a fit with it would have, and its standard error; NaN if its search did not converge."""
+    joint = replace(problem, fit_bias=True)
+    best = climb(joint, np.append(end.theta, 0.0), _ITERATIONS, tolerance)
+    if not best.converged:
+        return math.nan, math.nan
+    errors = report(joint, best, problem.start, blocks, 0).standard_errors
+    return float(best.theta[_BIAS]), errors["range_bias"]
+
+
+def _causes(problem: _Growing, end: Climb, known: NDArray[np.bool_]) -> Floats:
+    """Return the (n, 4) responsibilities of all readings; NaN for missing ones."""
+    hit, short, rand = mix(problem.parts(end.theta)[0])[1]
+    rows = np.full((len(known), 4), np.nan)
+    rows[known] = np.stack([hit, short, np.zeros_like(hit), rand], axis=1)
+    rows[np.flatnonzero(known)[problem.none]] = [0, 0, 1, 0]
+    return rows

@@ -1,0 +1,279 @@
+"""The particles of a filter on their device, and the programs of its steps.
+
+Two buffers hold poses: a stage of a correction scores and weighs those of one, and draws those of the other. On a GPU a
+step is one recorded program; a processor runs the launches one by one, and stops when no temperature is left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.recording import Recording
+from gpusense.interface.constants import (
+    DEGENERATE,
+    ESTIMATE,
+    ESTIMATE_SUMS,
+    LEFT,
+    RUNG,
+    SAMPLE_SIZE,
+    SETTINGS,
+    STAGE,
+    STATE,
+    WEIGHT_SUMS,
+)
+from gpusense.interface.flags import flags_if
+from gpusense.interface.launches import Program, launch
+
+_DOUBLE = np.dtype(np.float64)
+_PLAIN = frozenset[str]()
+
+
+class Summary(NamedTuple):
+    """The state of a filter after a correction.
+
+    Attributes:
+        effective_sample_size: Of the last stage.
+        temperature: Share of the temperature that all stages used.
+        degenerate: No particle was possible.
+        stages: Stages that ran.
+        numbers: The state as the kernels hold it.
+    """
+
+    effective_sample_size: float
+    temperature: float
+    degenerate: bool
+    stages: int
+    numbers: np.ndarray
+
+
+class Cloud:
+    """Particles and weights on a device.
+
+    Args:
+        backend: The device.
+        capacity: Most particles.
+        sensors: Most sensors of a correction.
+        precision: Of their log-likelihoods.
+
+    Attributes:
+        count: Particles.
+        shown: Index of the buffer with the weighted poses.
+        next: Index of the buffer with the poses of the next step.
+    """
+
+    def __init__(self, backend: Backend, capacity: int, sensors: int, precision: np.dtype) -> None:
+        self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
+        self.count, self.shown, self.next = capacity, 0, 0
+        self.block = max(math.ceil(math.sqrt(capacity)), 16)
+        most = -(-capacity // 16)
+        # Memory that a processor shares with the host is not lent.
+        make = backend.blank if backend.info.kind == "gpu" else backend.empty
+        self.poses = [make(3 * capacity, _DOUBLE) for _ in range(2)]
+        self.weight, self.before = make(capacity, _DOUBLE), make(capacity, _DOUBLE)
+        self.log_p = [make(capacity, precision) for _ in range(sensors)]
+        self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
+        self.largest = backend.empty(most, _DOUBLE)
+        self.sums = backend.empty(max(WEIGHT_SUMS, ESTIMATE_SUMS) * most, _DOUBLE)
+        self.totals, self.estimated = backend.empty(WEIGHT_SUMS, _DOUBLE), backend.empty(ESTIMATE, _DOUBLE)
+        self.settings, self.state = backend.empty(SETTINGS, _DOUBLE), backend.upload(np.zeros(STATE))
+        self.pool = backend.upload(np.zeros(3))
+        self._recordings: dict[Hashable, tuple[Recording, object]] = {}
+        self._uploads: list[np.ndarray] = []
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks of particles."""
+        return -(-self.count // self.block)
+
+    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
+        """Replace all particles."""
+        self.count, self.shown, self.next = len(poses), 0, 0
+        self.block = max(math.ceil(math.sqrt(self.count)), 16)
+        w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
+        self.backend.synchronize()
+        self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
+        self.backend.upload(np.ascontiguousarray(w, np.float64), self.weight)
+        self.backend.upload(np.ascontiguousarray(w, np.float64), self.before)
+
+    def set_pool(self, poses: np.ndarray) -> None:
+        """Upload the poses from which recovery injects particles."""
+        self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
+        self._recordings.clear()
+
+    def upload_settings(self, settings: np.ndarray) -> None:
+        """Copy the numbers of a step to the device."""
+        self._uploads.append(settings)
+        self.backend.upload(settings, self.settings, wait=False)
+        if len(self._uploads) > 64:
+            self.wait()
+
+    def wait(self) -> None:
+        """Wait for all work."""
+        self.backend.synchronize()
+        self._uploads.clear()
+
+    # ---- programs
+
+    def motion(self, kind: int) -> Program:
+        """Return the launch that moves the particles of the next step."""
+        buffer = self.poses[self.next]
+        return (
+            launch("move_particles", _PLAIN, (self.count,), source=buffer, settings=self.settings, target=buffer,
+                   particles=self.count, kind=kind),
+        )  # fmt: skip
+
+    def weighing(self, source: int, stage: int, stages: int, drawn: int) -> Program:
+        """Return the launches of a stage after its scores: weights, and the draw into the other buffer."""
+        n, blocks = self.count, self.blocks
+        sizes = dict(particles=n, block=self.block)
+        scores = tuple(
+            launch("add_scores", flags_if(FLOAT64=self.precision == np.float64), (blocks,), log_p=log_p,
+                   settings=self.settings, score=self.score, largest=self.largest, sensor=sensor, **sizes)
+            for sensor, log_p in enumerate(self.log_p[: self._sensors])
+        )  # fmt: skip
+        shared = dict(largest=self.largest, sums=self.sums, settings=self.settings, state=self.state, stage=stage)
+        return (
+            *scores,
+            launch("weigh_particles", _PLAIN, (blocks,), score=self.score, before=self.before, blocks=blocks, **sizes,
+                   **shared),
+            launch("sum_weights", _PLAIN, (WEIGHT_SUMS,), totals=self.totals, blocks=blocks, **shared),
+            launch("set_weights", _PLAIN, (blocks,), score=self.score, before=self.before, totals=self.totals,
+                   weight=self.weight, ends=self.ends, blocks=blocks, stages=stages, **sizes, **shared),
+            launch("draw_particles", _PLAIN, (drawn,), source=self.poses[source], weight=self.weight, ends=self.ends,
+                   settings=self.settings, state=self.state, pool=self.pool, target=self.poses[1 - source],
+                   after=self.before, particles=n, drawn=drawn, stage=stage),
+        )  # fmt: skip
+
+    # ---- steps
+
+    def use(self, sensors: int) -> None:
+        """Set the number of sensors of the next correction."""
+        self._sensors = sensors
+
+    def move(self, kind: int) -> None:
+        """Move the particles now."""
+        self.backend.run(self.motion(kind))
+        if self.shown == self.next:
+            return
+        # The weights of moved particles are those that the next correction begins with.
+        self.shown = self.next
+        self.backend.copy(self.before, self.weight, self.count * 8) if self.backend.info.kind == "gpu" else (
+            self.backend.upload(self._read(self.before, self.count), self.weight)
+        )
+
+    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int], None]) -> int:
+        """Run a step whose log-likelihoods are computed by calls between the launches.
+
+        Args:
+            kind: Kind of the motion that begins the step.
+            stages: Most stages.
+            drawn: Particles of the next step.
+            sensors: Sensors that are used, the first ones of ``log_p``.
+            score: Writes the log-likelihoods of the poses of a buffer into ``log_p``.
+
+        Returns:
+            The number of particles drawn.
+        """
+        run = self.backend.run
+        self.use(sensors)
+        run(self.motion(kind))
+        source = self.next
+        for stage in range(stages):
+            last = stage + 1 == stages
+            score(source)
+            # A stage that leaves nothing draws for the next step, so every stage may be the last one.
+            run(self.weighing(source, stage, stages, self.count if not last else drawn))
+            self.shown, self.next = source, 1 - source
+            if last or self._read(self.state, STATE)[stage * STAGE + LEFT] == 0.0:
+                return drawn if last else self.count
+            source = 1 - source
+        raise AssertionError(stages)
+
+    def replay(
+        self, kind: int, stages: int, drawn: int, key: Hashable, programs: Callable[[int], tuple[Program, object]]
+    ) -> None:
+        """Run a step as one recorded program.
+
+        Args:
+            kind: Kind of the motion that begins the step.
+            stages: Stages, all of which run.
+            drawn: Particles of the next step.
+            key: All on which the sensors' programs depend.
+            programs: Returns the program that scores the poses of a buffer, and the owners of its memory.
+        """
+        begin = self.next
+        whole = (key, begin, self.count, drawn, kind, stages)
+        if whole not in self._recordings:
+            if len(self._recordings) > 16:
+                self._recordings.clear()
+            program, owners = self.motion(kind), []
+            for stage in range(stages):
+                source = (begin + stage) % 2
+                scoring, owner = programs(source)
+                owners.append(owner)
+                program += scoring
+                program += self.weighing(source, stage, stages, drawn if stage + 1 == stages else self.count)
+            self._recordings[whole] = self.backend.record(program), owners
+        self._recordings[whole][0]()
+        self.shown = (begin + stages - 1) % 2
+        self.next = 1 - self.shown
+
+    def explain(self) -> str:
+        """Return how the last recorded step is started."""
+        if not self._recordings:
+            return "launches one by one"
+        return next(reversed(self._recordings.values()))[0].explain()
+
+    def resized(self, drawn: int) -> None:
+        """Set the number of particles, after a step that has drawn so many."""
+        self.count = drawn
+        self.block = max(math.ceil(math.sqrt(drawn)), 16)
+
+    # ---- what crosses to the host
+
+    def summary(self) -> Summary:
+        """Return the state after the last correction."""
+        numbers = self._read(self.state, STATE)
+        used, stage = 0.0, 0
+        while True:
+            used += float(numbers[stage * STAGE + RUNG])
+            if numbers[stage * STAGE + LEFT] == 0.0:
+                break
+            stage += 1
+        own = numbers[stage * STAGE : (stage + 1) * STAGE]
+        degenerate = bool(numbers[DEGENERATE])
+        return Summary(float(own[SAMPLE_SIZE]), min(used, 1.0), degenerate, stage + 1, numbers)
+
+    def estimate(self, count: int) -> np.ndarray:
+        """Return the kernel's estimate of the shown particles: mean, covariance, sum of weights, best particle."""
+        blocks, poses = -(-count // self.block), self.poses[self.shown]
+        program: Program = ()
+        for again in (0, 1):
+            program += (
+                launch("sum_poses", _PLAIN, (blocks,), poses=poses, weight=self.weight, estimate=self.estimated,
+                       sums=self.sums, particles=count, block=self.block, again=again),
+                launch("finish_estimate", _PLAIN, (1,), poses=poses, sums=self.sums, estimate=self.estimated,
+                       blocks=blocks, again=again),
+            )  # fmt: skip
+        self.backend.run(program)
+        return self._read(self.estimated, ESTIMATE)
+
+    def host_poses(self, index: int, count: int) -> np.ndarray:
+        """Return a copy of the poses of a buffer."""
+        return self._read(self.poses[index], 3 * count).reshape(count, 3)
+
+    def host_weights(self, count: int) -> np.ndarray:
+        """Return a copy of the weights of the shown particles, before they are normalised."""
+        return self._read(self.weight, count)
+
+    def _read(self, buffer: Buffer, count: int) -> np.ndarray:
+        return self.backend.download(buffer, np.empty(count))
+
+    def lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
+        """Return the head of a buffer as an array of the device's library."""
+        return self.backend.lend(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)

@@ -1,0 +1,54 @@
+"""Defaults of localisation that the filter and the commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+
+class Defaults(NamedTuple):
+    """Options of a particle filter; ``docs/localization.md`` has the measurements behind them.
+
+    Attributes:
+        particles: Their number.
+        particles_everywhere: Their number where the filter begins anywhere on a map.
+        beams: Beams of a scan that commands use; None for all.
+        threshold: Resample below this share of the particles.
+        stages: Most stages of a correction.
+        share: Least effective sample size of a stage, as a share of the particles.
+        jitter: Share of the difference of two particles by which a drawn one moves between stages.
+        farthest: Largest such difference [m].
+        farthest_turn: Largest such difference of headings [rad].
+        wide_scans: Corrections after a start anywhere on the map that use a lower temperature.
+        wide_share: Factor of the temperature there: particles that lie apart must not be judged as precisely.
+        slow: Rate of the slow average of the likelihood.
+        fast: Rate of the fast average.
+        most_injected: Largest share of injected particles.
+        temperature: Of the filter and of ``gpusense score``.
+        calibrations: Corrections from which the temperature is learned at first; later two of ten.
+        field: Parameters of the likelihood field of ``gpusense localize``.
+    """
+
+    particles: int = 2000
+    particles_everywhere: int = 20_000
+    beams: int | None = None
+    threshold: float = 0.5
+    stages: int = 4
+    share: float = 0.2
+    jitter: float = 0.2
+    farthest: float = 1.0
+    farthest_turn: float = 0.5
+    wide_scans: int = 5
+    wide_share: float = 0.3
+    slow: float = 0.02
+    fast: float = 0.3
+    most_injected: float = 0.2
+    temperature: str = "auto"
+    calibrations: int = 60
+    field: Mapping[str, Any] = MappingProxyType(
+        dict(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.07, interpolation="bilinear")
+    )
+
+
+DEFAULTS = Defaults()

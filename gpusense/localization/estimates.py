@@ -1,0 +1,93 @@
+"""Poses of the robot from weighted particles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.localization.pose_algebra import mean_pose, wrap_angle
+
+# Bins of which neighbours belong to a cluster [m, rad].
+_BIN, _BIN_TURN = 0.5, 0.35
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Pose of the robot as the particles know it.
+
+    Attributes:
+        pose: (3,) x, y, theta [m, m, rad].
+        covariance: (3, 3) covariance of the particles about it.
+        effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N.
+        lost: Whether recent scans contradict the pose; see ``docs/localization.md``.
+        explained: Share of the beams of the last scan that the pose explains; NaN without one.
+        temperature: Of the first sensor.
+        used: Share of the temperature that the stages of the last correction used: less than 1 where even the last
+            stage would have left too few particles.
+        degenerate: Whether no particle was possible at the last correction, which has changed nothing then.
+        particles: Their number.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 250.0, False, 0.9, 0.1, 1.0, False, 500)
+        Estimate(x=0.000, y=0.000, theta=0.000, deviations=(0.1, 0.1, 0.1), effective_sample_size=250, lost=False)
+    """
+
+    pose: np.ndarray
+    covariance: np.ndarray
+    effective_sample_size: float
+    lost: bool
+    explained: float
+    temperature: float
+    used: float
+    degenerate: bool
+    particles: int
+
+    def __repr__(self) -> str:
+        x, y, theta = (float(value) for value in self.pose)
+        deviations = ", ".join(f"{value:.3g}" for value in np.sqrt(np.maximum(np.diag(self.covariance), 0)))
+        return (
+            f"Estimate(x={x:.3f}, y={y:.3f}, theta={theta:.3f}, deviations=({deviations}), "
+            f"effective_sample_size={self.effective_sample_size:.3g}, lost={self.lost})"
+        )
+
+
+def covariance_of(numbers: np.ndarray) -> np.ndarray:
+    """Return the covariance in the numbers of the kernel ``finish_estimate``."""
+    xx, xy, xt, yy, yt, tt = numbers[3:9]
+    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+
+
+def clustered(poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of the heaviest cluster: bins of particles that touch each other.
+
+    Args:
+        poses: (N, 3) particles.
+        weights: (N,) weights >= 0.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    turns = round(2 * np.pi / _BIN_TURN)
+    cells = np.floor(poses[:, :2] / _BIN).astype(np.int64)
+    heading = np.floor(wrap_angle(poses[:, 2]) / (2 * np.pi) * turns).astype(np.int64) % turns
+    bins, member = np.unique(np.column_stack([cells, heading]), axis=0, return_inverse=True)
+    member = member.reshape(-1)
+    places = {tuple(one): i for i, one in enumerate(bins.tolist())}
+    offsets = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]
+    pairs = [
+        (a, places[key])
+        for (x, y, t), a in places.items()
+        for i, j, k in offsets
+        if (key := (x + i, y + j, (t + k) % turns)) in places
+    ]
+    rows, columns = np.array(pairs).T
+    touching = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(bins), len(bins)))
+    label = connected_components(touching, directed=False)[1][member]
+    chosen = label == np.argmax(np.bincount(label, weights))
+    w = weights[chosen] / weights[chosen].sum()
+    pose = mean_pose(poses[chosen], w)
+    d = poses[chosen] - pose
+    d[:, 2] = wrap_angle(d[:, 2])
+    return pose, (w[:, None] * d).T @ d - np.outer(w @ d, w @ d)

@@ -1,0 +1,218 @@
+"""Motion models: how far a robot may have moved, given its odometry or its commands.
+
+The models are those of Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), chapter 5. Each gives the means and
+deviations of a first turn, a translation ahead and to the left, and a second turn, which the kernel
+``move_particles`` samples for each particle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
+from gpusense.localization.pose_algebra import pose_difference
+
+# Below this translation [m] no direction can be read from it.
+_SHORTEST = 0.01
+
+
+class SampledMotion(NamedTuple):
+    """Numbers that ``move_particles`` samples.
+
+    Attributes:
+        mean: First turn, translation ahead and to the left, second turn [rad, m, m, rad].
+        deviation: Their standard deviations.
+        kind: A straight translation, or an arc.
+        reverse: Probability that the translation went the other direction.
+    """
+
+    mean: tuple[float, float, float, float]
+    deviation: tuple[float, float, float, float]
+    kind: int = STRAIGHT
+    reverse: float = 0.0
+
+
+class MotionModel(Protocol):
+    """Motion that a particle filter samples from the arguments of ``predict``."""
+
+    def sampled(self, *arguments: Any) -> SampledMotion:
+        """Return the numbers of one step."""
+
+
+def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
+    """Return an odometer's motion as a first turn, a translation and a second turn [rad, m, rad].
+
+    A translation below 1 cm has its turn in the second turn. A first turn of more than a quarter counts as driving
+    backwards, with a negative translation.
+
+    Args:
+        before: (3,) pose in the frame of the odometer [m, m, rad].
+        after: (3,) pose of the next reading.
+
+    Raises:
+        TypeError, ValueError: not poses.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.odometry_turns((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+        (0.0, -1.0, 0.0)
+    """
+    one, two = checks.array("before", before, (3,)), checks.array("after", after, (3,))
+    x, y, turn = (float(value) for value in pose_difference(one, two))
+    trans = math.hypot(x, y)
+    first = math.atan2(y, x) if trans >= _SHORTEST else 0.0
+    if abs(first) > math.pi / 2:
+        first, trans = first - math.copysign(math.pi, first), -trans
+    return first, trans, math.remainder(turn - first, math.tau)
+
+
+def _alphas(alpha: object, count: int) -> tuple[float, ...]:
+    values = checks.array("alpha", alpha, (count,))
+    if values.size and values.min() < 0:
+        raise ValueError(f"alpha: must be >= 0, got {values.min()}")
+    return tuple(float(value) for value in values)
+
+
+def _least(least: object) -> tuple[float, float]:
+    values = checks.array("least", least, (2,))
+    if values.min() < 0:
+        raise ValueError(f"least: must be >= 0, got {values.min()}")
+    return float(values[0]), float(values[1])
+
+
+@dataclasses.dataclass(frozen=True)
+class OdometryMotion:
+    """Odometry motion model, *Probabilistic Robotics* table 5.6.
+
+    Attributes:
+        alpha: (4,) noise. The variances are ``alpha[0] turn^2 + alpha[1] trans^2`` of each turn, and
+            ``alpha[2] trans^2 + alpha[3] (turn1^2 + turn2^2)`` of the translation [rad^2, m^2].
+        reverse: Probability that the translation went the other direction. Some odometers count wheel turns without a
+            sign; the tracks of such a log are lost at 0.
+        least: Standard deviations of translation and turns that are always added [m, rad]: wheels that slip, a robot
+            that is pushed.
+
+    Raises:
+        TypeError, ValueError: a number is missing, negative or not finite.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.OdometryMotion(alpha=(0.1, 0.1, 0.05, 0.05)).sampled((0, 0, 0), (1, 0, 0)).mean
+        (0.0, 1.0, 0.0, 0.0)
+    """
+
+    alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02)
+    reverse: float = 0.02
+    least: tuple[float, float] = (0.01, 0.005)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "alpha", _alphas(self.alpha, 4))
+        object.__setattr__(self, "reverse", checks.real("reverse", self.reverse, low=0, high=1))
+        object.__setattr__(self, "least", _least(self.least))
+
+    def sampled(self, *arguments: Any) -> SampledMotion:
+        """Return the numbers of a step from the odometer's poses before and after it."""
+        if len(arguments) != 2:
+            raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
+        first, trans, second = odometry_turns(*arguments)
+        a1, a2, a3, a4 = self.alpha
+        at, ar = self.least
+        # Noise does not depend on the direction: a turn by half a turn and back is none.
+        deviations = [math.sqrt(a1 * turn * turn + a2 * trans * trans + ar * ar) for turn in (first, second)]
+        length = math.sqrt(a3 * trans * trans + a4 * (first * first + second * second) + at * at)
+        reverse = self.reverse if abs(trans) >= _SHORTEST else 0.0
+        return SampledMotion(
+            (first, trans, 0.0, second), (deviations[0], length, 0.0, deviations[1]), STRAIGHT, reverse
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class OmniMotion:
+    """Motion of a robot that moves in any direction, from its odometry.
+
+    Attributes:
+        alpha: (5,) noise. The variances are ``alpha[0] turn^2 + alpha[1] trans^2`` of the turn, ``alpha[2] trans^2 +
+            alpha[3] turn^2`` of the translation along its direction, and ``alpha[4] trans^2 + alpha[3] turn^2`` across.
+        least: Standard deviations of translation and turn that are always added [m, rad].
+
+    Raises:
+        TypeError, ValueError: a number is missing, negative or not finite.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.OmniMotion().sampled((0, 0, 0), (1, 0, 0)).mean
+        (0.0, 1.0, 0.0, 0.0)
+    """
+
+    alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02, 0.02)
+    least: tuple[float, float] = (0.01, 0.005)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "alpha", _alphas(self.alpha, 5))
+        object.__setattr__(self, "least", _least(self.least))
+
+    def sampled(self, *arguments: Any) -> SampledMotion:
+        """Return the numbers of a step from the odometer's poses before and after it."""
+        if len(arguments) != 2:
+            raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
+        before, after = (checks.array(n, v, (3,)) for n, v in zip(("before", "after"), arguments, strict=True))
+        x, y, turn = (float(value) for value in pose_difference(before, after))
+        trans = math.hypot(x, y)
+        direction = math.atan2(y, x) if trans > 0 else 0.0
+        a1, a2, a3, a4, a5 = self.alpha
+        at, ar = (value * value for value in self.least)
+        along = math.sqrt(a3 * trans * trans + a4 * turn * turn + at)
+        across = math.sqrt(a5 * trans * trans + a4 * turn * turn + at)
+        turning = math.sqrt(a1 * turn * turn + a2 * trans * trans + ar)
+        return SampledMotion((direction, trans, 0.0, turn - direction), (0.0, along, across, turning))
+
+
+@dataclasses.dataclass(frozen=True)
+class VelocityMotion:
+    """Velocity motion model, *Probabilistic Robotics* table 5.3: an arc at commanded velocities.
+
+    ``predict`` takes the velocities (v, w) [m/s, rad/s] and the duration [s].
+
+    Attributes:
+        alpha: (6,) noise. The variances are ``alpha[0] v^2 + alpha[1] w^2`` of v, ``alpha[2] v^2 + alpha[3] w^2`` of w
+            and ``alpha[4] v^2 + alpha[5] w^2`` of a last turn per second.
+        least: Standard deviations of translation and last turn that are always added [m, rad].
+
+    Raises:
+        TypeError, ValueError: a number is missing, negative or not finite.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.VelocityMotion().sampled((1.0, 0.5), 0.1).mean
+        (0.025, 0.1, 0.0, 0.0)
+    """
+
+    alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02, 0.01, 0.01)
+    least: tuple[float, float] = (0.01, 0.005)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "alpha", _alphas(self.alpha, 6))
+        object.__setattr__(self, "least", _least(self.least))
+
+    def sampled(self, *arguments: Any) -> SampledMotion:
+        """Return the numbers of a step from velocities and a duration."""
+        if len(arguments) != 2:
+            raise TypeError(f"predict: must have velocities and a duration, got {len(arguments)} values")
+        v, w = (float(value) for value in checks.array("velocity", arguments[0], (2,)))
+        seconds = checks.real("seconds", arguments[1], low=0)
+        a1, a2, a3, a4, a5, a6 = self.alpha
+        at, ar = self.least
+        length = math.hypot(math.sqrt(a1 * v * v + a2 * w * w) * seconds, at)
+        half = math.sqrt(a3 * v * v + a4 * w * w) * seconds / 2
+        last = math.hypot(math.sqrt(a5 * v * v + a6 * w * w) * seconds, ar)
+        return SampledMotion((w * seconds / 2, v * seconds, 0.0, 0.0), (half, length, 0.0, last), VELOCITY_MODEL)
+
+
+def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:
+    """Return means and deviations as a (8,) array, and the probability of a reverse."""
+    return np.array([*motion.mean, *motion.deviation]), motion.reverse

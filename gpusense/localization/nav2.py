@@ -1,0 +1,250 @@
+"""Read the parameters of nav2_amcl's node from its YAML file, without ROS."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+from gpusense._util import checks
+from gpusense._util.files import read_mapping
+from gpusense.models.scan.beam import BeamModel
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.world.compat import Amcl
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+from gpusense.world.peer_weights import BeamWeights, FieldWeights
+from gpusense.world.scanner import Scanner
+
+LaserModel = Literal["beam", "likelihood_field", "likelihood_field_prob"]
+
+# Defaults of nav2_amcl 1.5.0's node. The types of the values are those of the parameters.
+_DEFAULTS: dict[str, Any] = {
+    "alpha1": 0.2, "alpha2": 0.2, "alpha3": 0.2, "alpha4": 0.2, "alpha5": 0.2,
+    "base_frame_id": "base_footprint", "global_frame_id": "map", "odom_frame_id": "odom",
+    "lambda_short": 0.1, "laser_likelihood_max_dist": 2.0, "laser_max_range": 100.0, "laser_min_range": -1.0,
+    "laser_model_type": "likelihood_field", "max_beams": 60, "max_particles": 2000, "min_particles": 500,
+    "map_topic": "map", "pf_err": 0.05, "pf_z": 0.99, "recovery_alpha_fast": 0.0, "recovery_alpha_slow": 0.0,
+    "resample_interval": 1, "robot_model_type": "nav2_amcl::DifferentialMotionModel", "scan_topic": "scan",
+    "set_initial_pose": False, "sigma_hit": 0.2, "tf_broadcast": True, "transform_tolerance": 1.0,
+    "update_min_a": 0.2, "update_min_d": 0.25, "z_hit": 0.5, "z_max": 0.05, "z_rand": 0.5, "z_short": 0.05,
+}  # fmt: skip
+_MODELS = ("beam", "likelihood_field", "likelihood_field_prob")
+_ROBOTS = {
+    "nav2_amcl::DifferentialMotionModel": "differential", "nav2_amcl::OmniMotionModel": "omni",
+    "differential": "differential", "omnidirectional": "omni", "differential_drive": "differential",
+    "omnidirectional_drive": "omni",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Nav2Options:
+    """Options of nav2_amcl's node, as :func:`from_nav2` reads them.
+
+    Example:
+        >>> import gpusense as gs
+        >>> options = gs.compat.from_nav2({"laser_model_type": "beam", "z_hit": 0.8, "max_particles": 5000})
+        >>> options.particles, options.alpha[:4], round(options.parameters.z_hit, 3)
+        ((500, 5000), (0.2, 0.2, 0.2, 0.2), 0.571)
+    """
+
+    model: LaserModel
+    """The laser model: ``"beam"``, ``"likelihood_field"`` or ``"likelihood_field_prob"``."""
+    weights: BeamWeights | FieldWeights
+    """The model's parameters as they are in the file, for ``compat="amcl"``; their weights need not sum to 1."""
+    parameters: BeamParameters | LikelihoodFieldParameters
+    """The model's parameters with weights that sum to 1; from ``beam_model`` where ``gpusense fit`` wrote the file."""
+    alpha: tuple[float, float, float, float, float]
+    """Noise of the odometry, alpha1 to alpha5; the fifth is for omnidirectional robots."""
+    motion: Literal["differential", "omni"]
+    """The kind of robot."""
+    particles: tuple[int, int]
+    """Least and most particles."""
+    pf_err: float
+    """Error of KLD sampling."""
+    pf_z: float
+    """Quantile of KLD sampling, as nav2_amcl reads it."""
+    resample_interval: int
+    """Corrections between resamplings."""
+    recovery: tuple[float, float]
+    """Decay rates of the slow and the fast average weight; 0 switches recovery off."""
+    update_min: tuple[float, float]
+    """Least translation along x or y [m] and least turn [rad] before the next correction."""
+    max_beams: int
+    """Most beams of a scan that nav2_amcl uses."""
+    range_limits: tuple[float | None, float | None]
+    """laser_min_range and laser_max_range [m]; None where the scan's own limit holds."""
+    frames: tuple[str, str, str]
+    """Frames of the map, the odometry and the robot's base."""
+    topics: tuple[str, str]
+    """Topics of the map and the scans."""
+    tf_broadcast: bool
+    """Whether the transform from map to odometry is sent."""
+    transform_tolerance: float
+    """Time by which the transform is dated ahead [s]."""
+    initial_pose: tuple[float, float, float] | None
+    """The robot's first pose (x, y, yaw) [m, m, rad]; None where the file sets none."""
+    ignored: tuple[str, ...]
+    """Names of other parameters in the file, which have no effect here."""
+
+    def make_model(
+        self, grid: OccupancyGrid, scanner: Scanner, *, compat: bool = False, **options: Any
+    ) -> BeamModel | LikelihoodFieldModel:
+        """Make the measurement model.
+
+        Args:
+            grid: The map.
+            scanner: The scanner.
+            compat: Whether to weigh as nav2_amcl does, by ``weights``; else log p of the book, by ``parameters``.
+            options: Options of :class:`BeamModel` or :class:`LikelihoodFieldModel`, such as ``backend``.
+
+        Raises:
+            TypeError, ValueError: As these classes do.
+        """
+        chosen: Any = self.weights if compat else self.parameters
+        if compat:
+            options["compat"] = Amcl(prob=self.model == "likelihood_field_prob")
+        kind: Any = BeamModel if self.model == "beam" else LikelihoodFieldModel
+        return cast("BeamModel | LikelihoodFieldModel", kind(grid, scanner, chosen, **options))
+
+
+def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options:
+    """Read the parameters of nav2_amcl's node from a YAML file or a mapping, without ROS.
+
+    A missing parameter has the node's default. The file is read as plain data; nothing in it is executed. The book's
+    parameters have the same weights in proportion. A file of ``gpusense fit`` has the fitted parameters, with offset
+    and growth, in ``beam_model``: these are then ``parameters``.
+
+    Args:
+        source: The file of parameters; or its content: a mapping with ``amcl: ros__parameters:``, in any namespace, or
+            the mapping of the parameters themselves.
+
+    Returns:
+        The options: model, parameters, motion, particles, gates, frames.
+
+    Raises:
+        FileNotFoundError: The file is missing.
+        TypeError: A value has the wrong type; the message names the parameter.
+        ValueError: A value breaks its rule, or the file holds no parameters of amcl.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.compat.from_nav2({"amcl": {"ros__parameters": {"update_min_d": 0.1}}}).update_min
+        (0.1, 0.2)
+    """
+    if isinstance(source, Mapping):
+        content, name = source, "source"
+    else:
+        file = checks.existing_file(checks.path("source", source))
+        content, name = read_mapping(file), str(file)
+    found = _parameters_of(content, name)
+    values = {key: _value(name, key, found.get(key, default), default) for key, default in _DEFAULTS.items()}
+    model = checks.choice("laser_model_type", values["laser_model_type"], _MODELS)
+    weights = _weights(model, values)
+    fitted = content.get("beam_model")
+    if model == "beam" and fitted is not None:
+        parameters: BeamParameters | LikelihoodFieldParameters = BeamParameters.from_dict(fitted)
+    else:
+        parameters = _normalized(weights)
+    robot = checks.choice("robot_model_type", values["robot_model_type"], tuple(_ROBOTS))
+    least, most = (checks.integer(key, values[key], low=1) for key in ("min_particles", "max_particles"))
+    if least > most:
+        raise ValueError(f"min_particles: must be <= max_particles = {most}, got {least}")
+    near, far = values["laser_min_range"], values["laser_max_range"]
+    return Nav2Options(
+        model=cast(LaserModel, model),
+        weights=weights,
+        parameters=parameters,
+        alpha=cast(Any, tuple(checks.real(f"alpha{k}", values[f"alpha{k}"], low=0) for k in range(1, 6))),
+        motion=cast(Any, _ROBOTS[robot]),
+        particles=(least, most),
+        pf_err=checks.real("pf_err", values["pf_err"], above=0),
+        pf_z=checks.real("pf_z", values["pf_z"], above=0),
+        resample_interval=checks.integer("resample_interval", values["resample_interval"], low=1),
+        recovery=(_rate("recovery_alpha_slow", values), _rate("recovery_alpha_fast", values)),
+        update_min=(values["update_min_d"], values["update_min_a"]),
+        max_beams=checks.integer("max_beams", values["max_beams"], low=1),
+        range_limits=(near if near >= 0 else None, far if far > 0 else None),
+        frames=(values["global_frame_id"], values["odom_frame_id"], values["base_frame_id"]),
+        topics=(values["map_topic"], values["scan_topic"]),
+        tf_broadcast=values["tf_broadcast"],
+        transform_tolerance=values["transform_tolerance"],
+        initial_pose=_initial_pose(name, found) if values["set_initial_pose"] else None,
+        ignored=tuple(sorted(str(key) for key in found if key not in _DEFAULTS and key != "initial_pose")),
+    )
+
+
+def _parameters_of(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return the parameters of amcl in a file's content.
+
+    Raises:
+        ValueError: There are none.
+    """
+    if any(key in content for key in _DEFAULTS):
+        return content
+    waiting: list[tuple[Mapping[str, Any], bool]] = [(content, False)]
+    while waiting:
+        here, ours = waiting.pop()
+        own = here.get("ros__parameters")
+        if ours and isinstance(own, Mapping):
+            return own
+        for key, value in here.items():
+            if isinstance(value, Mapping) and key not in ("ros__parameters", "beam_model", "incidence_model"):
+                waiting.append((value, str(key).strip("/") in ("amcl", "**")))
+    if "beam_model" in content:
+        return {"laser_model_type": "beam"}
+    raise ValueError(f"{name}: must hold amcl's ros__parameters, got the keys {checks.show(sorted(map(str, content)))}")
+
+
+def _value(name: str, key: str, value: object, default: object) -> Any:
+    """Return a parameter's value as the type of its default."""
+    place = f"{name}: {key}"
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise TypeError(f"{place}: must be true or false, got {checks.show(value)}")
+        return value
+    if isinstance(default, str):
+        if not isinstance(value, str):
+            raise TypeError(f"{place}: must be a string, got {checks.show(value)}")
+        return value
+    return checks.integer(place, value) if isinstance(default, int) else checks.real(place, value)
+
+
+def _rate(key: str, values: Mapping[str, Any]) -> float:
+    return checks.real(key, values[key], low=0, high=1)
+
+
+def _weights(model: str, v: Mapping[str, Any]) -> BeamWeights | FieldWeights:
+    if model == "beam":
+        return BeamWeights(v["z_hit"], v["z_short"], v["z_max"], v["z_rand"], v["sigma_hit"], v["lambda_short"])
+    # The likelihood fields of nav2_amcl do not use z_max.
+    return FieldWeights(
+        z_hit=v["z_hit"], z_max=0.0, z_rand=v["z_rand"], sigma_hit=v["sigma_hit"],
+        max_distance=v["laser_likelihood_max_dist"],
+    )  # fmt: skip
+
+
+def _normalized(weights: BeamWeights | FieldWeights) -> BeamParameters | LikelihoodFieldParameters:
+    """Return the book's parameters with weights in the same proportion.
+
+    Raises:
+        ValueError: All weights are 0.
+    """
+    values = weights.to_dict()
+    names = [name for name in values if name.startswith("z_")]
+    total = sum(values[name] for name in names)
+    if not total > 0:
+        raise ValueError(f"{' + '.join(names)}: must be > 0, got {total}")
+    values |= {name: values[name] / total for name in names}
+    return BeamParameters.from_dict(values) if isinstance(weights, BeamWeights) else (
+        LikelihoodFieldParameters.from_dict(values)
+    )  # fmt: skip
+
+
+def _initial_pose(name: str, found: Mapping[str, Any]) -> tuple[float, float, float]:
+    pose = found.get("initial_pose", {})
+    if not isinstance(pose, Mapping):
+        raise TypeError(f"{name}: initial_pose: must be a mapping, got {checks.show(pose)}")
+    x, y, yaw = (checks.real(f"{name}: initial_pose.{key}", pose.get(key, 0.0)) for key in ("x", "y", "yaw"))
+    return x, y, yaw

@@ -1,0 +1,122 @@
+"""Poses (x, y, theta) as rigid motions of the plane: products, inverses, differences and means."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense._util.typing import AnyArray
+
+
+def wrap_angle(angle: AnyArray) -> np.ndarray:
+    """Return angles in [-pi, pi).
+
+    Args:
+        angle: Angles [rad], any shape.
+
+    Raises:
+        TypeError: not real numbers.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> float(gs.wrap_angle(3 * np.pi / 2) / np.pi)
+        -0.5
+    """
+    values = np.asarray(checks.as_array("angle", angle), np.float64)
+    return (values + np.pi) % (2 * np.pi) - np.pi
+
+
+def compose_poses(first: AnyArray, second: AnyArray) -> np.ndarray:
+    """Return the poses in the world of ``second``, which is in the frame of ``first``.
+
+    Args:
+        first: (..., 3) poses [m, m, rad].
+        second: (..., 3) poses, of a shape that broadcasts with that of ``first``.
+
+    Raises:
+        TypeError, ValueError: not poses.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.compose_poses([1.0, 2.0, np.pi / 2], [1.0, 0.0, 0.0]).round(3).tolist()
+        [1.0, 3.0, 1.571]
+    """
+    one, two = _poses("first", first), _poses("second", second)
+    cosine, sine = np.cos(one[..., 2]), np.sin(one[..., 2])
+    x = one[..., 0] + cosine * two[..., 0] - sine * two[..., 1]
+    y = one[..., 1] + sine * two[..., 0] + cosine * two[..., 1]
+    return np.stack([x, y, wrap_angle(one[..., 2] + two[..., 2])], axis=-1)
+
+
+def invert_poses(poses: AnyArray) -> np.ndarray:
+    """Return the poses of the world in the frames of ``poses``.
+
+    Args:
+        poses: (..., 3) poses [m, m, rad].
+
+    Raises:
+        TypeError, ValueError: not poses.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.invert_poses([1.0, 2.0, np.pi / 2]).round(3).tolist()
+        [-2.0, 1.0, -1.571]
+    """
+    pose = _poses("poses", poses)
+    cosine, sine = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x = -cosine * pose[..., 0] - sine * pose[..., 1]
+    y = sine * pose[..., 0] - cosine * pose[..., 1]
+    return np.stack([x, y, wrap_angle(-pose[..., 2])], axis=-1)
+
+
+def pose_difference(before: AnyArray, after: AnyArray) -> np.ndarray:
+    """Return the poses ``after`` in the frames of ``before``: the motion between two readings of an odometer.
+
+    Args:
+        before: (..., 3) poses [m, m, rad].
+        after: (..., 3) poses, of a shape that broadcasts with that of ``before``.
+
+    Raises:
+        TypeError, ValueError: not poses.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.pose_difference([0.0, 0.0, np.pi / 2], [0.0, 2.0, np.pi]).round(3).tolist()
+        [2.0, 0.0, 1.571]
+    """
+    return compose_poses(invert_poses(_poses("before", before)), _poses("after", after))
+
+
+def mean_pose(poses: AnyArray, weights: AnyArray | None = None) -> np.ndarray:
+    """Return the weighted mean of poses; the heading is the circular mean.
+
+    Args:
+        poses: (N, 3) poses [m, m, rad], N > 0.
+        weights: (N,) weights >= 0 with a positive sum; None for equal ones.
+
+    Raises:
+        TypeError, ValueError: not poses, or not weights.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.mean_pose([(0.0, 0.0, 3.0), (2.0, 0.0, -3.0)]).round(3).tolist()
+        [1.0, 0.0, 3.142]
+    """
+    values = checks.array("poses", poses, ("N", 3))
+    if not len(values):
+        raise ValueError("poses: must hold at least one pose, got shape (0, 3)")
+    w = np.ones(len(values)) if weights is None else checks.array("weights", weights, (len(values),))
+    if not (w.min() >= 0 and w.sum() > 0):
+        raise ValueError(f"weights: must be >= 0 and have a positive sum, got {w.sum()}")
+    w = w / w.sum()
+    heading = np.arctan2(w @ np.sin(values[:, 2]), w @ np.cos(values[:, 2]))
+    return np.array([w @ values[:, 0], w @ values[:, 1], heading])
+
+
+def _poses(name: str, poses: object) -> np.ndarray:
+    values = np.asarray(checks.as_array(name, poses), np.float64)
+    if values.shape[-1:] != (3,):
+        raise ValueError(f"{name}: shape must be (..., 3), got {checks.shape_text(values.shape)}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}: must be finite, got one that is not")
+    return values

@@ -1,0 +1,105 @@
+"""A measurement model as a sensor of a filter: its device, its readings on the device, and its temperature."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends.base import Backend
+from gpusense.interface.launches import Program
+from gpusense.localization.temperature import BeamCorrelation
+from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.point.base import PointModel
+from gpusense.models.scan.bound import DeviceCall
+from gpusense.models.scan.model import ScanModel
+
+_DOUBLE = np.dtype(np.float64)
+
+
+class Sensor:
+    """A measurement model of a filter.
+
+    Args:
+        model: A scan, landmark or point model.
+
+    Attributes:
+        model: It.
+        backend: Its device.
+        precision: Precision of its log-likelihoods.
+        beams: Beams that a scan uses; 0 for other models.
+        seconds: Time of all calls of ``log_likelihood``.
+        calibrates: Whether temperature="auto" learns from it.
+
+    Raises:
+        TypeError: another object.
+    """
+
+    def __init__(self, model: Any) -> None:
+        if not isinstance(model, (ScanModel, PointModel, LandmarkModel)):
+            raise TypeError(f"models: must be measurement models, got {checks.show(model)}")
+        self.model: Any = model
+        self.calibrates = isinstance(model, ScanModel)
+        self.backend: Backend = model.backend
+        self.precision = np.dtype(model.precision)
+        self.beams = model.used_beams if isinstance(model, ScanModel) else 0
+        self._correlation = BeamCorrelation()
+        self._ranges: Any = None
+        self.seconds = 0.0
+
+    def temperature(self, chosen: float | str, reading: object = None) -> float:
+        """Return the temperature of the log-likelihood now."""
+        if not self.calibrates:
+            return 1.0
+        return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen
+
+    def correlate(self, pose: np.ndarray, reading: tuple[Any, ...], *, follows: bool) -> None:
+        """Learn the correlation of beams from a scan at the estimated pose."""
+        self._correlation.add(self.parts(pose[None], reading)[0], follows=follows)
+
+    def parts(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray:
+        """Return (N, K) log-likelihoods of the beams of a scan, in float64."""
+        return np.asarray(self.model.log_likelihood(poses, *reading, per_beam=True)[1], np.float64)
+
+    def log_likelihood(self, poses: Any, reading: tuple[Any, ...], out: Any = None) -> Any:
+        """Return the log-likelihoods of poses."""
+        begin = time.perf_counter()
+        result = self.model.log_likelihood(poses, *reading, out=out)
+        self.seconds += time.perf_counter() - begin
+        return result
+
+    # ---- recorded steps
+
+    def records(self, reading: tuple[Any, ...]) -> bool:
+        """Tell whether the device alone can score such a reading: a scan on the host, or one on the device."""
+        return self.calibrates and len(reading) == 1 and not self.model.compat
+
+    @property
+    def version(self) -> int:
+        """Number of the map's table, on which a recorded program depends."""
+        return self.model.table_version if self.calibrates else 0
+
+    def upload(self, reading: tuple[Any, ...]) -> None:
+        """Copy the ranges of a scan to the array that recorded programs read."""
+        ranges = reading[0]
+        count = self.model.scanner.count
+        if self._ranges is None:
+            self._ranges = self.backend.blank(count, _DOUBLE)
+        if self.backend.reads(ranges):
+            adopted = self.backend.adopt(ranges, "ranges")
+            if adopted.dtype == _DOUBLE and adopted.shape == (count,) and adopted.contiguous:
+                self.backend.copy(adopted.buffer, self._ranges, count * _DOUBLE.itemsize)
+                return
+            ranges = adopted.to_host()
+        values = checks.array("ranges", ranges, (count,), finite=False)
+        self.backend.upload(np.ascontiguousarray(values, _DOUBLE), self._ranges)
+
+    def program(self, poses: Any, out: Any) -> tuple[Program, object]:
+        """Return the launches that score poses on the device, and the owner of their memory."""
+        ranges = self.backend.lend(self._ranges, (self.model.scanner.count,), _DOUBLE)
+        call = self.model.bind(poses, ranges, out=out)
+        if not isinstance(call, DeviceCall):
+            raise RuntimeError(f"the model's call cannot be recorded: {call.explain()}")
+        return call.program, (call, ranges)

@@ -1,0 +1,119 @@
+"""First particles: drawn on the host by the reference of the kernels' generator, and so equal on every backend."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.reference.philox import normal_pair, random_words, uniform_of
+
+Key = tuple[int, int, int]
+Spread = tuple[float, float, float]
+# Poses of a pool: free cells of larger maps are thinned evenly.
+_MOST_POOL = 1 << 18
+# Stream of random numbers that no kernel uses.
+_STREAM = 64
+
+
+def _words(count: int, key: Key, stream: int) -> tuple[np.ndarray, ...]:
+    zero = np.zeros(count, np.uint64)
+    counter = (np.arange(count), zero + np.uint64(key[2]), zero + np.uint64(_STREAM + stream), zero)
+    return random_words(counter, key[0], key[1])
+
+
+def _wrapped(poses: np.ndarray) -> np.ndarray:
+    poses[:, 2] = np.remainder(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
+    return poses
+
+
+def normal(mean: Any, covariance: Any, count: int, key: Key) -> np.ndarray:
+    """Draw poses from a normal density.
+
+    Raises:
+        TypeError, ValueError: not a mean and a covariance.
+    """
+    centre, matrix = checks.array("mean", mean, (3,)), checks.array("covariance", covariance, (3, 3))
+    if np.abs(matrix - matrix.T).max() > 1e-9 * max(np.abs(matrix).max(), 1e-300):
+        raise ValueError("covariance: must be symmetric, got one that is not")
+    values, vectors = np.linalg.eigh(matrix)
+    if values.min() < -1e-9 * max(values.max(), 0.0):
+        raise ValueError(f"covariance: must be positive semidefinite, got an eigenvalue of {values.min()}")
+    words = _words(count, key, 0)
+    one, two = normal_pair(words[0], words[1])
+    three, _ = normal_pair(words[2], words[3])
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    return _wrapped(centre + np.column_stack([one, two, three]) @ root.T)
+
+
+def spread(pool: np.ndarray, half: Spread, count: int, key: Key, *, each: bool = False) -> np.ndarray:
+    """Draw poses from a pool, each uniform in a box around a pose.
+
+    Args:
+        pool: (M, 3) centres.
+        half: Half widths of the box [m, m, rad].
+        count: Poses to draw.
+        key: Seed and step.
+        each: Take the centres in their order, again and again, instead of drawing them.
+    """
+    first, more = _words(count, key, 1), _words(count, key, 2)
+    row = np.arange(count) % len(pool)
+    if not each:
+        row = np.minimum((uniform_of(first[0]) * len(pool)).astype(np.int64), len(pool) - 1)
+    offsets = np.column_stack([2 * uniform_of(word) - 1 for word in more[:3]])
+    return _wrapped(pool[row] + offsets * half)
+
+
+def free_pool(models: list[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
+    """Return the centres of free cells of the first map among the models, and half widths with any heading.
+
+    Raises:
+        TypeError, ValueError: bounds that are not two corners, no map and no bounds, or no free cell.
+    """
+    box = None if bounds is None else checks.array("bounds", bounds, (2, 2))
+    grid = next((model.grid for model in models if hasattr(model, "grid")), None)
+    if grid is None:
+        if box is None:
+            raise ValueError("bounds: must be given where no model has a grid, got None")
+        half = (box[1] - box[0]) / 2
+        return np.array([[*(box[0] + half), 0.0]]), (float(half[0]), float(half[1]), math.pi)
+    rows, columns = np.nonzero(grid.free)
+    x0, y0, yaw = grid.origin
+    along, up = (columns + 0.5) * grid.resolution, (rows + 0.5) * grid.resolution
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    centres = np.column_stack([x0 + cosine * along - sine * up, y0 + sine * along + cosine * up, np.zeros(len(rows))])
+    if box is not None:
+        centres = centres[((centres[:, :2] >= box[0]) & (centres[:, :2] <= box[1])).all(axis=1)]
+    if not len(centres):
+        raise ValueError("map: must have a free cell to begin in, got none")
+    if len(centres) > _MOST_POOL:
+        centres = centres[np.arange(_MOST_POOL) * len(centres) // _MOST_POOL]
+    half_cell = grid.resolution / 2
+    return centres, (half_cell, half_cell, math.pi)
+
+
+def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spread]:
+    """Return poses drawn by their likelihood, and half widths of a cell of the likelihood's grid.
+
+    Raises:
+        TypeError, ValueError: it has no such arrays, or no finite log-likelihood.
+    """
+    for name in ("log_p", "positions"):
+        if not hasattr(likelihood, name):
+            raise TypeError(f"likelihood: must have log_p and positions, got {checks.show(likelihood)}")
+    log_p = np.asarray(likelihood.log_p, np.float64).reshape(-1)
+    poses = np.asarray(likelihood.positions, np.float64).reshape(-1, 3)
+    if len(log_p) != len(poses):
+        raise ValueError(f"likelihood: positions must be those of log_p, got {len(poses)} for {len(log_p)}")
+    finite = np.isfinite(log_p)
+    if not finite.any():
+        raise ValueError("likelihood: must have a finite log_p, got none")
+    weight = np.where(finite, np.exp(np.where(finite, log_p, -np.inf) - log_p[finite].max()), 0.0)
+    ends = np.cumsum(weight)
+    start = float(uniform_of(_words(1, key, 3)[0])[0])
+    rows = np.searchsorted(ends, (np.arange(count) + start) / count * ends[-1], side="right")
+    step = float(getattr(likelihood, "resolution", 0.0)) / 2
+    turn = math.pi / log_p.size if not hasattr(likelihood, "headings") else math.pi / max(int(likelihood.headings), 1)
+    return poses[np.minimum(rows, len(poses) - 1)], (step, step, turn if step else 0.0)

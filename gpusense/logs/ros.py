@@ -1,0 +1,237 @@
+"""Read rosbags (ROS 1, ROS 2 with sqlite3 storage, MCAP) without ROS, through the library rosbags (extra "ros").
+
+=============================  ========================================================================================
+message                        use
+=============================  ========================================================================================
+sensor_msgs/LaserScan          a :class:`Scan`: the topic ``/scan``, or the bag's only one, or ``topic=``
+nav_msgs/Odometry              ``Scan.odometry`` and :class:`Odometry` records: ``/odom``, or the topic first by name
+tf2_msgs/TFMessage             fixed transforms from the robot's base to the laser give the mount; without Odometry
+                               messages, the moving transform from ``odom`` gives odometry
+=============================  ========================================================================================
+
+All other messages are skipped without being decoded; the message definitions that a bag brings are not used.
+
+* Times are those of the header, or of the log where the header has none. Odometry is interpolated at a scan's time,
+  headings along the shorter arc; before the first and after the last message it is the nearest one's. A log without
+  odometry has (0, 0, 0). ``Scan.pose`` is None.
+* The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Without a chain of
+  transforms the mount is (0, 0, 0). A laser that is mounted upside down has bearings that run clockwise.
+* A last beam that points where the first one does is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
+  all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
+* Some lasers change the number and bearings of their beams from scan to scan. All scans then share one scanner with
+  bearings in steps of 0.25 degrees all round, on which each reading takes the nearest place; the others are NaN, which
+  models leave out. Bearings move by 0.125 degrees at most.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
+from gpusense.logs.records import Floats, Odometry, Pose, Scan
+from gpusense.logs.transforms import Transforms, matrix_of, planar_mount
+from gpusense.world.messages import (
+    distinct_beams,
+    laser_geometry,
+    planar_pose,
+    real_field,
+    rotation_of,
+    spread_readings,
+    stamp_of,
+)
+from gpusense.world.messages import field as field_of
+from gpusense.world.scanner import Scanner
+
+_BASES = ("base_footprint", "base_link")
+# Beams of the common scanner of scans whose beams vary.
+_PLACES = 1440
+# Mounts that are further apart than this contradict each other [m, rad].
+_APART = (0.02, math.radians(2))
+
+Geometry = tuple[float, float, int, float, float]
+"""angle_min, angle_increment, count, range_min, range_max."""
+
+
+@dataclass
+class _Bag:
+    """Everything of a bag but its scans' readings.
+
+    Attributes:
+        topic: Topic of the scans.
+        odometer: Topic of the odometry; "" without one.
+        frame: Frame of the laser.
+        base: Frame of the robot's base, or None.
+        geometries: Numbers of scans by geometry.
+        times: Times of odometry [s].
+        poses: Poses of odometry.
+        transforms: Transforms between frames.
+        moved: Times and poses in the frame odom, by child frame.
+    """
+
+    topic: str
+    odometer: str
+    frame: str = ""
+    base: str | None = None
+    geometries: Counter[Geometry] = field(default_factory=Counter)
+    times: list[float] = field(default_factory=list)
+    poses: list[Pose] = field(default_factory=list)
+    transforms: Transforms = field(default_factory=Transforms)
+    moved: dict[str, list[tuple[float, Pose]]] = field(default_factory=dict)
+
+
+def read(
+    path: Path,
+    *,
+    range_max: float | None,
+    odometry: bool,
+    rear: bool,
+    topic: str | None = None,
+    mount: Pose | None = None,
+) -> Iterator[Scan | Odometry]:
+    """Read the records of a bag; see :func:`gpusense.read_log` for arguments and errors."""
+    if rear:
+        raise ValueError("rear: must be False for a ROS bag, whose lasers have topics (topic=), got True")
+    return _records(path, range_max, odometry, topic, mount)
+
+
+def _records(
+    path: Path, range_max: float | None, odometry: bool, topic: str | None, mount: Pose | None
+) -> Iterator[Scan | Odometry]:
+    bag = _survey(path, topic)
+    place, upside_down = _mount(path, bag, mount)
+    scanner = _scanner(path, bag, range_max, place, upside_down)
+    order = np.argsort(bag.times, kind="stable")
+    times, poses = np.array(bag.times)[order], np.array(bag.poses).reshape(-1, 3)[order]
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    wanted = {SCAN: {bag.topic}, ODOMETRY: {bag.odometer} if odometry else set()}
+    for message in messages(path, wanted):
+        with errors_at(message.where):
+            time = stamp_of("message", message.fields) or message.time
+            if message.kind == ODOMETRY:
+                record: Scan | Odometry = Odometry(time, _odometry_pose(message.fields))
+            else:
+                ranges = _readings(message.fields, scanner, len(bag.geometries) > 1, upside_down)
+                record = Scan(time, ranges, scanner, _pose_at(time, times, poses), None)
+        yield record
+
+
+def _survey(path: Path, topic: str | None) -> _Bag:
+    """Read everything but readings."""
+    topics = topics_of(path)
+    odometers = topics.get(ODOMETRY, [])
+    odometer = "/odom" if "/odom" in odometers else min(odometers, default="")
+    bag = _Bag(_scan_topic(path, topics.get(SCAN, []), topic), odometer)
+    for message in messages(path, {SCAN: {bag.topic}, ODOMETRY: {odometer}, TRANSFORMS: None}):
+        with errors_at(message.where):
+            if message.kind == SCAN:
+                geometry = laser_geometry(message.fields)
+                names = ("angle_min", "angle_increment", "count", "range_min", "range_max")
+                bag.geometries[tuple(geometry[name] for name in names)] += 1
+                bag.frame = bag.frame or str(field_of("message", message.fields, "header.frame_id"))
+            elif message.kind == ODOMETRY:
+                bag.times.append(stamp_of("message", message.fields) or message.time)
+                bag.poses.append(_odometry_pose(message.fields))
+                bag.base = bag.base or str(field_of("message", message.fields, "child_frame_id")) or None
+            else:
+                _take_transforms(bag, message.fields)
+    if not bag.geometries:
+        raise ValueError(f"{path}: must hold scans on {bag.topic}, got none")
+    if not bag.times and bag.moved:
+        base = next((each for each in _BASES if each in bag.moved), min(bag.moved))
+        bag.base, bag.times, bag.poses = base, [time for time, _ in bag.moved[base]], [p for _, p in bag.moved[base]]
+    return bag
+
+
+def _scan_topic(path: Path, known: list[str], topic: str | None) -> str:
+    """Return the topic of the scans.
+
+    Raises:
+        ValueError: There is none, or the choice is the user's.
+    """
+    if not known:
+        raise ValueError(f"{path}: must hold sensor_msgs/LaserScan messages, got none")
+    if topic is not None:
+        if topic not in known:
+            raise ValueError(f"topic: must be one of {', '.join(known)} in {path}, got {topic!r}")
+        return topic
+    if "/scan" in known:
+        return "/scan"
+    if len(known) > 1:
+        raise ValueError(f"topic: must be given, one of {', '.join(known)}, for {path}, got None")
+    return known[0]
+
+
+def _take_transforms(bag: _Bag, message: object) -> None:
+    for each in field_of("message", message, "transforms"):
+        rotation = rotation_of("message.rotation", field_of("message", each, "transform.rotation"))
+        place = [real_field("message", each, f"transform.translation.{axis}") for axis in "xyz"]
+        parent, child = (str(field_of("message", each, name)) for name in ("header.frame_id", "child_frame_id"))
+        bag.transforms.add(parent, child, matrix_of(rotation, place))
+        if parent.lstrip("/") == "odom":
+            pose = place[0], place[1], math.atan2(rotation[1, 0], rotation[0, 0])
+            bag.moved.setdefault(child.lstrip("/"), []).append((stamp_of("message", each), pose))
+
+
+def _odometry_pose(message: object) -> Pose:
+    return planar_pose("message.pose", field_of("message", message, "pose.pose"))
+
+
+def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
+    """Return the laser's mount, and whether it is upside down; warn where a given mount contradicts the transforms."""
+    bases = [bag.base] if bag.base else list(_BASES)
+    found = [matrix for base in bases if (matrix := bag.transforms.between(base, bag.frame)) is not None]
+    if not found:
+        return given or (0.0, 0.0, 0.0), False
+    with errors_at(f"{path}: transform to {bag.frame}"):
+        place, upside_down = planar_mount(found[0])
+    if given is None:
+        return place, upside_down
+    apart = math.hypot(given[0] - place[0], given[1] - place[1])
+    turn = abs((given[2] - place[2] + math.pi) % (2 * math.pi) - math.pi)
+    if apart > _APART[0] or turn > _APART[1]:
+        shown = ", ".join(f"{value:.4g}" for value in place)
+        warnings.warn(
+            f"{path}: mount {given} contradicts the transforms of the log, by which it is ({shown})", stacklevel=4
+        )
+    return given, upside_down
+
+
+def _scanner(path: Path, bag: _Bag, range_max: float | None, mount: Pose, upside_down: bool) -> Scanner:
+    """Return the scanner of all scans; a common one if their beams vary."""
+    with errors_at(f"{path}: {bag.topic}"):
+        farthest = range_max or max(each[4] for each in bag.geometries)
+        nearest = min(max(min(each[3] for each in bag.geometries), 0.0), farthest)
+        if len(bag.geometries) > 1:
+            step = 2 * math.pi / _PLACES
+            return Scanner.uniform(angle_min=-math.pi, angle_increment=step, count=_PLACES, range_max=farthest,
+                                   range_min=nearest, mount=mount)  # fmt: skip
+        ((first, step, count, _, _),) = bag.geometries
+        sign = -1 if upside_down else 1
+        return Scanner.uniform(angle_min=sign * first, angle_increment=sign * step, count=distinct_beams(step, count),
+                               range_max=farthest, range_min=nearest, mount=mount)  # fmt: skip
+
+
+def _readings(message: object, scanner: Scanner, common: bool, upside_down: bool) -> Floats:
+    """Return the readings of a scan for its scanner; read-only."""
+    if common:
+        ranges = spread_readings(message, scanner.count, upside_down)
+    else:
+        ranges = np.array(field_of("message", message, "ranges"), np.float64)[: scanner.count]
+    ranges[ranges == 0] = math.nan
+    ranges.setflags(write=False)
+    return ranges
+
+
+def _pose_at(time: float, times: Floats, poses: Floats) -> Pose:
+    """Return the pose at a time, between those before and after; (0, 0, 0) without any."""
+    if not len(times):
+        return 0.0, 0.0, 0.0
+    x, y, theta = (float(np.interp(time, times, column)) for column in poses.T)
+    return x, y, math.remainder(theta, 2 * math.pi)

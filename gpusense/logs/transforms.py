@@ -1,0 +1,144 @@
+"""Static transforms between the frames of a robot: the pose of a laser on its base, and how data contradict it."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gpusense.logs.records import Floats, Pose, Scan
+
+# Largest change of a transform that still counts as fixed [m, 1].
+_FIXED = 1e-5
+# Smallest cosine between vertical axes of a laser that scans a level plane.
+_LEVEL = 0.985
+# Check of a mount: headings tried, most pairs of scans, distance and turn between two scans of a pair.
+_HEADINGS, _PAIRS = 24, 12
+_SHIFT, _TURN = (0.15, 1.0), 0.2
+
+
+@dataclass
+class Transforms:
+    """Transforms of a log: the fixed ones, and the frames that move.
+
+    Attributes:
+        fixed: (4, 4) matrix of each pair (parent, child), as long as it does not change.
+        moving: Pairs whose transform changed.
+    """
+
+    fixed: dict[tuple[str, str], Floats] = field(default_factory=dict)
+    moving: set[tuple[str, str]] = field(default_factory=set)
+
+    def add(self, parent: str, child: str, matrix: Floats) -> None:
+        """Take a transform in."""
+        pair = parent.lstrip("/"), child.lstrip("/")
+        known = self.fixed.setdefault(pair, matrix)
+        if np.abs(known - matrix).max() > _FIXED:
+            self.moving.add(pair)
+
+    def between(self, base: str, frame: str) -> Floats | None:
+        """Return the (4, 4) pose of a frame in the base's, along fixed transforms; None without a chain of these."""
+        links: dict[str, list[tuple[str, Floats]]] = {}
+        for (parent, child), matrix in self.fixed.items():
+            if (parent, child) not in self.moving:
+                links.setdefault(parent, []).append((child, matrix))
+                links.setdefault(child, []).append((parent, np.asarray(np.linalg.inv(matrix), np.float64)))
+        reached, queue = {base.lstrip("/"): np.eye(4)}, deque([base.lstrip("/")])
+        while queue:
+            at = queue.popleft()
+            for other, matrix in links.get(at, []):
+                if other not in reached:
+                    reached[other] = reached[at] @ matrix
+                    queue.append(other)
+        return reached.get(frame.lstrip("/"))
+
+
+def matrix_of(rotation: Floats, translation: Sequence[float]) -> Floats:
+    """Return the (4, 4) matrix of a rotation and a translation."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def planar_mount(matrix: Floats) -> tuple[Pose, bool]:
+    """Return (x, y, theta) of a laser's (4, 4) pose, and whether it is upside down, so that its bearings run clockwise.
+
+    Raises:
+        ValueError: The laser does not scan a level plane.
+    """
+    up = float(matrix[2, 2])
+    if abs(up) < _LEVEL:
+        rule = "must scan a level plane"
+        raise ValueError(f"laser: {rule}, got one tilted by {math.degrees(math.acos(min(abs(up), 1.0))):.3g} deg")
+    pose = float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
+    return pose, up < 0
+
+
+def check_mount(scans: Sequence[Scan]) -> str | None:
+    """Return how the scans of a moving robot contradict their scanner's mount, in words; None if they do not.
+
+    Pairs of scans between which the robot drove without much turning are laid over each other by odometry, for 24
+    headings of the laser. If a heading other than the mount's brings end points at least twice as close, and closer
+    than 5 cm in the median, the mount contradicts the data. Positions of the laser are not checked.
+
+    Args:
+        scans: Scans in the order of time, with odometry.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.check_mount([]) is None
+        True
+    """
+    pairs = _pairs(scans)
+    if len(pairs) < 3:
+        return None
+    turns = 2 * math.pi * np.arange(_HEADINGS) / _HEADINGS
+    gaps = np.array([np.median([_gap(first, second, turn) for first, second in pairs]) for turn in turns])
+    best = int(np.argmin(gaps))
+    given = scans[0].scanner.mount[2]
+    better = math.remainder(given + turns[best], 2 * math.pi)
+    if best == 0 or gaps[best] > 0.5 * gaps[0] or gaps[best] > 0.05:
+        return None
+    return (
+        f"the laser's heading on the robot seems to be {math.degrees(better):.0f} deg, not "
+        f"{math.degrees(given):.0f} deg: then end points of {len(pairs)} pairs of scans are "
+        f"{1000 * gaps[best]:.0f} mm apart, not {1000 * gaps[0]:.0f} mm"
+    )
+
+
+def _pairs(scans: Sequence[Scan]) -> list[tuple[Scan, Scan]]:
+    """Return pairs of scans of which the second is some way ahead of the first, with nearly the same heading."""
+    pairs, first = [], 0
+    for k in range(1, len(scans)):
+        x, y, theta = np.subtract(scans[k].odometry, scans[first].odometry)
+        turn = abs((theta + math.pi) % (2 * math.pi) - math.pi)
+        if turn > _TURN or math.hypot(x, y) > _SHIFT[1]:
+            first = k
+        elif math.hypot(x, y) >= _SHIFT[0]:
+            pairs.append((scans[first], scans[k]))
+            first = k
+    return pairs[:: max(1, len(pairs) // _PAIRS)]
+
+
+def _gap(first: Scan, second: Scan, turn: float) -> float:
+    """Return the median distance of the second scan's end points from those of the first, by odometry."""
+    from scipy.spatial import KDTree
+
+    points = [_end_points(scan, turn) for scan in (first, second)]
+    if min(map(len, points)) < 10:
+        return math.inf
+    return float(np.median(KDTree(points[0]).query(points[1])[0]))
+
+
+def _end_points(scan: Scan, turn: float) -> Floats:
+    """Return end points of the hits in the odometry frame, for a laser turned on the robot."""
+    scanner = scan.scanner
+    hit = np.isfinite(scan.ranges) & (scan.ranges > max(scanner.range_min, 0.05)) & (scan.ranges < scanner.range_max)
+    x, y, theta = scanner.mount
+    angle = scanner.bearings[hit] + theta + turn
+    on_robot = np.stack([x + scan.ranges[hit] * np.cos(angle), y + scan.ranges[hit] * np.sin(angle)])
+    c, s = math.cos(scan.odometry[2]), math.sin(scan.odometry[2])
+    return (np.array([[c, -s], [s, c]]) @ on_robot).T + scan.odometry[:2]

@@ -1,0 +1,91 @@
+"""Read logs of Carnegie Mellon's course 16-831 (Wean Hall): one message per line, centimetres and radians.
+
+=======  ===========================================================================
+message  fields after the letter
+=======  ===========================================================================
+L        robot x y theta, laser x y theta, 180 ranges, time [s]
+O        robot x y theta, time [s]
+=======  ===========================================================================
+
+Beam k has the bearing -90 + k degrees. Readings of 8183 cm and more are "no return". The poses of robot and laser give
+the scanner's mount, rounded to 1 mm and 1e-3 rad; one laser is on the robot, so all scans share the first one's. The
+odometry frame is arbitrary, and ``Scan.pose`` is None. Results are in metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gpusense.logs.lines import numbered_lines
+from gpusense.logs.records import Floats, Odometry, Pose, Scan
+from gpusense.world.scanner import Scanner
+
+_BEAMS, _RANGE_MAX = 180, 81.83
+_NAMES = {b"L": 6 + _BEAMS + 1, b"O": 4}
+# A laser elsewhere on the robot than in the first scan is an error [m, rad].
+_MOVED = 0.02
+
+
+def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
+    """Read the records of a log; see :func:`gpusense.read_log` for arguments and errors."""
+    if rear:
+        raise ValueError("rear: must be False for a Wean Hall log, whose robot has one laser, got True")
+    return _records(path, range_max or _RANGE_MAX, odometry)
+
+
+def _records(path: Path, range_max: float, odometry: bool) -> Iterator[Scan | Odometry]:
+    scanner: Scanner | None = None
+    for number, line in numbered_lines(path):
+        fields = line.split()
+        if not fields:
+            continue
+        where = f"{path}:{number}"
+        values = _numbers(where, fields)
+        pose = float(values[0]) / 100, float(values[1]) / 100, float(values[2])
+        if fields[0] == b"O":
+            if odometry:
+                yield Odometry(float(values[-1]), pose)
+            continue
+        mount = _mount(pose, (float(values[3]) / 100, float(values[4]) / 100, float(values[5])))
+        if scanner is None:
+            scanner = Scanner.uniform(
+                angle_min=-math.pi / 2, angle_increment=math.pi / _BEAMS, count=_BEAMS, range_max=range_max, mount=mount
+            )
+        apart = max(math.dist(mount[:2], scanner.mount[:2]), abs(math.remainder(mount[2] - scanner.mount[2], math.tau)))
+        if apart > _MOVED:
+            raise ValueError(f"{where}: L: the laser must stay at {scanner.mount} on the robot, got {mount}")
+        ranges = values[6 : 6 + _BEAMS] / 100
+        ranges.setflags(write=False)
+        yield Scan(float(values[-1]), ranges, scanner, pose, None)
+
+
+def _numbers(where: str, fields: list[bytes]) -> Floats:
+    """Return the finite numbers after a message's letter."""
+    count = _NAMES.get(fields[0])
+    name = fields[0].decode(errors="replace")[:20]
+    if count is None:
+        raise ValueError(f"{where}: must begin with L or O, got {name!r}")
+    if len(fields) != 1 + count:
+        raise ValueError(f"{where}: {name}: must have {1 + count} fields, got {len(fields)}")
+    values = np.empty(count)
+    for k, field in enumerate(fields[1:]):
+        try:
+            values[k] = math.nan if b"_" in field else float(field)
+        except ValueError:
+            values[k] = math.nan
+        if not math.isfinite(values[k]):
+            text = field.decode(errors="replace")[:40]
+            raise ValueError(f"{where}: {name}: field {k + 1} must be a finite number, got {text!r}")
+    return values
+
+
+def _mount(robot: Pose, laser: Pose) -> Pose:
+    """Return the laser's pose on the robot, rounded."""
+    dx, dy = laser[0] - robot[0], laser[1] - robot[1]
+    c, s = math.cos(robot[2]), math.sin(robot[2])
+    turn = math.remainder(laser[2] - robot[2], math.tau)
+    return round(c * dx + s * dy, 3) + 0.0, round(c * dy - s * dx, 3) + 0.0, round(turn, 3) + 0.0

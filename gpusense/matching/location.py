@@ -1,0 +1,75 @@
+"""Results of global localisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Status = Literal["found", "ambiguous", "no match"]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMode:
+    """A local maximum of the scores of poses.
+
+    Attributes:
+        pose: (3,) x, y and theta in the world [m, m, rad].
+        score: Mean score of the end points, from 0 (all far from obstacles) to 1 (all on obstacles).
+        log_likelihood: log p(z | pose, m) by the model.
+        agreement: Share of the hits that agree with the expected ranges at the pose.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> gs.PoseMode(np.array([1.0, 2.0, 0.5]), score=0.98, log_likelihood=-12.5, agreement=0.9).score
+        0.98
+    """
+
+    pose: Floats
+    score: float
+    log_likelihood: float
+    agreement: float
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """The result of :func:`locate_scan`.
+
+    Attributes:
+        pose: (3,) the likeliest pose on the grid of poses: x, y and theta in the world [m, m, rad].
+        score: Mean score of the end points there, from 0 to 1.
+        log_likelihood: log p(z | pose, m) by the model.
+        agreement: Share of the hits that agree with the expected ranges at the pose.
+        modes: The pose and distinct other ones that score nearly as well, by falling score.
+        status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
+            scan.
+        resolution: Distance between neighbouring positions of the grid of poses [m].
+        angle: Angle between neighbouring headings [rad].
+        poses: Number of poses of the grid.
+        evaluated: Number of poses and blocks of poses that were evaluated.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> model = gs.LikelihoodFieldModel(gs.OccupancyGrid([[0, 100]]), gs.Scanner([0.0], 1.0), backend="numpy")
+        >>> gs.locate_scan(model, [np.inf], angle=0.5).status
+        'no match'
+    """
+
+    pose: Floats
+    score: float
+    log_likelihood: float
+    agreement: float
+    modes: tuple[PoseMode, ...] = field(repr=False)
+    status: Status
+    resolution: float
+    angle: float
+    poses: int
+    evaluated: int
+
+    @property
+    def found(self) -> bool:
+        """Whether one pose alone explains the scan."""
+        return self.status == "found"

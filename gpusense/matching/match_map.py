@@ -1,0 +1,267 @@
+"""Match a local map with a global one: branch and bound, and the correlation of the book's section 6.5."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.backends import Selection, get_backend
+from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
+from gpusense.matching.search import Found, PoseGrid, Search
+from gpusense.tables.distances import distance_transform
+from gpusense.world.grid import OccupancyGrid
+
+Floats = NDArray[np.float64]
+
+# Occupied and free cells of the local map that the search sums; the correlation takes all.
+_OCCUPIED, _FREE = 400, 200
+# Deviation and cap of the field around the global map's obstacles [cells].
+_SIGMA, _CAP = 2.0, 8.0
+# Levels of branch and bound, and score below the best one to which modes are looked for, as a share of the largest.
+_LEVELS, _DEPTH = 5, 0.02
+# Poses nearer than this to a better one are part of its mode [m, rad].
+_MODE_RADIUS, _MODE_ANGLE, _MODES = 0.5, math.radians(10), 10
+# Least overlap, as a share of the local map's known cells, and share of the best correlation that makes a rival.
+_OVERLAP, _RIVAL = 0.3, 0.95
+# Half widths of the window around a guess [m, m, rad].
+_WINDOW = (1.0, 1.0, 0.35)
+
+
+@dataclass(frozen=True, eq=False)
+class MapMatch:
+    """The result of :func:`match_map`.
+
+    Attributes:
+        pose: (3,) pose of the local map's frame in the world: x, y and theta [m, m, rad].
+        correlation: Correlation of both maps there, from -1 to 1 (book equation 6.26).
+        overlap: Share of the local map's known cells that the global map knows.
+        score: Mean score of the search, from 0 to 1.
+        modes: (M, 3) poses of distinct matches, by falling correlation; the first is ``pose``.
+        correlations: (M,) their correlations.
+        status: ``"found"``, ``"ambiguous"`` where another mode correlates as well, or ``"no match"``.
+        poses: Number of poses of the search.
+        evaluated: Number of poses and blocks of poses that were evaluated.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> cells = np.pad(np.zeros((12, 20), int), 1, constant_values=100)
+        >>> cells[1:7, 9] = 100
+        >>> grid = gs.OccupancyGrid(cells, resolution=0.1)
+        >>> local = gs.OccupancyGrid(cells[:, :14], resolution=0.1)
+        >>> gs.match_map(local, grid, backend="numpy").pose.round(2).tolist()
+        [0.0, 0.0, 0.0]
+    """
+
+    pose: Floats
+    correlation: float
+    overlap: float
+    score: float
+    modes: Floats = field(repr=False)
+    correlations: Floats = field(repr=False)
+    status: Literal["found", "ambiguous", "no match"]
+    poses: int
+    evaluated: int
+
+    @property
+    def found(self) -> bool:
+        """Whether one pose alone explains the local map."""
+        return self.status == "found"
+
+
+def match_map(
+    local_grid: OccupancyGrid,
+    grid: OccupancyGrid,
+    guess: ArrayLike | None = None,
+    window: ArrayLike | None = None,
+    *,
+    angle: float = 0.0175,
+    min_correlation: float = 0.4,
+    backend: Selection = "auto",
+) -> MapMatch:
+    """Find the pose of a local map in a global one, in a window or without a guess.
+
+    The search sums scores of the local map's occupied cells in the likelihood field of the global map, and of its free
+    cells in the global map's free cells; branch and bound finds the poses of the largest sums exactly. Among these and
+    their neighbours, the pose has the largest correlation of both maps (*Probabilistic Robotics* equation 6.26), over
+    cells that both know.
+
+    Args:
+        local_grid: The local map; its resolution may differ.
+        grid: The global map. Positions are its cells.
+        guess: (3,) pose of the local map's frame in the world [m, m, rad]. None: the whole map is searched.
+        window: (3,) half widths in x, y and theta around the guess [m, m, rad]; all poses within, and some beyond, are
+            searched. None: 1 m, 1 m and 0.35 rad.
+        angle: Angle between neighbouring headings [rad], > 0.
+        min_correlation: Correlation below which there is no match, from 0 to 1.
+        backend: The device, see :func:`gpusense.devices`.
+
+    Raises:
+        TypeError: an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, there is a window without a guess, or the local map has no occupied
+            cell.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> cells = np.pad(np.zeros((12, 20), int), 1, constant_values=100)
+        >>> cells[1:7, 9] = 100
+        >>> local, grid = (gs.OccupancyGrid(cells[:, :end], resolution=0.1) for end in (14, 22))
+        >>> gs.match_map(local, grid, guess=(0.2, 0.1, 0.05), backend="numpy").status
+        'found'
+    """
+    for name, value in (("local_grid", local_grid), ("grid", grid)):
+        if not isinstance(value, OccupancyGrid):
+            raise TypeError(f"{name}: must be an OccupancyGrid, got {checks.show(value)}")
+    turn = checks.real("angle", angle, above=1e-4, high=math.pi / 2)
+    least = checks.real("min_correlation", min_correlation, low=0, high=1)
+    if guess is None and window is not None:
+        raise ValueError("window: must be given with a guess, got guess=None")
+    if not local_grid.occupied.any():
+        raise ValueError("local_grid: must have an occupied cell, got none")
+    device = get_backend(backend)
+    local = _Local(local_grid, grid.resolution)
+    searched = _whole(grid, turn) if guess is None else _around(grid, local, guess, window, turn)
+    levels = min(_LEVELS, int(math.log2(max(min(searched.height, searched.width) / 4, 1))))
+    search = Search(ScoreTables(device, _scores(grid, backend=backend), levels=levels))
+    slack = math.ceil(_DEPTH * TOP * len(local.points))
+    found = search.find([local.points], searched, slack=slack, images=[local.images])
+    return _result(local, grid, searched, found, least)
+
+
+class _Local:
+    """The known cells of a local map around their middle.
+
+    Attributes:
+        middle: (2,) centre of the known cell in their middle, in the local map's frame [m].
+        xy: (M, 2) centres of the known cells around the middle [cells of the global map].
+        occupied: (M,) whether they are occupied.
+        points: (K, 2) cells that the search sums.
+        images: (K,) table of each: 0 for occupied, 1 for free cells.
+    """
+
+    def __init__(self, grid: OccupancyGrid, cell: float) -> None:
+        row, col = np.nonzero(~grid.unknown)
+        centers = grid.cell_centers(row, col)
+        middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
+        # The centre of a cell: maps whose cells coincide then match exactly.
+        self.middle = centers[np.hypot(*(centers - middle).T).argmin()]
+        self.xy = (centers - self.middle) / cell
+        self.occupied = occupied = grid.occupied[row, col]
+        chosen = [_thinned(np.flatnonzero(mask), most) for mask, most in ((occupied, _OCCUPIED), (~occupied, _FREE))]
+        self.points = self.xy[np.concatenate(chosen)]
+        self.images = np.repeat([0, 1], [len(part) for part in chosen])
+
+
+def _thinned(index: np.ndarray, most: int) -> np.ndarray:
+    """Return at most ``most`` of some indices, evenly chosen."""
+    return index if len(index) <= most else index[np.arange(most) * len(index) // most]
+
+
+def _scores(grid: OccupancyGrid, *, backend: Selection) -> np.ndarray:
+    """Return (2, H, W) scores of occupied and of free cells of a local map in the global one."""
+    field = field_scores(distance_transform(grid.occupied, backend=backend), _SIGMA, _CAP)
+    free = np.where(grid.free, TOP, np.where(grid.occupied, 0, TOP // 2)).astype(np.uint8)
+    return np.stack([field, free])
+
+
+def _whole(grid: OccupancyGrid, angle: float) -> PoseGrid:
+    """Return positions in all cells of a map, and headings all around in its frame."""
+    turns = 4 * math.ceil(math.pi / 2 / angle - 1e-9)
+    return PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], *grid.shape)
+
+
+def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayLike | None, angle: float) -> PoseGrid:
+    """Return the poses in a window around a guess, in the frame of the global map."""
+    x, y, theta = checks.array("guess", guess, (3,)).tolist()
+    half = checks.array("window", _WINDOW if window is None else window, (3,))
+    if (half < 0).any():
+        raise ValueError(f"window: must be at least 0, got {checks.show(window)}")
+    cos, sin = math.cos(theta), math.sin(theta)
+    middle = np.array(
+        [[x + cos * local.middle[0] - sin * local.middle[1], y + sin * local.middle[0] + cos * local.middle[1]]]
+    )
+    center = np.column_stack([grid.world_to_cells(middle), [theta - grid.origin[2]]])
+    # Turns of the frame move the middle; the window's axes are those of the world.
+    yaw_cos, yaw_sin = abs(math.cos(grid.origin[2])), abs(math.sin(grid.origin[2]))
+    swing = 2 * math.hypot(*local.middle) * math.sin(min(half[2], math.pi) / 2)
+    wide = np.array([yaw_cos * half[0] + yaw_sin * half[1], yaw_sin * half[0] + yaw_cos * half[1]]) + swing
+    reach = np.ceil(wide / grid.resolution - 1e-9).astype(int)
+    return PoseGrid.around(center, (int(reach[1]), int(reach[0])), math.ceil(half[2] / angle - 1e-9), angle)
+
+
+def _result(local: _Local, grid: OccupancyGrid, searched: PoseGrid, found: Found, least: float) -> MapMatch:
+    """Return the match among the poses of a search and their neighbours."""
+    poses = searched.poses(found, 1)
+    chosen = _distinct(poses, grid.resolution)
+    angle = float(np.diff(searched.headings[0]).max(initial=0.0))
+    # The pose itself comes first and wins ties.
+    steps = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    best, values, overlaps = [], [], []
+    for pose in poses[chosen]:
+        near = pose + steps * [1, 1, angle]
+        measured = np.array([_correlation(local, grid, each) for each in near])
+        top = int(measured[:, 0].argmax())
+        best.append(near[top])
+        values.append(measured[top, 0])
+        overlaps.append(measured[top, 1])
+    order = np.argsort(-np.array(values), kind="stable")
+    modes, correlations = _to_world(local, grid, np.array(best)[order]), np.array(values)[order]
+    rivals = correlations[1:] >= max(_RIVAL * correlations[0], least)
+    status: Literal["found", "ambiguous", "no match"] = "found"
+    if correlations[0] < least:
+        status = "no match"
+    elif rivals.any():
+        status = "ambiguous"
+    return MapMatch(
+        modes[0], float(correlations[0]), float(overlaps[order[0]]), float(found.score[chosen[order[0]]])
+        / (TOP * len(local.points)), modes, correlations, status, searched.count, found.evaluated,
+    )  # fmt: skip
+
+
+def _distinct(poses: np.ndarray, cell: float) -> list[int]:
+    """Return the indices of poses, in falling order of score, that are not near a better one."""
+    left = np.ones(len(poses), bool)
+    chosen: list[int] = []
+    while left.any() and len(chosen) < _MODES:
+        chosen.append(int(left.argmax()))
+        off = poses - poses[chosen[-1]]
+        turn = np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
+        left &= (np.hypot(off[:, 0], off[:, 1]) * cell > _MODE_RADIUS) | (turn > _MODE_ANGLE)
+    return chosen
+
+
+def _correlation(local: _Local, grid: OccupancyGrid, pose: np.ndarray) -> tuple[float, float]:
+    """Return the correlation of both maps over cells that both know, and the share of these (book equation 6.26).
+
+    With m 1 for occupied and 0 for free cells, and its mean over both maps, the correlation is the sum of (m - mean)
+    (m_local - mean) over the root of the product of the sums of (m - mean)^2 and (m_local - mean)^2. Below the least
+    overlap it is -1.
+    """
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    x, y = local.xy[:, 0], local.xy[:, 1]
+    col = np.floor(pose[0] + (cos * x - sin * y)).astype(np.int64)
+    row = np.floor(pose[1] + (sin * x + cos * y)).astype(np.int64)
+    inside = (col >= 0) & (col < grid.shape[1]) & (row >= 0) & (row < grid.shape[0])
+    known = grid.cells[row[inside], col[inside]] >= 0
+    overlap = np.count_nonzero(known) / len(x)
+    if overlap < _OVERLAP:
+        return -1.0, overlap
+    m = grid.occupied[row[inside], col[inside]][known].astype(np.float64)
+    m_local = local.occupied[inside][known].astype(np.float64)
+    mean = (m.mean() + m_local.mean()) / 2
+    scale = math.sqrt(((m - mean) ** 2).sum() * ((m_local - mean) ** 2).sum())
+    return (float(((m - mean) * (m_local - mean)).sum() / scale) if scale > 0 else 0.0), overlap
+
+
+def _to_world(local: _Local, grid: OccupancyGrid, poses: np.ndarray) -> Floats:
+    """Return poses of the local map's frame in the world, from poses of its middle in the global map's cells."""
+    theta = poses[:, 2] + grid.origin[2]
+    cos, sin = np.cos(theta), np.sin(theta)
+    x, y = local.middle
+    shift = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+    wrapped = np.remainder(theta + math.pi, 2 * math.pi) - math.pi
+    return np.column_stack([grid._to_world(poses[:, :2] * grid.resolution) - shift, wrapped])

@@ -1,0 +1,95 @@
+"""Poses to search, and poses that a search found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGrid:
+    """Poses to search: for each of S scans A headings and H x W positions.
+
+    Attributes:
+        start: (S, 2) x and y of the position with row and column 0 [cells of the table].
+        headings: (S, A) headings in the table's frame [rad].
+        height: Rows of positions.
+        width: Columns of positions; neighbours are ``stride`` cells of the tables apart.
+    """
+
+    start: np.ndarray
+    headings: np.ndarray
+    height: int
+    width: int
+
+    @classmethod
+    def around(cls, poses: np.ndarray, reach: tuple[int, int], turns: int, angle: float, stride: int = 1) -> PoseGrid:
+        """Return the poses around (S, 3) poses [cells, cells, rad] in the table's frame.
+
+        Args:
+            poses: The centres.
+            reach: Positions on either side, along y and along x.
+            turns: Headings on either side.
+            angle: Angle between neighbouring headings [rad].
+            stride: Cells between neighbouring positions.
+        """
+        rows, cols = reach
+        start = poses[:, :2] - stride * np.array([cols, rows])
+        headings = poses[:, 2:] + angle * np.arange(-turns, turns + 1)
+        return cls(start, headings, 2 * rows + 1, 2 * cols + 1)
+
+    @property
+    def count(self) -> int:
+        """Number of poses of all scans."""
+        return self.headings.size * self.height * self.width
+
+    def poses(self, found: Found, stride: int) -> np.ndarray:
+        """Return (M, 3) poses [cells, cells, rad] in the table's frame of poses that were found."""
+        start = self.start[found.scan]
+        return np.stack(
+            [start[:, 0] + stride * found.col, start[:, 1] + stride * found.row,
+             self.headings[found.scan, found.heading]], axis=1,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Poses of a search, those of each scan by falling score; ties by row, then column, then heading.
+
+    Attributes:
+        scan: (M,) scan of each pose.
+        row: (M,) its row.
+        col: (M,) its column.
+        heading: (M,) index of its heading.
+        score: (M,) its score, the sum of cells over the scan's points.
+        evaluated: Poses and blocks that were evaluated.
+        complete: (S,) whether all poses of a scan within ``slack`` of its best one are here.
+    """
+
+    scan: np.ndarray
+    row: np.ndarray
+    col: np.ndarray
+    heading: np.ndarray
+    score: np.ndarray
+    evaluated: int
+    complete: np.ndarray
+
+    @property
+    def best(self) -> np.ndarray:
+        """(S,) index of the best pose of each scan."""
+        return np.searchsorted(self.scan, np.arange(len(self.complete)))
+
+
+def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return (A, K, 2) int32 columns and rows of the end points at each heading, at the position ``start``.
+
+    Args:
+        points: (K, 2) end points in the robot's frame [cells].
+        headings: (A,) [rad].
+        start: (2,) x and y [cells].
+    """
+    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+    x, y = points[:, 0], points[:, 1]
+    cells = np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
+    return np.floor(cells).astype(np.int32)

@@ -1,0 +1,219 @@
+"""P(z | x, m) over all positions and headings of a map (Thrun, Burgard and Fox, figures 6.3 and 6.8)."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.models.scan.model import ScanModel
+from gpusense.world.grid import OccupancyGrid
+
+Floats = NDArray[np.float64]
+
+# Poses of one call of the model, and most poses of a map.
+_TILE, _MOST = 1 << 19, 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class PoseLikelihood:
+    """Log-likelihoods of a scan over a lattice of poses; the result of :func:`pose_likelihood`.
+
+    Attributes:
+        grid: The map.
+        log_p: (H', W', A) log p(z | x, m) at each row, column and heading; NaN where it was not evaluated.
+        headings: (A,) headings in the world [rad].
+        step: Cells between neighbouring positions.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> grid, scanner = gs.OccupancyGrid([[0, 0, 100]], 1.0), gs.Scanner([0.0], 9.0)
+        >>> model = gs.LikelihoodFieldModel(grid, scanner, backend="numpy")
+        >>> p = gs.pose_likelihood(model, [1.9], resolution=1.0, headings=4)
+        >>> p.log_p.shape, np.unravel_index(p.log_p.argmax(), p.log_p.shape)[2] == 0
+        ((1, 3, 4), np.True_)
+    """
+
+    grid: OccupancyGrid = field(repr=False)
+    log_p: NDArray[np.floating] = field(repr=False)
+    headings: Floats = field(repr=False)
+    step: int
+
+    @property
+    def resolution(self) -> float:
+        """Distance between neighbouring positions [m]."""
+        return self.step * self.grid.resolution
+
+    def poses(self, row: ArrayLike, col: ArrayLike, heading: ArrayLike) -> Floats:
+        """Return (M, 3) poses in the world of M indices of rows, columns and headings [m, m, rad]."""
+        row, col, heading = (index.ravel() for index in np.broadcast_arrays(row, col, heading))
+        places = np.stack([col, row], axis=-1)
+        xy = self.grid._to_world((places * self.step + self.step // 2 + 0.5) * self.grid.resolution)
+        return np.column_stack([xy, self.headings[heading]])
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the mean of p(z | x, m) over the evaluated poses: log p(z | m) for a uniform prior."""
+        known = ~np.isnan(self.log_p)
+        count = np.count_nonzero(known)
+        return _log_sum(self.log_p) - math.log(count) if count else -math.inf
+
+    @property
+    def probability(self) -> Floats:
+        """(H', W', A) posterior of each pose for a uniform prior; the sum is 1, or 0 if no pose is possible."""
+        total = _log_sum(self.log_p)
+        if total == -math.inf:
+            return np.zeros(self.log_p.shape)
+        return np.nan_to_num(np.exp(self.log_p.astype(np.float64) - total), nan=0.0)
+
+    @property
+    def marginal(self) -> Floats:
+        """(H', W') posterior of each position, the sum over headings."""
+        summed: Floats = self.probability.sum(axis=2)
+        return summed
+
+    @property
+    def entropy(self) -> float:
+        """Entropy of the posterior over poses [nats]; the log of the number of poses where nothing is known."""
+        p = self.probability
+        p = p[p > 0]
+        return float(-(p * np.log(p)).sum())
+
+    def modes(self, count: int = 10, *, radius: float = 0.5, angle: float = 0.26) -> tuple[Floats, Floats]:
+        """Return the best poses that are no neighbours of a better one.
+
+        Args:
+            count: Largest number of modes.
+            radius: Modes nearer than this to a better one are suppressed [m], unless their heading differs.
+            angle: Least difference of heading of modes that are near each other [rad].
+
+        Returns:
+            (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first. Poses that are impossible are left out.
+        """
+        checks.integer("count", count, low=1)
+        near, turn = checks.real("radius", radius, low=0), checks.real("angle", angle, low=0)
+        left = np.where(np.isnan(self.log_p), -np.inf, self.log_p)
+        poses: list[Floats] = []
+        log_p: list[float] = []
+        reach = int(near / self.resolution)
+        distant = np.abs(np.remainder(np.subtract.outer(self.headings, self.headings) + math.pi, 2 * math.pi) - math.pi)
+        rows, cols = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+        disc = rows**2 + cols**2 <= (near / self.resolution) ** 2
+        while len(log_p) < count:
+            row, col, heading = np.unravel_index(int(left.argmax()), left.shape)
+            if left[row, col, heading] == -np.inf:
+                break
+            poses.append(self.poses(row, col, heading)[0])
+            log_p.append(float(left[row, col, heading]))
+            i, j = rows[disc] + row, cols[disc] + col
+            inside = (i >= 0) & (i < left.shape[0]) & (j >= 0) & (j < left.shape[1])
+            around = np.flatnonzero(distant[heading] <= turn)
+            left[i[inside, None], j[inside, None], around] = -np.inf
+        return np.array(poses).reshape(-1, 3), np.array(log_p)
+
+    def plot(self, path: str | os.PathLike[str]) -> None:
+        """Draw the map and the likelihood of each position, and write the picture; see ``gs.plots``.
+
+        Args:
+            path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
+
+        Raises:
+            ImportError: Matplotlib is not installed.
+        """
+        # Pictures are in a room above this one.
+        importlib.import_module("gpusense.plots.pose_maps").pose_likelihood_figure(self, path)
+
+
+def pose_likelihood(
+    model: ScanModel,
+    ranges: ArrayLike,
+    *,
+    resolution: float = 0.1,
+    headings: int = 72,
+    positions: Literal["free", "all"] = "all",
+) -> PoseLikelihood:
+    """Compute P(z | x, m) over all positions and headings of a map.
+
+    Positions are centres of cells, those in the middle of square tiles of whole cells from the map's first corner on.
+    Headings are 0, 2 pi / A, ... in the world. The model evaluates them in tiles, so memory is that of the result.
+
+    Args:
+        model: A scan model: its map, parameters and device are used.
+        ranges: (K,) readings [m].
+        resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
+        headings: Number A of headings.
+        positions: ``"all"``, or ``"free"`` to leave out positions in occupied and unknown cells.
+
+    Raises:
+        TypeError: the model is no scan model, or an argument is of the wrong kind.
+        ValueError: an argument breaks its rule, or there are more than 2^30 poses.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid = gs.OccupancyGrid([[0, 0, 100], [0, 0, 100]], resolution=0.5)
+        >>> model = gs.BeamModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+        >>> gs.pose_likelihood(model, [0.75], resolution=0.5, headings=4, positions="free").marginal.round(2).tolist()
+        [[0.48, 0.02, 0.0], [0.48, 0.02, 0.0]]
+    """
+    result, tiles = prepare_tiles(model, ranges, resolution=resolution, headings=headings, positions=positions)
+    for _ in tiles:
+        pass
+    return result
+
+
+def prepare_tiles(
+    model: ScanModel,
+    ranges: ArrayLike,
+    *,
+    resolution: float,
+    headings: int,
+    positions: Literal["free", "all"],
+) -> tuple[PoseLikelihood, Iterator[float]]:
+    """Return the result, empty so far, and an iterator that fills it tile by tile and yields the share that is done."""
+    if not isinstance(model, ScanModel):
+        raise TypeError(f"model: must be a BeamModel or LikelihoodFieldModel, got {checks.show(model)}")
+    grid = model.grid
+    step = max(round(checks.real("resolution", resolution, above=0) / grid.resolution), 1)
+    count = checks.integer("headings", headings, low=1)
+    checks.choice("positions", positions, ("free", "all"))
+    z = checks.array("ranges", ranges, (model.scanner.count,), finite=False, dtype=None)
+    rows, cols = (-(-size // step) for size in grid.shape)
+    if rows * cols * count > _MOST:
+        raise ValueError(f"resolution: there must be at most {_MOST} poses, got {rows} x {cols} x {count}")
+    log_p = np.full((rows, cols, count), np.nan, model.precision)
+    directions: Floats = 2 * math.pi / count * np.arange(count, dtype=np.float64)
+    result = PoseLikelihood(grid, log_p, directions, step)
+    return result, _fill(model, z, result, positions == "free")
+
+
+def _fill(model: ScanModel, ranges: np.ndarray, result: PoseLikelihood, free: bool) -> Iterator[float]:
+    """Evaluate the poses of a result, tile by tile."""
+    rows, cols, count = result.log_p.shape
+    middle = result.step // 2
+    if free:
+        padded = np.zeros((rows * result.step, cols * result.step), bool)
+        padded[: result.grid.shape[0], : result.grid.shape[1]] = result.grid.free
+        row, col = np.nonzero(padded[middle :: result.step, middle :: result.step])
+    else:
+        row, col = (index.ravel() for index in np.indices((rows, cols)))
+    each = max(_TILE // count, 1)
+    for first in range(0, len(row), each):
+        part = slice(first, min(first + each, len(row)))
+        i, j = row[part], col[part]
+        poses = result.poses(np.repeat(i, count), np.repeat(j, count), np.tile(np.arange(count), len(i)))
+        result.log_p[i, j] = model.log_likelihood(poses, ranges).reshape(len(i), count)
+        yield part.stop / len(row)
+
+
+def _log_sum(log_p: np.ndarray) -> float:
+    """Return the log of the sum of probabilities; NaN stands for none."""
+    known = log_p[~np.isnan(log_p)].astype(np.float64)
+    high = known.max(initial=-np.inf)
+    return float(high + np.log(np.exp(known - high).sum())) if np.isfinite(high) else float(high)

@@ -1,0 +1,157 @@
+"""Draw likelihoods of poses, and likelihood fields of maps and scans; see :mod:`gpusense.plots.drawing`."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gpusense._util import checks
+from gpusense.interface.terms import log_weight
+from gpusense.matching.pose_likelihood import PoseLikelihood
+from gpusense.plots.drawing import _over_grid, add_colour_bar, draw_map, draw_pose, new_figure, save
+from gpusense.plots.pose_densities import _scale
+from gpusense.tables.distances import distance_transform
+from gpusense.world.frames import ray_vectors
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.scanner import Reading, Scanner, classify
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+# Cells around the end points of a scan's field.
+_MARGIN = 10
+
+
+def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float | None = None) -> AxesImage:
+    """Draw the likelihood of each position at its best heading: the darker a position, the larger P(z | x, m).
+
+    Args:
+        ax: Axes to draw onto, usually those of :func:`draw_map`.
+        likelihood: A result of :func:`gpusense.pose_likelihood`.
+        depth: Extent of the grey scale below the best value [nats]; by default half of the positions lie on it.
+
+    Returns:
+        The image, for :func:`add_colour_bar`.
+
+    Example:
+        >>> import gpusense as gs
+        >>> grid, ax = gs.OccupancyGrid([[0, 0, 100]], 1.0), gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], range_max=9.0), backend="numpy")
+        >>> p = gs.pose_likelihood(model, [1.9], resolution=1.0, headings=4)
+        >>> gs.plots.draw_pose_likelihood(ax, p).get_array().shape
+        (1, 3)
+    """
+    best = np.where(np.isnan(likelihood.log_p), -np.inf, likelihood.log_p).max(axis=2).astype(np.float64)
+    low, high = _scale(best, depth)
+    below = np.where(np.isfinite(best), np.maximum(best, low) - high, np.nan)
+    rows, cols = best.shape
+    size = (cols * likelihood.resolution, rows * likelihood.resolution)
+    image = _over_grid(ax, likelihood.grid, below, size, cmap="Greys", zorder=1, interpolation="nearest")
+    image.set_clim(low - high, 0.0)
+    return image
+
+
+def pose_likelihood_figure(likelihood: PoseLikelihood, path: str | os.PathLike[str]) -> None:
+    """Draw likelihoods over the map's outlines, with the modes of nearly the best likelihood, and write the picture.
+
+    Args:
+        likelihood: A result of :func:`gpusense.pose_likelihood`.
+        path: A path that ends in .png, .pdf, .svg or another format that Matplotlib writes.
+    """
+    grid = likelihood.grid
+    figure = new_figure(8.0, 8.0 * min(max(grid.height / grid.width, 0.3), 2.0))
+    ax = figure.subplots()
+    draw_map(ax, grid)
+    image = draw_pose_likelihood(ax, likelihood)
+    outlines = np.where(grid.occupied, 1.0, np.nan)
+    _over_grid(ax, grid, outlines, cmap="autumn", vmin=0, vmax=2, zorder=2, interpolation="nearest")
+    poses, log_p = likelihood.modes(5)
+    for pose, value in zip(poses, log_p, strict=True):
+        if value > log_p[0] - 10:
+            draw_pose(ax, pose, length=0.05 * math.hypot(grid.width, grid.height))
+    add_colour_bar(ax, image, "log P(z | x, m) below the best [nats]")
+    save(figure, path)
+
+
+def draw_likelihood_field(
+    ax: Axes, grid: OccupancyGrid, parameters: LikelihoodFieldParameters | None = None, *, range_max: float = 30.0
+) -> AxesImage:
+    """Draw the likelihood field of a map: the darker a point, the less likely a range ends there (figure 6.8).
+
+    Args:
+        ax: Axes to draw onto.
+        grid: The map.
+        parameters: Parameters of the field.
+        range_max: Largest range of the scanner, for z_rand [m].
+
+    Returns:
+        The image, for :func:`add_colour_bar`.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax = gs.plots.new_figure(6.0, 4.0).subplots()
+        >>> gs.plots.draw_likelihood_field(ax, gs.OccupancyGrid([[0, 100, 0]], 0.5)).get_array().argmax()
+        np.int64(1)
+    """
+    p = LikelihoodFieldParameters() if parameters is None else parameters
+    distance = distance_transform(grid.occupied, resolution=grid.resolution, backend="numpy")
+    hit = -0.5 * (np.minimum(distance, p.max_distance) / p.sigma_hit) ** 2
+    hit += log_weight(p.z_hit) - math.log(p.sigma_hit * math.sqrt(2 * math.pi))
+    reach = checks.real("range_max", range_max, above=0)
+    density = np.logaddexp(hit, log_weight(p.z_rand) - math.log(reach))
+    image = _over_grid(ax, grid, density, cmap="gray", interpolation="nearest")
+    ax.set_aspect("equal")
+    x_min, y_min, x_max, y_max = grid.bounds()
+    ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xlabel="x [m]", ylabel="y [m]")
+    return image
+
+
+def draw_scan_field(
+    ax: Axes,
+    ranges: ArrayLike,
+    scanner: Scanner,
+    parameters: LikelihoodFieldParameters | None = None,
+    *,
+    resolution: float = 0.05,
+) -> AxesImage:
+    """Draw the likelihood field of a scan, whose end points are the obstacles, in the robot's frame (figure 6.9).
+
+    Args:
+        ax: Axes to draw onto.
+        ranges: (K,) readings [m].
+        scanner: The scanner's geometry.
+        parameters: Parameters of the field.
+        resolution: Side of a cell [m].
+
+    Returns:
+        The image, for :func:`add_colour_bar`.
+
+    Raises:
+        ValueError: no reading has a range.
+
+    Example:
+        >>> import gpusense as gs
+        >>> ax, scanner = gs.plots.new_figure(6.0, 4.0).subplots(), gs.Scanner([0.0, 0.5], range_max=9.0)
+        >>> gs.plots.draw_scan_field(ax, [1.0, 2.0], scanner).get_array().shape
+        (40, 36)
+    """
+    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    hits = classify(z, scanner) == Reading.HIT
+    if not hits.any():
+        raise ValueError("ranges: must have a range, got none")
+    cell = checks.real("resolution", resolution, above=0)
+    ends = z[hits, None] * ray_vectors(scanner.bearings, scanner.mount)[hits] + np.array(scanner.mount[:2])
+    place = np.floor(ends / cell).astype(int)
+    low = place.min(axis=0) - _MARGIN
+    cols, rows = (place.max(axis=0) + _MARGIN + 1 - low).tolist()
+    cells = np.zeros((rows, cols), np.int8)
+    cells[place[:, 1] - low[1], place[:, 0] - low[0]] = 100
+    x, y = (low * cell).tolist()
+    field = OccupancyGrid(cells, cell, (x, y, 0.0))
+    return draw_likelihood_field(ax, field, parameters, range_max=scanner.range_max)

@@ -1,0 +1,47 @@
+"""Draw a track: map, particles, estimated and logged poses, and errors with their deviations."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gpusense.evaluation.tracking import Track
+from gpusense.localization.filter import ParticleFilter
+from gpusense.plots.drawing import draw_map, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LOGGED, ESTIMATED, CLOUD = "#8fa3b8", "#e4572e", "#4c78a8"
+
+
+def track_figure(pf: ParticleFilter, track: Track) -> Figure:
+    """Draw the map with estimated and logged poses and the last particles, and errors along the track.
+
+    Args:
+        pf: The filter after its last step.
+        track: Its track.
+    """
+    figure = new_figure(11.0, 6.0)
+    axes = figure.subplot_mosaic([["map", "error"], ["map", "explained"]], width_ratios=(1.6, 1.0))
+    ax, upper, lower = (axes[name] for name in ("map", "error", "explained"))
+    draw_map(ax, pf.grid)
+    poses, truth = np.array(track.poses).reshape(-1, 3), track.truth
+    if truth is not None:
+        ax.plot(truth[:, 0], truth[:, 1], "-", color=LOGGED, lw=1.6, label="logged pose")
+    ax.plot(poses[:, 0], poses[:, 1], "-", color=ESTIMATED, lw=0.8, label="estimate")
+    cloud = pf.host_particles()
+    ax.plot(cloud[:, 0], cloud[:, 1], ".", color=CLOUD, ms=1.5, label="particles after the last scan")
+    ax.legend(loc="best", fontsize="small")
+    deviation = np.sqrt([max(c[0, 0] + c[1, 1], 0.0) for c in track.covariances])
+    index = [step.index for step in track.steps]
+    errors = track.errors()
+    if errors is not None:
+        upper.semilogy(index, np.maximum(errors[0], 1e-4), color=ESTIMATED, lw=0.8, label="error")
+    upper.semilogy(index, np.maximum(deviation, 1e-4), color=CLOUD, lw=0.8, label="deviation of the particles")
+    upper.set(xlabel="scan", ylabel="position [m]")
+    upper.legend(loc="best", fontsize="small")
+    lower.plot(index, track.explained, color=CLOUD, lw=0.8)
+    lower.set(xlabel="scan", ylabel="share of beams explained", ylim=(0, 1.02))
+    return figure

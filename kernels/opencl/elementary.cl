@@ -1,0 +1,68 @@
+// Exponential, logarithm and angle in float64 from +, -, *, / and sqrt alone, so that every device gives the same bits.
+// exp x = 2^k exp r with r = x - k log 2, |r| <= log(2) / 2, by its power series. log x = e log 2 + 2 artanh s with x =
+// m 2^e, sqrt(1/2) <= m < sqrt 2 and s = (m - 1) / (m + 1). atan t with t <= 1 is 4 atan t'', where t' = t / (1 + sqrt(1
+// + t^2)) halves the angle. Errors are a few units in the last place.
+
+#define LOG2_HIGH 0.6931471803691238
+#define LOG2_LOW 1.9082149292705877e-10
+#define INVERSE_LOG2 1.4426950408889634
+// Below this exponent the result is 0.
+#define LEAST_EXPONENT -700.0
+#define SQRT_HALF 0.7071067811865476
+#define RIGHT_ANGLE 1.5707963267948966
+#define HALF_TURN 3.141592653589793
+// 1 / n! for n = 13, ..., 2, and 1 / (2 n + 1) for n = 11, ..., 1.
+constant double EXP[12] = {
+    1.6059043836821613e-10, 2.08767569878681e-09, 2.505210838544172e-08, 2.755731922398589e-07, 2.7557319223985893e-06,
+    2.48015873015873e-05, 0.0001984126984126984, 0.001388888888888889, 0.008333333333333333, 0.041666666666666664,
+    0.16666666666666666, 0.5,
+};
+constant double ODD[11] = {
+    0.043478260869565216, 0.047619047619047616, 0.05263157894736842, 0.058823529411764705, 0.06666666666666667,
+    0.07692307692307693, 0.09090909090909091, 0.1111111111111111, 0.14285714285714285, 0.2, 0.3333333333333333,
+};
+
+// Return exp(x) for x <= 700; 0 below LEAST_EXPONENT.
+double exp_of(const double x) {
+    const double held = x > LEAST_EXPONENT ? x : 0.0;
+    // 1.5 * 2^52: a sum with it is rounded to an integer.
+    const double count = (held * INVERSE_LOG2 + 6755399441055744.0) - 6755399441055744.0;
+    const double r = (held - count * LOG2_HIGH) - count * LOG2_LOW;
+    double series = EXP[0];
+#pragma unroll
+    for (int i = 1; i < 12; i++) series = series * r + EXP[i];
+    const double power = as_double(((long)count + 1023) << 52);
+    return x > LEAST_EXPONENT ? (1.0 + (r + r * r * series)) * power : 0.0;
+}
+
+// Return log(x) of a normal number x > 0.
+double log_of(const double x) {
+    const long bits = as_long(x);
+    const double m = as_double((bits & 0xFFFFFFFFFFFFFL) | 0x3FE0000000000000L);
+    const int small = m < SQRT_HALF;
+    const double exponent = (double)((bits >> 52) - 1023) + (small ? 0.0 : 1.0);
+    const double scaled = small ? 2.0 * m : m;
+    const double s = (scaled - 1.0) / (scaled + 1.0);
+    const double z = s * s;
+    double series = ODD[0];
+#pragma unroll
+    for (int i = 1; i < 11; i++) series = series * z + ODD[i];
+    return exponent * LOG2_HIGH + (2.0 * s + (2.0 * s * z * series + exponent * LOG2_LOW));
+}
+
+// Return the angle of a vector in [-pi, pi]; 0 for the vector 0.
+double angle_of(const double x, const double y) {
+    const double size_x = fabs(x), size_y = fabs(y);
+    const double high = size_x > size_y ? size_x : size_y, low = size_x > size_y ? size_y : size_x;
+    double t = low / (high > 0.0 ? high : 1.0);
+    t = t / (1.0 + sqrt(1.0 + t * t));
+    t = t / (1.0 + sqrt(1.0 + t * t));
+    const double z = -(t * t);
+    double series = ODD[0];
+#pragma unroll
+    for (int i = 1; i < 11; i++) series = series * z + ODD[i];
+    double angle = 4.0 * (t + t * z * series);
+    angle = size_y > size_x ? RIGHT_ANGLE - angle : angle;
+    angle = x < 0.0 ? HALF_TURN - angle : angle;
+    return y < 0.0 ? -angle : angle;
+}

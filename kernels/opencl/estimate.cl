@@ -1,0 +1,59 @@
+// Weighted mean, circular in the heading, and covariance of a cloud of particles.
+// Sums are relative to a reference pose, block by block in the order of the particles: the first particle for the mean,
+// and the mean for the covariance (again). Mardia and Jupp, "Directional Statistics" (2000), section 2.2.
+// requires: motion
+
+#define ESTIMATE_SUMS 13
+
+// Sum weights, offsets, products of offsets, cosines and sines of a block, and find its heaviest particle: one work-item
+// takes a block.
+kernel void sum_poses(global const double *poses, global const double *weight, global const double *estimate,
+                      global double *sums, const int particles, const int block, const int again) {
+    const int b = get_global_id(0), begin = b * block;
+    if (begin >= particles) return;
+    global const double *reference = again ? estimate : poses;
+    const double x0 = reference[0], y0 = reference[1], theta0 = reference[2];
+    const int end = min(begin + block, particles);
+    double total[11], largest = -1.0;
+    int best = begin;
+    for (int k = 0; k < 11; k++) total[k] = 0.0;
+    for (int n = begin; n < end; n++) {
+        const double w = weight[n], x = poses[3 * (long)n] - x0, y = poses[3 * (long)n + 1] - y0;
+        const double angle = wrap_once(poses[3 * (long)n + 2] - theta0);
+        const double2 heading = cos_sin(angle);
+        total[0] += w, total[1] += w * x, total[2] += w * y;
+        total[3] += w * heading.x, total[4] += w * heading.y;
+        total[5] += w * x * x, total[6] += w * x * y, total[7] += w * x * angle;
+        total[8] += w * y * y, total[9] += w * y * angle, total[10] += w * angle * angle;
+        best = w > largest ? n : best;
+        largest = w > largest ? w : largest;
+    }
+    global double *row = sums + (long)b * ESTIMATE_SUMS;
+    for (int k = 0; k < 11; k++) row[k] = total[k];
+    row[11] = largest, row[12] = (double)best;
+}
+
+// Add up the blocks; write the mean pose, or the covariance about it: one work-item takes all.
+kernel void finish_estimate(global const double *poses, global const double *sums, global double *estimate,
+                            const int blocks, const int again) {
+    if (get_global_id(0) > 0) return;
+    double total[11], largest = -1.0, best = 0.0;
+    for (int k = 0; k < 11; k++) total[k] = 0.0;
+    for (int b = 0; b < blocks; b++) {
+        global const double *row = sums + (long)b * ESTIMATE_SUMS;
+        for (int k = 0; k < 11; k++) total[k] += row[k];
+        best = row[11] > largest ? row[12] : best;
+        largest = row[11] > largest ? row[11] : largest;
+    }
+    const double weight = total[0] > 0.0 ? total[0] : 1.0;
+    const double x = total[1] / weight, y = total[2] / weight;
+    if (!again) {
+        estimate[0] = poses[0] + x, estimate[1] = poses[1] + y;
+        estimate[2] = wrap_once(poses[2] + angle_of(total[3], total[4]));
+        estimate[9] = weight, estimate[10] = best;
+        return;
+    }
+    estimate[3] = total[5] / weight - x * x, estimate[4] = total[6] / weight - x * y;
+    estimate[5] = total[7] / weight, estimate[6] = total[8] / weight - y * y;
+    estimate[7] = total[9] / weight, estimate[8] = total[10] / weight;
+}

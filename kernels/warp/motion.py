@@ -1,0 +1,94 @@
+"""Sampled motions of particles: a first turn, a translation ahead and to the left, and a second turn.
+
+Odometry model: Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6; velocity model: table 5.3. Each of
+the four parts is normal, with a mean and a deviation in the settings. An arc of the velocity model (VELOCITY_MODEL)
+turns by twice the first part; its chord is the arc's length times sin(a) / a. With probability REVERSE the translation
+goes the other direction: some odometers count wheel turns without a sign.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import heading, philox
+from .prelude import kernel
+
+SEED, STEP, MEAN, DEVIATION, REVERSE = (wp.constant(place) for place in (0, 2, 3, 7, 11))
+MOTION_STREAM, REVERSE_STREAM = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
+VELOCITY_MODEL = wp.constant(1)
+SMALL_ARC, SIX = wp.constant(wp.float64(1e-4)), wp.constant(wp.float64(6.0))
+WHOLE_TURN, HALF_TURN = wp.constant(wp.float64(6.283185307179586)), wp.constant(wp.float64(3.141592653589793))
+MINUS_HALF_TURN = wp.constant(wp.float64(-3.141592653589793))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file; no flag changes them."""
+    cos_sin = heading.functions(frozenset()).cos_sin
+
+    # Return the chord of an arc that turns by twice half_turn.
+    @wp.func
+    def chord_of(length: wp.float64, half_turn: wp.float64):
+        chord = length * (ONE - half_turn * half_turn / SIX)
+        if wp.abs(half_turn) >= SMALL_ARC:
+            turn = cos_sin(half_turn)
+            chord = length * (turn.y / half_turn)
+        return chord
+
+    # Return a heading less than a turn beyond [-pi, pi] in that interval.
+    @wp.func
+    def wrap_once(theta: wp.float64):
+        less = wp.where(theta < MINUS_HALF_TURN, theta + WHOLE_TURN, theta)
+        return wp.where(theta > HALF_TURN, theta - WHOLE_TURN, less)
+
+    return SimpleNamespace(chord_of=chord_of, wrap_once=wrap_once, cos_sin=cos_sin)
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    made = functions(frozenset())
+    chord_of, wrap_once, cos_sin = made.chord_of, made.wrap_once, made.cos_sin
+    numbers = philox.functions(frozenset())
+    random_words, uniform_of, normal_pair = numbers.random_words, numbers.uniform_of, numbers.normal_pair
+
+    # Move particles from source to target, which may be the same array: one work-item takes a particle.
+    @kernel
+    def move_particles(
+        source: wp.array(dtype=wp.float64),
+        settings: wp.array(dtype=wp.float64),
+        target: wp.array(dtype=wp.float64),
+        particles: wp.int32,
+        kind: wp.int32,
+    ):
+        n = wp.tid()
+        if n >= particles:
+            return
+        step = wp.uint32(settings[STEP])
+        key_0 = wp.uint32(settings[SEED])
+        key_1 = wp.uint32(settings[SEED + 1])
+        words = random_words(wp.uint32(n), step, MOTION_STREAM, key_0, key_1)
+        one = normal_pair(words[0], words[1])
+        two = normal_pair(words[2], words[3])
+        first = settings[MEAN] + settings[DEVIATION] * one.x
+        ahead = settings[MEAN + 1] + settings[DEVIATION + 1] * one.y
+        left = settings[MEAN + 2] + settings[DEVIATION + 2] * two.x
+        second = settings[MEAN + 3] + settings[DEVIATION + 3] * two.y
+        if kind == VELOCITY_MODEL:
+            ahead = chord_of(ahead, first)
+            second = first + second
+        if settings[REVERSE] > ZERO:
+            more = random_words(wp.uint32(n), step, REVERSE_STREAM, key_0, key_1)
+            if uniform_of(more[0]) < settings[REVERSE]:
+                ahead = -ahead
+        x = source[3 * n]
+        y = source[3 * n + 1]
+        theta = source[3 * n + 2] + first
+        turn = cos_sin(theta)
+        target[3 * n] = x + (ahead * turn.x - left * turn.y)
+        target[3 * n + 1] = y + (ahead * turn.y + left * turn.x)
+        target[3 * n + 2] = wrap_once(theta + second)
+
+    return {"move_particles": move_particles}[name]

@@ -1,0 +1,116 @@
+"""``gpusense localize`` on a made log: figures, files, the verdict on a wrong map, bad input."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.command_line import error_of
+
+import gpusense as gs
+from gpusense.commands import cli
+from gpusense.evaluation import tracking
+
+BEARINGS = np.radians(np.arange(-90, 91, 1.0))
+
+
+def room(rows, columns):
+    cells = np.pad(np.zeros((rows, columns), int), 2, constant_values=100)
+    cells[rows // 2, : columns // 3] = 100
+    return gs.OccupancyGrid(cells, resolution=0.1)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Return a folder with a map, another map, and a log of 12 scans in the first."""
+    folder, rng = tmp_path_factory.mktemp("localize"), np.random.default_rng(0)
+    grid = room(60, 80)
+    gs.write_map(grid, folder / "map.yaml")
+    gs.write_map(room(160, 150), folder / "other.yaml")
+    caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
+    pose, odometry, lines = np.array([3.0, 1.5, 0.2]), np.zeros(3), []
+    for step in range(12):
+        ranges = caster.cast(pose[None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS))
+        numbers = [*ranges, *pose, *odometry]
+        lines.append(f"FLASER 181 {' '.join(f'{value:.4f}' for value in numbers)} {step}.0 robot {step}.0")
+        pose = gs.compose_poses(pose, np.add((0.2, 0, 0.1), rng.normal(0, 0.01, 3)))
+        odometry = gs.compose_poses(odometry, (0.2, 0, 0.1))
+    (folder / "run.log").write_text("\n".join(lines))
+    (folder / "poses.yaml").write_text(
+        "beam_model: {z_hit: 0.8, z_short: 0.05, z_max: 0.05, z_rand: 0.1, sigma_hit: 0.05, lambda_short: 0.5}\n"
+    )
+    return folder
+
+
+def call(place, *more, grid="map.yaml", log="run.log"):
+    common = ["--particles", "300", "--backend", "numpy", "--range-max", "20", "--beams", "60"]
+    return ["localize", "--map", str(place / grid), "--log", str(place / log), *common, *more]
+
+
+def test_a_log_is_tracked_and_written(place, capsys):
+    tum, plot = place / "run.tum", place / "run.png"
+    parameters = ["--parameters", str(place / "poses.yaml"), "--tum", str(tum), "--plot", str(plot)]
+    assert cli.main(call(place, *parameters)) == 0
+    out = capsys.readouterr().out
+    assert "verdict: not lost" in out and "position error" in out and "ms per scan" in out
+    rows = np.loadtxt(tum)
+    assert rows.shape == (12, 8) and plot.stat().st_size > 10_000
+    truth = [scan.pose for scan in gs.read_log(place / "run.log", range_max=20.0)]
+    assert np.median(np.hypot(*(rows[:, 1:3] - np.array(truth)[:, :2]).T)) < 0.1
+    np.testing.assert_allclose(np.hypot(rows[:, 6], rows[:, 7]), 1, atol=1e-8)
+
+
+def test_figures_come_as_json(place, capsys):
+    assert cli.main(call(place, "--json", "--limit", "4", "--temperature", "0.2", "--fit-motion")) in (0, 1)
+    document = json.loads(capsys.readouterr().out)
+    found = document["summary"]
+    assert found["scans"] == 4 and len(document["poses"]) == 4 and found["temperature"] == 0.2
+    assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_score"] > 0
+
+
+def test_a_log_on_a_wrong_map_is_lost(place, capsys):
+    assert cli.main(call(place, "--global", "--particles", "500", grid="other.yaml")) == 1
+    assert "verdict: LOST" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_keeps_what_it_has(place, capsys, monkeypatch):
+    follow = tracking.follow
+
+    def stop_after_three(pf, steps, track):
+        for step in follow(pf, steps, track):
+            yield step
+            if len(track.steps) == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(tracking, "follow", stop_after_three)
+    tum = place / "part.tum"
+    assert cli.main(call(place, "--tum", str(tum))) == 130
+    assert "interrupted: results of 3 of 12 scans" in capsys.readouterr().out
+    assert len(tum.read_text().splitlines()) == 3
+
+
+def test_odometry_that_copies_corrected_poses_is_chained_from_wheel_readings(tmp_path):
+    def scan(x, step):
+        return f"FLASER 3 1 2 3 {x} 0 0 {x} 0 0 {step} robot {step}"
+
+    def wheels(x):
+        return f"ODOM {x} 0 0 0 0 0 1 robot 1"
+
+    log = tmp_path / "copied.log"
+    log.write_text("\n".join([scan(0, 0), wheels(0.3), wheels(0.9), scan(1, 1), wheels(2.1), scan(2, 2)]))
+    found = [step.odometry[0] for step in tracking.read_steps(log, range_max=8.0)]
+    np.testing.assert_allclose(found, [0, 0.9, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--temperature", "2"], "temperature: must be"),
+        (["--offset", "99"], "log: must have a scan of index 99"),
+        (["--motion-noise", "1", "2", "3"], "expected 4 arguments"),
+        (["--parameters", "absent.yaml"], "absent.yaml"),
+    ],
+)
+def test_bad_input_is_one_line(place, capsys, more, message):
+    assert message in error_of(call(place, *more), capsys)

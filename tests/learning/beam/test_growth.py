@@ -1,0 +1,90 @@
+"""Fits of the deviation's growth with range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.learning.beam import growth
+
+TRUTH = gs.BeamParameters(0.7, 0.12, 0.08, 0.1, sigma_hit=0.02, lambda_short=0.4, range_bias=0.03, sigma_growth=0.015)
+
+
+def draw(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    expected = rng.uniform(0.3, 9.5, count)
+    cause = rng.choice(4, count, p=[TRUTH.z_hit, TRUTH.z_short, TRUTH.z_max, TRUTH.z_rand])
+    hit = expected + TRUTH.range_bias + (TRUTH.sigma_hit + TRUTH.sigma_growth * expected) * rng.normal(size=count)
+    short = -np.log1p(-rng.random(count) * -np.expm1(-TRUTH.lambda_short * expected)) / TRUTH.lambda_short
+    return np.choose(cause, [hit, short, np.full(count, 10.0), rng.uniform(0, 10, count)]), expected
+
+
+@pytest.mark.parametrize("bias", [False, True])
+def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    real = growth.maximize
+    monkeypatch.setattr(growth, "maximize", lambda p, *rest: seen.append(p) or real(p, *rest))
+    z, expected = draw(500, 1)
+    gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, range_bias=bias, backend="numpy")
+    problem = seen[0]
+    theta = np.array([0.1, 0.2, 0.15, np.log(0.1), 0.02, np.log(0.5), *([0.05] if bias else [])])
+    gradient = problem.log_p(theta)[1]
+    for k, step in enumerate(1e-6 * problem.scales(theta)):
+        ends = [problem.log_p(theta + sign * step * np.eye(len(theta))[k])[0] for sign in (1, -1)]
+        size = 1 + np.abs(gradient[:, k]).max()
+        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), gradient[:, k], rtol=0, atol=1e-8 * size)
+
+
+def test_all_parameters_are_found(needs) -> None:
+    z, expected = draw(12_000, 2)
+    z[7] = np.nan
+    options: Any = dict(backend=needs("opencl"), range_bias=True)
+    plain = gs.fit_beam_parameters(z, expected, 10.0, **options)
+    fit = gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, responsibilities=True, **options,
+                                 blocks=np.arange(12_000) // 10)  # fmt: skip
+    assert fit.converged and fit.log_likelihood > plain.log_likelihood + 100
+    found = fit.parameters.to_dict()
+    errors = fit.standard_errors | {"range_bias": fit.range_bias_error}
+    for name, value in TRUTH.to_dict().items():
+        assert abs(found[name] - value) < 4 * errors[name] < 0.2, name
+        # Errors over 1200 blocks have a standard error of some percent.
+        assert errors[name] == pytest.approx(fit.independent_errors[name], rel=0.2)
+    assert "sigma_growth" in str(fit) and "over 1200 blocks" in str(fit)
+    np.testing.assert_allclose(np.delete(fit.responsibilities, 7, axis=0).sum(axis=1), 1, rtol=1e-9)
+    # The model's own log-likelihood, at poses whose expected ranges are known: one beam towards a wall.
+    grid = gs.OccupancyGrid([[0] * 120 + [100]], 0.1)
+    scanner = gs.Scanner([0.0], range_max=10.0)
+    poses = np.column_stack([12.0 - expected[:200], np.full(200, 0.05), np.zeros(200)])
+    model = gs.BeamModel(grid, scanner, fit.parameters, backend="numpy", precision="float64")
+    total = sum(float(model.log_likelihood(p[None], [r])[0]) for p, r in zip(poses, z[:200], strict=True))
+    walls = model.expected_ranges(poses)[:, 0]
+    again = gs.fit_beam_parameters(z[:200], walls, 10.0, sigma_growth=True, range_bias=True, backend="numpy")
+    best = gs.BeamModel(grid, scanner, again.parameters, backend="numpy", precision="float64")
+    own = sum(float(best.log_likelihood(p[None], [r])[0]) for p, r in zip(poses, z[:200], strict=True))
+    assert own == pytest.approx(again.log_likelihood, rel=1e-9) and own >= total
+
+
+def test_without_growth_the_fit_is_the_plain_one() -> None:
+    rng = np.random.default_rng(3)
+    expected = rng.uniform(1, 9, 3000)
+    # A deviation that falls with range: growth ends at its bound, 0.
+    z = expected + rng.normal(0, 0.3 - 0.03 * expected)
+    plain = gs.fit_beam_parameters(z, expected, 10.0, backend="numpy")
+    fit = gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, backend="numpy")
+    assert fit.parameters.sigma_growth == 0 and fit.held["sigma_growth"] == "at a bound"
+    assert fit.log_likelihood == pytest.approx(plain.log_likelihood, abs=1e-6)
+    assert fit.parameters.sigma_hit == pytest.approx(plain.parameters.sigma_hit, rel=1e-5)
+    assert fit.range_bias == pytest.approx(plain.range_bias, abs=1e-6)
+    assert fit.range_bias_error == pytest.approx(plain.range_bias_error, rel=1e-3)
+
+
+def test_bad_input() -> None:
+    with pytest.raises(TypeError, match=r"^sigma_growth: must be True or False, got 1$"):
+        gs.fit_beam_parameters([1.0], [1.0], 10.0, sigma_growth=1)
+    with pytest.raises(ValueError, match=r"^sigma_growth: must be False with method 'em-book', which has no growth"):
+        gs.fit_beam_parameters([1.0], [1.0], 10.0, sigma_growth=True, method="em-book")
+    none = gs.fit_beam_parameters([10.0], [1.0], 10.0, sigma_growth=True, backend="numpy")
+    assert none.held["sigma_growth"] == "no range determines it" and none.parameters.z_max == 1

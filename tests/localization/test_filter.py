@@ -1,0 +1,241 @@
+"""The particle filter against a Kalman filter, itself, and bad input; the models of motion and the algebra of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.localization.adaptive import kld_count
+from gpusense.localization.estimates import clustered
+from gpusense.localization.temperature import BeamCorrelation
+
+GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
+TRUTH = np.array([3.0, 2.5, 0.4])
+
+
+def gps(backend="numpy", precision="float64"):
+    parameters = gs.PositionParameters(sigma=0.3, z_rand=0.0)
+    return gs.PositionModel(parameters, backend=backend, precision=precision)
+
+
+def posterior(count, seed, backend="numpy"):
+    """Return mean and covariance of a robot that knows its heading, after three steps and fixes."""
+    motion = gs.OdometryMotion((0, 0, 0.04, 0), reverse=0.0, least=(0.0, 0.0))
+    pf = gs.ParticleFilter(gps(backend), motion=motion, particles=count, seed=seed, stages=1)
+    pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.5, 0.5, 0.0]))
+    for step, fix in enumerate(((1.3, 0.2), (2.1, -0.3), (3.4, 0.1))):
+        pf.predict((step, 0, 0), (step + 1, 0, 0))
+        pf.correct(np.array(fix))
+    return pf.estimate()
+
+
+def kalman():
+    mean, variance = np.zeros(2), np.array([0.5, 0.5])
+    for fix in ((1.3, 0.2), (2.1, -0.3), (3.4, 0.1)):
+        mean, variance = mean + np.array([1, 0]), variance + np.array([0.04, 0])
+        gain = variance / (variance + 0.09)
+        mean, variance = mean + gain * (fix - mean), (1 - gain) * variance
+    return mean, variance
+
+
+def test_a_linear_gaussian_problem_has_the_kalman_filters_answer(backend):
+    found, (mean, variance) = posterior(8000, 3, backend), kalman()
+    # Three draws leave the mean of some 2000 independent particles: 4 deviations of it.
+    np.testing.assert_allclose(found.pose[:2], mean, atol=4 * np.sqrt(variance.max() / 2000))
+    np.testing.assert_allclose(np.diag(found.covariance)[:2], variance, rtol=0.1)
+    assert abs(found.pose[2]) < 1e-12
+
+
+def test_errors_fall_with_the_root_of_the_number_of_particles():
+    mean, _ = kalman()
+    errors = [
+        np.sqrt(np.mean([np.sum((posterior(n, seed).pose[:2] - mean) ** 2) for seed in range(30)])) for n in (100, 1600)
+    ]
+    assert 2.5 < errors[0] / errors[1] < 6.5
+
+
+def walls(pose):
+    return gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(pose[None], SCANNER.bearings)[0]
+
+
+def tracked(backend, count=400, **options):
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    pf = gs.ParticleFilter(model, particles=count, seed=5, **options)
+    pf.initialize(mean=TRUTH + np.array([0.2, -0.2, 0.1]), covariance=np.diag([0.1, 0.1, 0.03]))
+    pose, odometry = TRUTH, np.zeros(3)
+    for _ in range(8):
+        moved = gs.compose_poses(odometry, (0.2, 0, 0.1))
+        pf.predict(odometry, moved)
+        pose, odometry = gs.compose_poses(pose, (0.2, 0, 0.1)), moved
+        pf.correct(walls(pose))
+    return pf, pose
+
+
+@pytest.mark.parametrize("options", [{}, dict(stages=1), dict(resampling="stratified"), dict(particles=(200, 600))])
+def test_a_robot_in_a_room_is_tracked(backend, options):
+    pf, pose = tracked(backend, options.pop("particles", 400), **options)
+    for method in ("mean", "cluster"):
+        found = pf.estimate(method)
+        assert np.hypot(*(found.pose - pose)[:2]) < 0.1 and abs(found.pose[2] - pose[2]) < 0.05
+        assert not found.lost and found.explained > 0.9
+    assert np.hypot(*(pf.estimate("best").pose - pose)[:2]) < 0.3
+    assert abs(np.sum(pf.weights) - 1) < 1e-12 and pf.particles.shape == (len(pf.weights), 3)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_one_others(backend):
+    one, two = tracked(backend)[0], tracked(backend)[0]
+    assert np.array_equal(one.particles, two.particles) and np.array_equal(one.weights, two.weights)
+    # Random numbers are common to all backends: their estimates differ by less than those of two seeds.
+    reference = tracked("numpy")[0].estimate().pose
+    assert np.abs(one.estimate().pose - reference).max() < 0.03
+
+
+def test_several_sensors_weigh_together(backend):
+    fields = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
+    compass = gs.HeadingModel(gs.HeadingParameters(sigma=0.02), backend=backend)
+    pf = gs.ParticleFilter([fields, compass], particles=500, seed=1)
+    # A rectangle looks the same from the other side: the compass decides.
+    pf.initialize_uniform()
+    for _ in range(6):
+        pf.correct({fields: walls(TRUTH), compass: float(TRUTH[2])})
+        pf.predict((0, 0, 0), (0, 0, 0))
+    assert abs(pf.estimate("cluster").pose[2] - TRUTH[2]) < 0.05
+    pf.correct({fields: None, compass: float(TRUTH[2])})
+    with pytest.raises(KeyError, match="must be of the filter's models"):
+        pf.correct({gps(backend): np.zeros(2)})
+    with pytest.raises(TypeError, match="must be a mapping"):
+        pf.correct(walls(TRUTH))
+
+
+def test_a_filter_on_a_wrong_map_says_that_it_is_lost():
+    hall = gs.OccupancyGrid(np.pad(np.zeros((150, 150), int), 2, constant_values=100), resolution=0.1)
+    model = gs.LikelihoodFieldModel(hall, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend="numpy")
+    pf = gs.ParticleFilter(model, particles=300, seed=2)
+    pf.initialize_uniform()
+    for _ in range(6):
+        pf.correct(walls(TRUTH))
+        found = pf.estimate()
+    assert found.lost and found.explained < 0.8
+
+
+def test_impossible_readings_change_nothing():
+    parameters = gs.LikelihoodFieldParameters(z_hit=1.0, z_rand=0.0, z_max=0.0, sigma_hit=0.01)
+    model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(1.0, 0.0, 0.0, 0.0, sigma_hit=1e-8), backend="numpy")
+    pf = gs.ParticleFilter(model, particles=50, seed=0)
+    pf.initialize(mean=(-50.0, -50.0, 0.0), covariance=np.eye(3) * 1e-6)
+    before = pf.particles
+    pf.correct(np.full(60, np.nan))
+    assert np.isfinite(pf.estimate().pose).all() and parameters.sigma_hit == 0.01
+    assert np.array_equal(pf.particles[:, 2], before[:, 2])
+
+
+def test_recovery_from_a_kidnapping():
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend="numpy")
+    for recovery in ("augmented", "sensor"):
+        pf = gs.ParticleFilter(model, particles=800, seed=4, recovery=recovery)
+        pf.initialize(mean=TRUTH, covariance=np.eye(3) * 1e-3)
+        for pose in (*[TRUTH] * 4, *[np.array([6.5, 5.0, -1.0])] * 12):
+            pf.correct(walls(pose))
+            pf.predict((0, 0, 0), (0, 0, 0))
+        found = pf.estimate("cluster").pose
+        # The room has a twin: half a turn about its centre.
+        twin = np.array([8.4 - 6.5, 6.4 - 5.0, -1.0 + np.pi])
+        assert min(np.hypot(*(found - one)[:2]) for one in (pose, twin)) < 0.5, recovery
+
+
+def test_starts_have_their_densities():
+    pf = gs.ParticleFilter(gps(), particles=50_000, seed=1)
+    covariance = np.array([[0.5, 0.2, 0.0], [0.2, 0.3, 0.05], [0.0, 0.05, 0.1]])
+    pf.initialize(mean=(1, 2, 0.5), covariance=covariance)
+    found = pf.estimate()
+    np.testing.assert_allclose(found.covariance, covariance, atol=0.01)
+    np.testing.assert_allclose(found.pose, (1, 2, 0.5), atol=0.02)
+    pf.initialize_uniform(bounds=[(0, 0), (2, 4)])
+    np.testing.assert_allclose(np.var(pf.particles, axis=0), [4 / 12, 16 / 12, (2 * np.pi) ** 2 / 12], rtol=0.03)
+
+    class Likelihood:
+        log_p = np.log([0.75, 0.25, 1e-300])
+        positions = np.array([(0.0, 0, 0), (1.0, 0, 0), (2.0, 0, 0)])
+
+    pf.initialize_from(Likelihood())
+    assert np.bincount(pf.particles[:, 0].round().astype(int)).tolist() == [37_500, 12_500]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: gs.ParticleFilter([]), "models: must be 1 to"),
+        (lambda: gs.ParticleFilter(gps(), particles=(5, 2)), "particles: least must be at most"),
+        (lambda: gs.ParticleFilter(gps(), temperature=2.0), "temperature: must be"),
+        (lambda: gs.ParticleFilter(gps(), resampling="multinomial"), "resampling: must be"),
+        (lambda: gs.ParticleFilter(gps(), stages=9), "stages: must be"),
+        (lambda: gs.ParticleFilter(gps()).initialize(mean=np.zeros(3), covariance=-np.eye(3)), "positive semidefinite"),
+        (lambda: gs.ParticleFilter(gps()).initialize_uniform(), "bounds: must be given"),
+        (lambda: gs.OdometryMotion(alpha=(-1, 0, 0, 0)), "alpha: must be >= 0"),
+        (lambda: gs.fit_odometry_motion(np.zeros((2, 3)), np.zeros((2, 3))), "at least 3 poses"),
+    ],
+)
+def test_bad_input_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_filter_must_be_initialised():
+    with pytest.raises(RuntimeError, match="must be initialised first"):
+        gs.ParticleFilter(gps()).correct(np.zeros(2))
+
+
+def test_the_algebra_of_poses():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 20, 3))
+    np.testing.assert_allclose(gs.compose_poses(a, gs.pose_difference(a, b))[:, :2], b[:, :2], atol=1e-12)
+    np.testing.assert_allclose(gs.compose_poses(a, gs.invert_poses(a)), 0, atol=1e-12)
+
+
+def test_motion_noise_is_learned():
+    rng, alpha, steps = np.random.default_rng(1), np.array([0.02, 0.01, 0.03, 0.005]), 3000
+    truth, odometry = [np.zeros(3)], [np.zeros(3)]
+    for _ in range(steps):
+        one, trans, two = rng.normal(0, 0.3), rng.uniform(0.3, 1.5), rng.normal(0, 0.3)
+        noise = rng.normal(size=3) * np.sqrt(
+            [alpha[0] * one**2 + alpha[1] * trans**2, alpha[2] * trans**2 + alpha[3] * (one**2 + two**2),
+             alpha[0] * two**2 + alpha[1] * trans**2]
+        )  # fmt: skip
+        odometry.append(_step(odometry[-1], one, trans, two))
+        sign = -1 if rng.random() < 0.05 else 1
+        truth.append(_step(truth[-1], one + noise[0], sign * (trans + noise[1]), two + noise[2]))
+    fit = gs.fit_odometry_motion(np.array(odometry), np.array(truth))
+    # A Student t density fits normal errors with a smaller scale.
+    assert (np.array(fit.motion.alpha) / fit.inflation / alpha)[[0, 1, 2]] == pytest.approx(np.full(3, 0.75), rel=0.35)
+    assert fit.inflation < 1.5 and 0.03 < fit.motion.reverse < 0.07
+
+
+def _step(pose, one, trans, two):
+    return gs.compose_poses(gs.compose_poses(pose, (trans * np.cos(one), trans * np.sin(one), one)), (0, 0, two))
+
+
+def test_correlated_beams_are_worth_less():
+    rng, white, smooth = np.random.default_rng(0), BeamCorrelation(), BeamCorrelation()
+    for _ in range(60):
+        values = rng.normal(-2, 1, 300)
+        white.add(values)
+        smooth.add(np.convolve(rng.normal(-2, 1, 309), np.full(10, 0.1), "valid"))
+    # Moving averages of 10 have an inflation of 10.
+    assert white.temperature(300) > 0.6
+    assert 0.07 < smooth.temperature(300) < 0.16
+
+
+def test_kld_sampling_asks_for_more_where_the_cloud_is_wide():
+    rng = np.random.default_rng(0)
+    narrow, wide = rng.normal(0, 0.05, (5000, 3)), rng.normal(0, 5, (5000, 3))
+    assert kld_count(narrow, 100, 50_000) < 2000 < kld_count(wide, 100, 50_000)
+
+
+def test_the_heaviest_cluster_is_found():
+    rng = np.random.default_rng(0)
+    one, two = rng.normal((0, 0, 3.1), 0.1, (300, 3)), rng.normal((9, 0, 0), 0.1, (200, 3))
+    pose, covariance = clustered(np.vstack([one, two]), np.r_[np.full(300, 1.0), np.full(200, 1.1)])
+    np.testing.assert_allclose(pose, (0, 0, 3.1), atol=0.03)
+    np.testing.assert_allclose(np.diag(covariance), 0.01, rtol=0.3)

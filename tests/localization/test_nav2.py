@@ -1,0 +1,233 @@
+"""Parameters of nav2_amcl's node, and the example package of ROS 2 without ROS."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import math
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+import gpusense as gs
+
+PACKAGE = ROOT / "examples" / "ros2" / "gpusense_localization"
+from_nav2 = gs.compat.from_nav2
+
+
+def test_defaults_are_those_of_the_node() -> None:
+    options = from_nav2({"amcl": {"ros__parameters": {}}})
+    assert options.model == "likelihood_field" and options.weights == gs.compat.FieldWeights()
+    assert options.parameters == gs.LikelihoodFieldParameters(z_hit=0.5, z_rand=0.5, sigma_hit=0.2)
+    assert options.alpha == (0.2,) * 5 and options.particles == (500, 2000) and options.motion == "differential"
+    assert options.update_min == (0.25, 0.2) and options.recovery == (0.0, 0.0) and options.resample_interval == 1
+    assert options.range_limits == (None, 100.0) and options.initial_pose is None and options.ignored == ()
+
+
+FILE = """
+/robot:
+  amcl:
+    ros__parameters:
+      laser_model_type: beam
+      z_hit: 1.2
+      z_short: 0.2
+      z_max: 0.2
+      z_rand: 0.4
+      lambda_short: 1
+      robot_model_type: nav2_amcl::OmniMotionModel
+      recovery_alpha_slow: 0.001
+      recovery_alpha_fast: 0.1
+      set_initial_pose: true
+      initial_pose: {x: 1.5, y: -2, yaw: 0.5}
+      do_beamskip: false
+controller_server:
+  ros__parameters: {z_hit: 9.0}
+"""
+
+
+def test_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "nav2.yaml"
+    file.write_text(FILE)
+    options = from_nav2(file)
+    assert options.weights == gs.compat.BeamWeights(1.2, 0.2, 0.2, 0.4, 0.2, 1.0)
+    assert options.parameters.to_dict() == pytest.approx(gs.BeamParameters(0.6, 0.1, 0.1, 0.2, 0.2, 1.0).to_dict())
+    assert (options.motion, options.recovery, options.initial_pose) == ("omni", (0.001, 0.1), (1.5, -2.0, 0.5))
+    assert options.ignored == ("do_beamskip",)
+    grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]], 0.1), gs.Scanner([0.0], range_max=4.0)
+    ours = options.make_model(grid, scanner, backend="numpy")
+    own = gs.BeamModel(grid, scanner, options.parameters, backend="numpy")
+    theirs = options.make_model(grid, scanner, compat=True, backend="numpy")
+    peers = gs.BeamModel(grid, scanner, options.weights, compat="amcl", backend="numpy")
+    poses = [(0.35, 0.05, 0.0), (0.55, 0.05, 0.1)]
+    for one, two in ((ours, own), (theirs, peers)):
+        np.testing.assert_array_equal(one.log_likelihood(poses, [1.5]), two.log_likelihood(poses, [1.5]))
+
+
+def test_what_the_command_fit_wrote(tmp_path: Path) -> None:
+    from gpusense.commands.fit import parameters_yaml
+
+    rng = np.random.default_rng(0)
+    expected = rng.uniform(1, 9, 4000)
+    fit = gs.fit_beam_parameters(expected + 0.04 + rng.normal(0, 0.1, 4000), expected, 10.0, range_bias=True,
+                                 backend="numpy")  # fmt: skip
+    result: Any = SimpleNamespace(fit=fit, incidence=None, data=SimpleNamespace(range_max=10.0))
+    file = tmp_path / "parameters.yaml"
+    file.write_text(parameters_yaml(result))
+    options = from_nav2(file)
+    assert options.model == "beam" and options.parameters == fit.parameters and options.parameters.range_bias > 0
+    assert options.range_limits == (None, 10.0)
+    assert from_nav2({"beam_model": fit.parameters.to_dict()}).parameters == fit.parameters
+
+
+V, T = ValueError, TypeError
+CASES: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({}, V, "source: must hold amcl's ros__parameters, got the keys []"),
+    ({"bt": {"ros__parameters": {}}}, V, "source: must hold amcl's ros__parameters, got the keys ['bt']"),
+    ({"z_hit": "a"}, T, "source: z_hit: must be a real number, got 'a'"),
+    ({"max_particles": 2.5}, T, "source: max_particles: must be an integer, got 2.5"),
+    ({"max_particles": 100}, V, "min_particles: must be <= max_particles = 100, got 500"),
+    ({"tf_broadcast": 1}, T, "source: tf_broadcast: must be true or false, got 1"),
+    ({"scan_topic": 1}, T, "source: scan_topic: must be a string, got 1"),
+    ({"alpha1": -0.1}, V, "alpha1: must be finite and >= 0, got -0.1"),
+    ({"recovery_alpha_fast": 2.0}, V, "recovery_alpha_fast: must be finite and >= 0 and <= 1, got 2.0"),
+    ({"laser_model_type": "sonar"}, V,
+     "laser_model_type: must be one of 'beam', 'likelihood_field', 'likelihood_field_prob', got 'sonar'"),
+    ({"z_hit": 0.0, "z_rand": 0.0}, V, "z_hit + z_max + z_rand: must be > 0, got 0.0"),
+    ({"set_initial_pose": True, "initial_pose": 3}, T, "source: initial_pose: must be a mapping, got 3"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("values, error, text", CASES)
+def test_bad_parameters(values: dict[str, Any], error: type[Exception], text: str) -> None:
+    with pytest.raises(error) as raised:
+        from_nav2(values)
+    assert str(raised.value) == text
+
+
+def test_a_file_executes_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text("amcl: !!python/object/apply:os.system ['exit 1']")
+    with pytest.raises(ValueError, match="must be plain YAML"):
+        from_nav2(file)
+
+
+# ------------------------------------------------------------------------------------------------- the example
+
+
+@pytest.fixture
+def conversions(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    return importlib.import_module("gpusense_localization.conversions")
+
+
+@pytest.fixture
+def localizer(conversions: ModuleType) -> ModuleType:
+    return importlib.import_module("gpusense_localization.localizer")
+
+
+def test_the_node_compiles_and_reads_its_own_parameters() -> None:
+    for file in (PACKAGE / "gpusense_localization").glob("*.py"):
+        ast.parse(file.read_text())
+    assert from_nav2(PACKAGE / "config" / "amcl.yaml").ignored == ()
+
+
+def test_conversions(conversions: ModuleType) -> None:
+    pose, odometry = (3.0, -1.0, 2.5), (0.4, 0.2, -1.2)
+    fixed = conversions.map_to_odometry(pose, odometry)
+    np.testing.assert_allclose(conversions.compose(fixed, odometry), pose, atol=1e-12)
+    np.testing.assert_allclose(conversions.compose(pose, conversions.inverse(pose)), 0, atol=1e-12)
+    turned = SimpleNamespace(**conversions.quaternion_of(2.5))
+    assert conversions.yaw_of(turned) == pytest.approx(2.5)
+    covariance = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]])
+    numbers = conversions.covariance_fields(covariance)
+    assert len(numbers) == 36 and numbers[5] == 0.2 and numbers[35] == 3.0
+    np.testing.assert_array_equal(conversions.covariance_of(numbers), covariance)
+    message = SimpleNamespace(position=SimpleNamespace(x=0.0, y=0.0, z=9.0), orientation=SimpleNamespace(w=0.0))
+    assert conversions.pose_of(conversions.fill(message, conversions.pose_fields(pose))) == pytest.approx(pose)
+    cloud = conversions.cloud_fields(np.arange(30.0).reshape(10, 3), np.full(10, 0.1), most=4)
+    assert [each["pose"]["position"]["x"] for each in cloud] == [0.0, 9.0, 18.0, 27.0]
+    least = (0.25, 0.2)
+    assert not conversions.moved_enough((0, 0, 3.1), (0.2, 0.2, -3.1), least)
+    assert conversions.moved_enough((0, 0, 0), (0.0, -0.3, 0.0), least)
+    assert conversions.moved_enough((0, 0, 3.0), (0.0, 0.0, -3.0), least)
+
+
+class FakeFilter:
+    """A filter that records its calls, with the interface of gs.ParticleFilter."""
+
+    made: ClassVar[list[FakeFilter]] = []
+
+    def __init__(self, model: Any, **options: Any) -> None:
+        self.model, self.options, self.calls = model, options, []
+        FakeFilter.made.append(self)
+
+    def initialize(self, **start: Any) -> None:
+        self.calls.append(("initialize", start))
+
+    def initialize_uniform(self) -> None:
+        self.calls.append(("uniform",))
+
+    def predict(self, before: Any, after: Any) -> None:
+        self.calls.append(("predict", tuple(before), tuple(after)))
+
+    def correct(self, ranges: np.ndarray) -> None:
+        assert len(ranges) == self.model.scanner.count
+        self.calls.append(("correct", ranges))
+
+    def estimate(self) -> Any:
+        return SimpleNamespace(pose=np.array([1.0, 2.0, 0.5]), covariance=np.eye(3))
+
+
+def scan_of(count: int) -> Any:
+    return SimpleNamespace(angle_min=-math.pi, angle_increment=2 * math.pi / count, range_min=0.1, range_max=8.0,
+                           ranges=np.full(count, 2.0))  # fmt: skip
+
+
+def map_message() -> Any:
+    origin = SimpleNamespace(position=SimpleNamespace(x=0.0, y=0.0), orientation=SimpleNamespace(x=0.0, y=0.0, z=0.0,
+                             w=1.0))  # fmt: skip
+    info = SimpleNamespace(width=40, height=40, resolution=0.1, origin=origin)
+    cells = np.zeros((40, 40), np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    return SimpleNamespace(info=info, data=cells.ravel())
+
+
+def test_the_localizer_drives_a_filter(localizer: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeFilter.made = []
+    monkeypatch.setattr(gs, "ParticleFilter", FakeFilter, raising=False)
+    monkeypatch.setattr(gs, "OdometryMotion", lambda alpha: alpha, raising=False)
+    options = from_nav2({"max_particles": 900, "alpha1": 0.3, "recovery_alpha_slow": 0.01, "recovery_alpha_fast": 0.1})
+    own = localizer.Localizer(options, backend="numpy")
+    assert not own.update(scan_of(90), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    own.set_map(map_message())
+    assert own.update(scan_of(90), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    assert not own.update(scan_of(90), (0.1, 0.0, 0.0), (0.1, 0.0, 0.0))
+    assert own.update(scan_of(90), (0.3, 0.0, 0.0), (0.1, 0.0, 0.0))
+    (made,) = FakeFilter.made
+    assert [call[0] for call in made.calls] == ["uniform", "correct", "predict", "correct"]
+    assert made.calls[2] == ("predict", (0.0, 0.0, 0.0), (0.3, 0.0, 0.0))
+    assert made.options == dict(motion=(0.3, 0.2, 0.2, 0.2), particles=(500, 900), seed=0, recovery="augmented")
+    np.testing.assert_allclose(localizer.map_to_odometry((1.0, 2.0, 0.5), (0.3, 0.0, 0.0)), own.map_to_odometry())
+    for k, count in enumerate((91, 88, 90)):
+        assert own.update(scan_of(count), (1.0 + k, 0.0, 0.0), (0.1, 0.0, 0.0))
+    assert len(FakeFilter.made) == 2 and FakeFilter.made[1].calls[0][0] == "initialize"
+    assert np.isfinite(FakeFilter.made[1].calls[-1][1]).sum() == 90
+
+
+@pytest.mark.skipif(not hasattr(gs, "ParticleFilter"), reason="this version has no particle filter")
+def test_the_localizer_localises(localizer: ModuleType) -> None:
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1, "update_min_d": 0.05}), backend="numpy")
+    own.set_map(map_message())
+    own.start_at((1.0, 1.3, 0.2), np.diag([0.01, 0.01, 0.01]))
+    caster = gs.RayCaster(own.grid, range_max=8.0, backend="numpy")
+    for k in range(5):
+        message = scan_of(60)
+        truth = (1.05 + 0.1 * k, 1.25, 0.25)
+        bearings = gs.Scanner.from_laser_scan(message).bearings
+        message.ranges = caster.cast([truth], bearings)[0]
+        assert own.update(message, (0.1 * k * math.cos(0.25), -0.1 * k * math.sin(0.25), 0.0), (0.0, 0.0, 0.0))
+    assert np.hypot(*(np.asarray(own.estimate.pose)[:2] - truth[:2])) < 0.1

@@ -1,0 +1,181 @@
+"""Kernels of particle filters: published vectors, exact distributions, and the same bits on every backend."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gpusense.backends import get_backend
+from gpusense.interface import constants as c
+from gpusense.interface.launches import launch
+from gpusense.reference.drawing import draw_particles
+from gpusense.reference.elementary import angle_of, exp_of, log_of
+from gpusense.reference.motion import move_particles
+from gpusense.reference.philox import normal_pair, random_words, uniform_of
+
+PLAIN = frozenset()
+
+# Random123's known-answer tests (kat_vectors, philox4x32 10): counter, key, words.
+VECTORS = [
+    ("00000000 00000000 00000000 00000000", "00000000 00000000", "6627e8d5 e169c58d bc57ac4c 9b00dbd8"),
+    ("ffffffff ffffffff ffffffff ffffffff", "ffffffff ffffffff", "408f276d 41c83b0e a20bc7c6 6d5451fd"),
+    ("243f6a88 85a308d3 13198a2e 03707344", "a4093822 299f31d0", "d16cfe09 94fdcceb 5001e420 24126ea1"),
+]
+
+
+def words(text):
+    return tuple(int(word, 16) for word in text.split())
+
+
+@pytest.mark.parametrize(("counter", "key", "expected"), VECTORS)
+def test_random_words_are_the_published_ones(counter, key, expected):
+    found = random_words(tuple(np.array([word]) for word in words(counter)), *words(key))
+    assert tuple(int(word[0]) for word in found) == words(expected)
+
+
+def test_elementary_functions_are_right_to_a_few_units():
+    x = np.concatenate([-np.logspace(-300, 2.8, 4001), [0.0]])
+    np.testing.assert_allclose(exp_of(x), np.exp(x), rtol=4e-16)
+    assert exp_of(np.array([-701.0, -np.inf])).tolist() == [0.0, 0.0]
+    y = np.concatenate([np.logspace(-300, 300, 4001), 1 + np.linspace(-1e-3, 1e-3, 101)])
+    np.testing.assert_allclose(log_of(y), np.log(y), rtol=6e-16, atol=1e-19)
+    turn = np.linspace(-np.pi, np.pi, 4001)
+    np.testing.assert_allclose(angle_of(np.cos(turn), np.sin(turn)), np.arctan2(np.sin(turn), np.cos(turn)), rtol=1e-15)
+    assert angle_of(np.zeros(1), np.zeros(1))[0] == 0
+
+
+def test_deviates_are_uniform_and_standard_normal():
+    n, zero = np.arange(200_000), np.zeros(200_000)
+    found = random_words((n, zero, zero, zero), 7, 9)
+    assert stats.kstest(uniform_of(found[0]), "uniform").pvalue > 1e-3
+    one, two = normal_pair(found[0], found[1])
+    assert stats.kstest(one, "norm").pvalue > 1e-3 and stats.kstest(two, "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(one, two)[0, 1]) < 0.01
+    # Independent over steps and streams, too.
+    other = normal_pair(*random_words((n, zero + 1, zero, zero), 7, 9)[:2])[0]
+    assert abs(np.corrcoef(one, other)[0, 1]) < 0.01
+
+
+def settings_of_step(**values):
+    settings = np.zeros(c.SETTINGS)
+    settings[c.SEED], settings[c.STEP], settings[c.SCALE] = 5, 3, 2.0**30
+    settings[c.THRESHOLD], settings[c.SHARE] = 0.5, 0.2
+    for name, value in values.items():
+        place = getattr(c, name)
+        settings[place : place + np.size(value)] = value
+    return settings
+
+
+def test_moves_have_the_moments_of_the_model():
+    count = 200_000
+    pose = np.tile([1.0, 2.0, 0.5], count)
+    settings = settings_of_step(MEAN=[0.2, 1.0, 0.1, -0.3], DEVIATION=[0.0, 0.1, 0.05, 0.02])
+    move_particles(PLAIN, pose, settings, pose, count, c.STRAIGHT)
+    x, y, theta = pose.reshape(-1, 3).T
+    along, across = (np.cos(0.7), np.sin(0.7)), (-np.sin(0.7), np.cos(0.7))
+    ahead, left = (x - 1) * along[0] + (y - 2) * along[1], (x - 1) * across[0] + (y - 2) * across[1]
+    for value, mean, deviation in ((ahead, 1.0, 0.1), (left, 0.1, 0.05), (theta, 0.4, 0.02)):
+        assert stats.kstest((value - mean) / deviation, "norm").pvalue > 1e-3
+
+
+def test_an_arc_ends_where_the_velocity_model_says():
+    v, w, seconds = 1.5, 0.8, 0.7
+    pose = np.array([0.0, 0.0, 0.3])
+    settings = settings_of_step(MEAN=[w * seconds / 2, v * seconds, 0, 0])
+    move_particles(PLAIN, pose, settings, pose, 1, c.VELOCITY_MODEL)
+    end = 0.3 + w * seconds
+    radius = v / w
+    expected = [radius * (np.sin(end) - np.sin(0.3)), radius * (np.cos(0.3) - np.cos(end)), end]
+    np.testing.assert_allclose(pose, expected, atol=1e-14)
+
+
+def test_a_reverse_has_its_probability():
+    count = 100_000
+    pose = np.zeros(3 * count)
+    move_particles(PLAIN, pose, settings_of_step(MEAN=[0, 1.0, 0, 0], REVERSE=0.1), pose, count, c.STRAIGHT)
+    assert stats.binomtest(int((pose[::3] < 0).sum()), count, 0.1).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("stratified", [0.0, 1.0])
+def test_draws_keep_the_expected_copies(stratified):
+    count, repeats = 50, 400
+    weight = np.floor(np.random.default_rng(0).exponential(size=count) * 2.0**30)
+    weight[7] = 0
+    ends, copies = np.cumsum(weight), np.zeros(count)
+    source = np.zeros((count, 3))
+    source[:, 0] = np.arange(count)
+    state = np.zeros(c.STATE)
+    state[c.TOTAL], state[c.RESAMPLED] = ends[-1], 1.0
+    expected = count * weight / weight.sum()
+    for step in range(repeats):
+        target, after = np.zeros(3 * count), np.zeros(count)
+        draw_particles(
+            PLAIN, source.reshape(-1), weight, ends, settings_of_step(STEP=step, STRATIFIED=stratified), state,
+            np.zeros(3), target, after, count, count, 0,
+        )  # fmt: skip
+        found = np.bincount(target[::3].astype(int), minlength=count)
+        copies += found
+        if not stratified:
+            assert (np.abs(found - expected) < 1).all()
+    assert copies[7] == 0
+    np.testing.assert_allclose(copies / repeats, expected, atol=5 * np.sqrt(expected.max() / repeats))
+
+
+def run_step(selection, count, flags=PLAIN):
+    """Return all buffers after two motions, a correction of two stages and an estimate."""
+    device, rng = get_backend(selection), np.random.default_rng(0)
+    block = int(np.ceil(np.sqrt(count)))
+    blocks = -(-count // block)
+    settings = settings_of_step(
+        SEED=[123456789, 4000000000], MEAN=[0.1, 1, 0.02, -0.2], DEVIATION=[0.1, 0.2, 0.05, 0.1], REVERSE=0.1,
+        JITTER=0.2, FARTHEST_X=1, FARTHEST_THETA=0.5, POOL=[5, 0.1, 0.1, 3.0], SCALE=2.0**36,
+        PER_BEAM_SCALE=0.01, SLOW_RATE=0.05, FAST_RATE=0.3, MOST_INJECTED=0.3, TEMPERATURE=[0.7, 0.9],
+    )  # fmt: skip
+    state = np.zeros(c.STATE)
+    state[c.SLOW], state[c.FAST] = 0.9, 0.6
+    real = np.float64 if "FLOAT64" in flags else np.float32
+    buffers = dict(
+        settings=settings, state=state, a=rng.normal(size=3 * count), b=np.zeros(3 * count), before=np.ones(count),
+        first=(rng.normal(size=count) ** 2 * -30).astype(real), second=(rng.normal(size=count) ** 2 * -3).astype(real),
+        score=np.zeros(count), largest=np.zeros(count), sums=np.zeros(c.WEIGHT_SUMS * blocks), weight=np.zeros(count),
+        totals=np.zeros(c.WEIGHT_SUMS), ends=np.zeros(count), pool=rng.normal(size=15), estimate=np.zeros(c.ESTIMATE),
+    )  # fmt: skip
+    buffers["first"][:3] = -np.inf
+    on = {name: device.upload(values) for name, values in buffers.items()}
+    sizes, step = dict(particles=count, block=block), dict(settings=on["settings"])
+    program = [
+        launch("move_particles", PLAIN, (count,), source=on["a"], target=on["a"], particles=count, kind=kind, **step)
+        for kind in (c.STRAIGHT, c.VELOCITY_MODEL)
+    ]
+    for stage, (source, target) in enumerate((("a", "b"), ("b", "a"))):
+        for sensor, name in enumerate(("first", "second")):
+            program.append(launch("add_scores", flags, (blocks,), log_p=on[name], score=on["score"], sensor=sensor,
+                                  largest=on["largest"], **sizes, **step))  # fmt: skip
+        shared = dict(largest=on["largest"], sums=on["sums"], state=on["state"], blocks=blocks, stage=stage, **step)
+        scores = dict(score=on["score"], before=on["before"], **sizes)
+        program += [
+            launch("weigh_particles", PLAIN, (blocks,), **scores, **shared),
+            launch("sum_weights", PLAIN, (c.WEIGHT_SUMS,), totals=on["totals"], **shared),
+            launch("set_weights", PLAIN, (blocks,), totals=on["totals"], weight=on["weight"], ends=on["ends"], stages=2,
+                   **scores, **shared),
+            launch("draw_particles", PLAIN, (count,), source=on[source], target=on[target], weight=on["weight"],
+                   ends=on["ends"], state=on["state"], pool=on["pool"], after=on["before"], particles=count,
+                   drawn=count, stage=stage, **step),
+        ]  # fmt: skip
+    for again in (0, 1):
+        estimate = dict(sums=on["sums"], estimate=on["estimate"], poses=on["a"], again=again)
+        program.append(launch("sum_poses", PLAIN, (blocks,), weight=on["weight"], **sizes, **estimate))
+        program.append(launch("finish_estimate", PLAIN, (1,), blocks=blocks, **estimate))
+    device.run(tuple(program))
+    found = {name: device.download(on[name], np.empty_like(values)) for name, values in buffers.items()}
+    device.synchronize()
+    return found
+
+
+@pytest.mark.parametrize("count", [1, 37, 1500])
+@pytest.mark.parametrize("flags", [PLAIN, frozenset({"FLOAT64"})], ids=["float32", "float64"])
+def test_every_backend_has_the_bits_of_the_reference(backend, count, flags):
+    expected, found = run_step("numpy", count, flags), run_step(backend, count, flags)
+    for name, values in expected.items():
+        assert np.array_equal(values, found[name]), name

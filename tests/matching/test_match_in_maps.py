@@ -1,0 +1,105 @@
+"""Matches of scans to maps, and methods on maps of single scans."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support.matching_scenes import FRONT, RING, random_pairs
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.matching.options import MatchOptions
+from gpusense.matching.to_map import MapMatcher
+
+
+def drawn(origin=(0.0, 0.0, 0.0)):
+    """Return a map of 5 cm of a room with two blocks in a frame anywhere."""
+    cells = np.zeros((150, 190), int)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    cells[70:95, 120:140] = 100
+    cells[30:50, 40:55] = 100
+    return gs.OccupancyGrid(cells, resolution=0.05, origin=origin)
+
+
+def poses_in(grid, local):
+    """Return poses of the world from poses in the grid's frame."""
+    x0, y0, yaw = grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y, theta = local.T
+    return np.column_stack([x0 + c * x - s * y, y0 + s * x + c * y, theta + yaw])
+
+
+@pytest.fixture(scope="module")
+def local():
+    rng = np.random.default_rng(7)
+    return np.column_stack([rng.uniform(3.0, 5.5, 12), rng.uniform(2.6, 3.3, 12), rng.uniform(-3, 3, 12)])
+
+
+def scans_at(grid, poses):
+    return gs.RayCaster(grid, range_max=30.0, backend="numpy", precision="float64").cast(poses, RING.bearings)
+
+
+def errors(match, truth):
+    turn = np.angle(np.exp(1j * (match.pose[:, 2] - truth[:, 2])))
+    return np.hypot(*(match.pose - truth).T[:2]), np.abs(turn)
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e6, -4e6, 0.6)], ids=["near", "far and yawed"])
+def test_poor_guesses_in_a_map_are_corrected_to_a_fraction_of_a_cell(device, local, origin):
+    grid = drawn(origin)
+    truth = poses_in(grid, local)
+    rng = np.random.default_rng(1)
+    guess = truth + np.column_stack([rng.uniform(-0.5, 0.5, (12, 2)), np.radians(rng.uniform(-10, 10, 12))])
+    match = gs.match_scan(grid, scans_at(grid, truth), RING, guess, backend=device)
+    assert match.converged.all()
+    distance, turn = errors(match, truth)
+    assert np.median(distance) < 0.1 * grid.resolution
+    assert distance.max() < 0.5 * grid.resolution
+    assert np.degrees(np.median(turn)) < 0.02
+
+
+@pytest.mark.parametrize(("method", "cells"), [("gauss_newton", 1.0), ("correlative", 2.5)])
+def test_fields_find_poses_to_the_cell(device, local, method, cells):
+    grid = drawn((1.0, 2.0, 0.3))
+    truth = poses_in(grid, local)
+    match = gs.match_scan(
+        grid, scans_at(grid, truth), RING, truth + np.array([0.15, -0.1, 0.05]), method, backend=device
+    )
+    distance, turn = errors(match, truth)
+    assert np.median(distance) < cells * grid.resolution
+    assert np.median(turn) < 0.02
+    assert (np.linalg.eigvalsh(match.covariance) > 0).all()
+
+
+def test_the_search_returns_the_best_pose_of_its_grid(local):
+    """A correlative match is as good as every other pose of the window by its own integer scores: brute force."""
+    grid = drawn()
+    matcher = MapMatcher(grid, RING, get_backend("numpy"), "float32", MatchOptions(0.01, 1.0, (0.3, 0.1)))
+    scans = scans_at(grid, local[:2])
+    guess = local[:2] + np.array([0.1, 0.1, 0.05])
+    pose = matcher.searched(scans, guess)
+    original = matcher._search.find
+    matcher._search.find = lambda points, poses: original(points, poses, level=0)
+    np.testing.assert_array_equal(pose, matcher.searched(scans, guess))
+
+
+@pytest.mark.parametrize("method", ["gauss_newton", "correlative"])
+def test_methods_of_maps_match_scans_to_scans(method):
+    first, second, truth = random_pairs(2, FRONT, seed=8)
+    match = gs.match_scan(first, second, FRONT, truth + np.array([0.05, 0.05, 0.02]), method, backend="numpy")
+    distance, turn = errors(match, truth)
+    assert distance.max() < 0.1
+    assert turn.max() < 0.05
+
+
+def test_a_single_scan_gives_a_single_match(local):
+    grid = drawn()
+    scan = scans_at(grid, local[:1])[0]
+    match = gs.match_scan(grid, scan, RING, local[0], backend="numpy")
+    assert isinstance(match.status, str)
+    assert match.pose.shape == (3,)
+    with pytest.raises(ValueError, match="method"):
+        gs.match_scan(grid, scan, RING, local[0], "icp", backend="numpy")

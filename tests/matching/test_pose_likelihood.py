@@ -1,0 +1,116 @@
+"""Likelihoods over all poses of a map: the model's own values, entropy, modes, tiles and pictures."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+
+SCANNER = gs.Scanner.uniform(angle_min=-1.5, angle_increment=0.25, count=13, range_max=6.0)
+
+
+def room() -> gs.OccupancyGrid:
+    cells = np.pad(np.zeros((15, 23), int), 1, constant_values=100)
+    cells[1:9, 14] = 100
+    cells[12:14, 3:6] = -1
+    return gs.OccupancyGrid(cells, 0.2, (1e5, -3.0, 0.8))
+
+
+@pytest.mark.parametrize("kind", [gs.BeamModel, gs.LikelihoodFieldModel])
+def test_values_are_those_of_the_model(backend, kind, monkeypatch):
+    monkeypatch.setattr("gpusense.matching.pose_likelihood._TILE", 500)
+    grid = room()
+    model = kind(grid, SCANNER, backend=backend)
+    (xy,) = grid.cell_centers([5], [8])
+    ranges = gs.BeamModel(grid, SCANNER, backend="numpy").expected_ranges(np.array([[*xy, 0.7]]))[0]
+    p = gs.pose_likelihood(model, ranges, resolution=0.4, headings=9)
+    assert p.log_p.shape == (9, 13, 9) and p.resolution == pytest.approx(0.4)
+    rows, cols = np.mgrid[1:18:2, 1:26:2]
+    centers = grid.cell_centers(rows.ravel(), cols.ravel())
+    turns = 2 * math.pi / 9 * np.arange(9)
+    poses = np.array([(x, y, turn) for x, y in centers for turn in turns])
+    np.testing.assert_array_equal(p.log_p.ravel(), model.log_likelihood(poses, ranges))
+    np.testing.assert_allclose(p.poses(rows[:, :, None] // 2, cols[:, :, None] // 2, np.arange(9)), poses, atol=1e-9)
+    probability = np.exp(p.log_p.astype(np.float64) - p.log_p.max())
+    probability /= probability.sum()
+    np.testing.assert_allclose(p.probability, probability, atol=1e-12)
+    np.testing.assert_allclose(p.marginal, probability.sum(axis=2), atol=1e-12)
+    assert p.entropy == pytest.approx(-(probability * np.log(np.where(probability > 0, probability, 1))).sum())
+    assert p.log_evidence == pytest.approx(np.log(np.exp(p.log_p.astype(float)).mean()), rel=1e-5)
+
+
+def test_free_positions_alone_and_a_scan_that_says_nothing():
+    grid = room()
+    model = gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy")
+    p = gs.pose_likelihood(model, np.full(13, np.nan), resolution=0.2, headings=4, positions="free")
+    np.testing.assert_array_equal(np.isnan(p.log_p), np.repeat(~grid.free[:, :, None], 4, axis=2))
+    assert p.entropy == pytest.approx(math.log(4 * grid.free.sum()))
+    assert p.log_evidence == pytest.approx(0.0)
+
+
+def test_modes_are_local_maxima():
+    cells = np.pad(np.zeros((20, 40), int), 1, constant_values=100)
+    grid = gs.OccupancyGrid(cells, 0.1)
+    model = gs.LikelihoodFieldModel(grid, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend="numpy")
+    pose = np.array([1.25, 0.85, 0.0])
+    ranges = gs.BeamModel(grid, SCANNER, backend="numpy").expected_ranges(pose[None])[0]
+    p = gs.pose_likelihood(model, ranges, resolution=0.1, headings=36)
+    poses, log_p = p.modes(2, radius=0.6, angle=0.6)
+    assert log_p[0] == p.log_p.max() and log_p[0] >= log_p[1]
+    # A rectangle looks the same from the other side.
+    assert np.abs(poses[:, 0] + poses[::-1, 0] - 4.2).max() < 0.25
+    assert abs(abs(math.remainder(poses[0, 2] - poses[1, 2], 2 * math.pi)) - math.pi) < 0.2
+    many, values = p.modes(30)
+    assert (np.diff(values) <= 0).all() and len(many) == len(values) > 2
+    assert len(p.modes(1)[1]) == 1
+
+
+def test_impossible_scans_have_no_modes():
+    grid = gs.OccupancyGrid(np.zeros((3, 3), int), 1.0)
+    parameters = gs.BeamParameters(z_hit=1.0, z_short=0.0, z_max=0.0, z_rand=0.0, sigma_hit=1e-4)
+    model = gs.BeamModel(grid, gs.Scanner([0.0], range_max=4.0), parameters, backend="numpy")
+    p = gs.pose_likelihood(model, [1.0], resolution=1.0, headings=2)
+    if np.isneginf(p.log_p).all():
+        assert p.entropy == 0 and p.log_evidence == -np.inf and p.marginal.sum() == 0 and len(p.modes()[1]) == 0
+    else:
+        assert np.isfinite(p.log_evidence)
+
+
+def test_pictures_are_written(tmp_path):
+    model = gs.LikelihoodFieldModel(room(), SCANNER, backend="numpy")
+    p = gs.pose_likelihood(model, np.full(13, 1.0), resolution=0.4, headings=8, positions="free")
+    p.plot(tmp_path / "map.png")
+    assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
+    ax = gs.plots.new_figure(4.0, 3.0).subplots()
+    best = np.nan_to_num(p.log_p, nan=-np.inf).max(axis=2)
+    image = gs.plots.draw_pose_likelihood(ax, p, depth=5.0).get_array()
+    assert image.argmax() == best.argmax() and image.max() == 0 and image.min() >= -5
+
+
+def test_fields_of_maps_and_scans_are_drawn():
+    ax = gs.plots.new_figure(4.0, 3.0).subplots()
+    grid = room()
+    field = gs.plots.draw_likelihood_field(ax, grid).get_array()
+    np.testing.assert_array_equal(field == field.max(), grid.occupied)
+    scan = gs.plots.draw_scan_field(ax, np.full(13, 1.0), SCANNER, resolution=0.1).get_array()
+    ends = np.floor(np.stack([np.cos(SCANNER.bearings), np.sin(SCANNER.bearings)], axis=1) / 0.1)
+    assert np.count_nonzero(scan == scan.max()) == len({tuple(end) for end in ends})
+    with pytest.raises(ValueError, match=r"^ranges: must have a range"):
+        gs.plots.draw_scan_field(ax, np.full(13, np.inf), SCANNER)
+
+
+def test_bad_arguments_are_named():
+    model, ranges = gs.LikelihoodFieldModel(room(), SCANNER, backend="numpy"), np.ones(13)
+    for options, name in [({"resolution": 0}, "resolution"), ({"headings": 0}, "headings"),
+                          ({"positions": "x"}, "positions")]:  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{name}:"):
+            gs.pose_likelihood(model, ranges, **options)
+    with pytest.raises(ValueError, match=r"^ranges:"):
+        gs.pose_likelihood(model, ranges[1:])
+    with pytest.raises(TypeError, match=r"^model:"):
+        gs.pose_likelihood(room(), ranges)
+    with pytest.raises(ValueError, match=r"^resolution: there must be at most"):
+        gs.pose_likelihood(model, ranges, resolution=0.2, headings=1 << 22)

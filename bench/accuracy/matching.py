@@ -156,14 +156,16 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--recorded", type=Path, help="folder of recorded data; without it generated buildings alone")
     parser.add_argument("--matches", type=int, default=300, help="most matches of a row (default: %(default)s)")
+    parser.add_argument("--rows", action="append", choices=("pairs", "simulated", "map"), help="default: all")
     parser.add_argument("--repeats", type=int, default=3, help="timed calls of each row (default: %(default)s)")
     arguments: argparse.Namespace = parse(parser, argv)
     global REPEATS
     REPEATS = arguments.repeats
     data, backend, most = arguments.recorded, arguments.backend, arguments.matches
-    rows = [] if data is None else recorded(data, backend, most)
-    rows += simulated(data, backend, most, arguments.seed)
-    rows += [] if data is None else in_maps(data, backend, most, arguments.seed)
+    chosen = arguments.rows or ["pairs", "simulated", "map"]
+    rows = [] if data is None or "pairs" not in chosen else recorded(data, backend, most)
+    rows += simulated(data, backend, most, arguments.seed) if "simulated" in chosen else []
+    rows += [] if data is None or "map" not in chosen else in_maps(data, backend, most, arguments.seed)
     lines = [
         [
             r["what"], r["set"], r["guess"], str(r["matches"]), f"{r['median_mm']:.1f} / {r['p95_mm']:.0f}",

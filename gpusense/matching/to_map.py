@@ -33,6 +33,8 @@ _RANDOM = 0.2
 _LEAST_CELLS, _ITERATIONS, _SMALL = 1.5, 15, 1e-4
 # A score below this is a failure. Least hits, and least pairs and share of pairs that observe a direction.
 _POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 8, 2.0, 0.01
+# In maps drawn of end points, readings end this far behind surfaces; most that field and expected scan differ [cells].
+_BEHIND, _MOST_OFF = 0.1, 3.0
 # Positions and headings of a search: cells apart, and points apart at a scan's rms range; most levels of its tables.
 _SEARCH_CELL, _LEVELS = 0.1, 4
 
@@ -87,19 +89,37 @@ class MapMatcher:
         """Match to expected scans at the guesses, then at the poses found; search the map where that fails."""
         found = self._to_expected(ranges, self._to_expected(ranges, guess, "auto").pose, "icp")
         poor = np.flatnonzero((found.score < DOUBTFUL) & (self._hits(ranges).sum(axis=1) >= _FEW))
-        if not len(poor):
-            return found
-        pose = self.refined(ranges[poor], self.searched(ranges[poor], guess[poor]))[0]
-        again = self._to_expected(ranges[poor], pose, "icp")
-        return found.replaced(poor, again, again.score > found.score[poor])
+        if len(poor):
+            pose = self.refined(ranges[poor], self.searched(ranges[poor], guess[poor]))[0]
+            again = self._to_expected(ranges[poor], pose, "icp")
+            found = found.replaced(poor, again, again.score > found.score[poor])
+        behind = np.flatnonzero(self._behind_surfaces(ranges, found.pose) & found.converged)
+        if len(behind):
+            pose, iterations, calm = self.refined(ranges[behind], found.pose[behind], finest=True)
+            centred = self._finished(ranges[behind], pose, iterations, calm, "gauss_newton")
+            off = np.abs(pose - found.pose[behind])[:, :2].max(axis=1)
+            found = found.replaced(behind, centred, centred.converged & (off < _MOST_OFF * self._grid.resolution))
+        return found
+
+    def _behind_surfaces(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return whether end points lie behind the surfaces of occupied cells, as in maps drawn of end points."""
+        off = ranges - self._caster.cast(self._sensors(pose), self._scanner.bearings)
+        near = self._hits(ranges) & (np.abs(off) < max(0.3 * self._options.capture, 3 * self._grid.resolution))
+        with np.errstate(invalid="ignore"):
+            typical = np.array([np.median(row[use]) if use.any() else 0.0 for row, use in zip(off, near, strict=True)])
+        behind: np.ndarray = typical > _BEHIND * self._grid.resolution
+        return behind
+
+    def _sensors(self, pose: np.ndarray) -> np.ndarray:
+        """Return the poses of the sensor."""
+        x, y, yaw = self._scanner.mount
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        return pose + np.stack([c * x - s * y, s * x + c * y, np.full(len(pose), yaw)], axis=1)
 
     def _to_expected(self, ranges: np.ndarray, pose: np.ndarray, method: str) -> ScanMatch:
         """Match readings to the expected readings at poses."""
         scanner = self._scanner
-        x, y, yaw = scanner.mount
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        sensor = pose + np.stack([c * x - s * y, s * x + c * y, np.full(len(pose), yaw)], axis=1)
-        expected = self._caster.cast(sensor, scanner.bearings)
+        expected = self._caster.cast(self._sensors(pose), scanner.bearings)
         points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), scanner, self._real)
         pairs = np.arange(2 * len(pose)).reshape(2, -1).T
         local = match_pairs(
@@ -107,11 +127,13 @@ class MapMatcher:
         )
         return local.moved(pose)
 
-    def refined(self, ranges: np.ndarray, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def refined(
+        self, ranges: np.ndarray, guess: np.ndarray, *, finest: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return poses of maximal likelihood from coarse to fine, iterations, and whether the last step was small."""
         pose, count = guess.copy(), np.zeros(len(guess))
         calm = np.zeros(len(guess), bool)
-        for model in self._models:
+        for model in self._models[-1:] if finest else self._models:
             pose, iterations, calm = _climb(model, ranges, pose)
             count += iterations
         pose[:, 2] = wrapped(pose[:, 2])

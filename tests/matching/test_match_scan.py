@@ -131,6 +131,13 @@ def test_a_symmetrical_room_stays_near_its_guess():
     np.testing.assert_allclose(match.pose[2], math.pi / 2 + 0.1, atol=2e-3)
 
 
+def test_a_temperature_divides_the_covariance():
+    scans = [segments_scan(ROOM, pose, RING) for pose in ((0.0, 0.0, 0.0), (0.1, 0.0, 0.1))]
+    one, tenth = (gs.match_scan(*scans, RING, backend="numpy", temperature=value) for value in (1.0, 0.1))
+    np.testing.assert_allclose(tenth.covariance, 10 * one.covariance)
+    np.testing.assert_array_equal(tenth.pose, one.pose)
+
+
 def test_what_the_reference_did_not_see_neither_attracts_nor_repels():
     """A scan of 181 beams is matched to the part of it that the other one sees."""
     first, second = (segments_scan(ROOM, pose, FRONT) for pose in ((0.0, 0.0, 0.0), (0.1, 0.1, 0.6)))
@@ -147,6 +154,7 @@ def test_what_the_reference_did_not_see_neither_attracts_nor_repels():
         (dict(method="csm"), ValueError, "method"),
         (dict(noise=-1.0), ValueError, "noise"),
         (dict(capture=0.0), ValueError, "capture"),
+        (dict(temperature=0.0), ValueError, "temperature"),
         (dict(window=(1.0,)), ValueError, "window"),
         (dict(window=(100.0, 0.1)), ValueError, "window"),
         (dict(reference=np.ones(3)), ValueError, "reference"),

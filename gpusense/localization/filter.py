@@ -440,6 +440,13 @@ class ParticleFilter:
             summary.degenerate, self._shown,
         )  # fmt: skip
 
+    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
+        self._check_started()
+        self.flush()
+        numbers = self._cloud.estimate(self._shown)
+        return numbers[:3].copy(), covariance_of(numbers)
+
     @property
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""

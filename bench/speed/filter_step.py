@@ -1,7 +1,7 @@
 """Measure a step of the particle filter: predict, score, normalise, resample, estimate.
 
-The scene is a generated building, the cloud that of a tracked robot. ``one stage`` is the plain filter; ``default`` has up to
-four stages, of which a step takes those that the cloud needs.
+The scene is a generated building, the cloud that of a tracked robot. One stage is the plain filter; the default is up
+to four stages, of which a step on a processor takes those that the cloud needs.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def main() -> None:
             one = measure(args.backend, particles, beams, stages, max(args.steps * 2000 // particles, 10))
             rows.append(one)
             print(
-                f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | {one['start']} |",
+                f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
+                f"{one['start']} |",
                 flush=True,
             )
     print(f"\n{machine_line()}")

@@ -230,7 +230,7 @@ class Cloud:
         return next(reversed(self._recordings.values()))[0].explain()
 
     def resized(self, drawn: int) -> None:
-        """Set the number of particles to ``drawn``, the draws of the last step."""
+        """Set the number of particles, after a step that has drawn that number."""
         self.count = drawn
         self.block = max(math.ceil(math.sqrt(drawn)), 16)
 

@@ -78,14 +78,11 @@ class ParticleFilter:
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> grid = gs.OccupancyGrid([[0] * 40 + [100]])
-        >>> scanner = gs.Scanner([0.0], range_max=4.0)
-        >>> model = gs.BeamModel(grid, scanner, backend="numpy")
+        >>> model = gs.PositionModel(gs.PositionParameters(sigma=0.1), backend="numpy")
         >>> pf = gs.ParticleFilter(model, particles=500, seed=1)
-        >>> pf.initialize(mean=(0.5, 0.02, 0.0), covariance=np.diag([0.04, 1e-6, 1e-6]))
-        >>> pf.predict((0, 0, 0), (0.5, 0, 0))
-        >>> pf.correct([1.0])
-        >>> abs(float(pf.estimate().pose[0]) - 1.0) < 0.1
+        >>> pf.initialize(mean=(0.5, 0.0, 0.0), covariance=np.diag([0.04, 0.04, 1e-6]))
+        >>> pf.predict((0, 0, 0), (0.5, 0, 0)); pf.correct(np.array([1.0, 0.0]))
+        >>> bool(abs(pf.estimate().pose[0] - 1.0) < 0.1)
         True
     """
 
@@ -439,6 +436,13 @@ class ParticleFilter:
             pose, covariance, size, self._verdict.lost, explained, self.temperatures[0], summary.temperature,
             summary.degenerate, self._shown,
         )  # fmt: skip
+
+    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
+        self._check_started()
+        self.flush()
+        numbers = self._cloud.estimate(self._shown)
+        return numbers[:3].copy(), covariance_of(numbers)
 
     @property
     def temperatures(self) -> tuple[float, ...]:

@@ -39,6 +39,11 @@ class MotionFit:
         reversed_steps: Steps in which the odometer's translation had the wrong sign.
         inflation: Factor of the variances, by the autocorrelation of errors; ``motion`` has it.
         log_likelihood: Of all steps before the inflation, natural logarithm up to a constant.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.MotionFit(gs.OdometryMotion(), 100, 0, 1.5, 42.0).inflation
+        1.5
     """
 
     motion: OdometryMotion

@@ -41,6 +41,14 @@ def exp_of(x: np.ndarray) -> np.ndarray:
     return np.where(x > LEAST_EXPONENT, (1.0 + (r + r * r * series)) * power, 0.0)
 
 
+def odd_series(z: np.ndarray) -> np.ndarray:
+    """Return the power series of the logarithm and of the angle."""
+    series = np.full_like(z, ODD[0])
+    for term in ODD[1:]:
+        series = series * z + term
+    return series
+
+
 def log_of(x: np.ndarray) -> np.ndarray:
     """Return ``log(x)`` of a normal number x > 0."""
     bits = np.asarray(x, np.float64).view(np.int64)
@@ -51,10 +59,7 @@ def log_of(x: np.ndarray) -> np.ndarray:
     exponent = np.where(small, exponent, exponent + 1.0)
     s = (m - 1.0) / (m + 1.0)
     z = s * s
-    series = np.full_like(z, ODD[0])
-    for term in ODD[1:]:
-        series = series * z + term
-    return exponent * LOG2_HIGH + (2.0 * s + (2.0 * s * z * series + exponent * LOG2_LOW))
+    return exponent * LOG2_HIGH + (2.0 * s + (2.0 * s * z * odd_series(z) + exponent * LOG2_LOW))
 
 
 def angle_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -65,10 +70,7 @@ def angle_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     for _ in range(2):
         t = t / (1.0 + np.sqrt(1.0 + t * t))
     z = -(t * t)
-    series = np.full_like(z, ODD[0])
-    for term in ODD[1:]:
-        series = series * z + term
-    angle = 4.0 * (t + t * z * series)
+    angle = 4.0 * (t + t * z * odd_series(z))
     angle = np.where(size_y > size_x, QUARTER - angle, angle)
     angle = np.where(x < 0.0, HALF_TURN - angle, angle)
     return np.where(y < 0.0, -angle, angle)

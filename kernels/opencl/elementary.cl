@@ -12,15 +12,29 @@
 #define RIGHT_ANGLE 1.5707963267948966
 #define HALF_TURN 3.141592653589793
 // 1 / n! for n = 13, ..., 2, and 1 / (2 n + 1) for n = 11, ..., 1.
-constant double EXP[12] = {
-    1.6059043836821613e-10, 2.08767569878681e-09, 2.505210838544172e-08, 2.755731922398589e-07, 2.7557319223985893e-06,
-    2.48015873015873e-05, 0.0001984126984126984, 0.001388888888888889, 0.008333333333333333, 0.041666666666666664,
-    0.16666666666666666, 0.5,
-};
-constant double ODD[11] = {
-    0.043478260869565216, 0.047619047619047616, 0.05263157894736842, 0.058823529411764705, 0.06666666666666667,
-    0.07692307692307693, 0.09090909090909091, 0.1111111111111111, 0.14285714285714285, 0.2, 0.3333333333333333,
-};
+#define EXP_0 1.6059043836821613e-10
+#define EXP_1 2.08767569878681e-09
+#define EXP_2 2.505210838544172e-08
+#define EXP_3 2.755731922398589e-07
+#define EXP_4 2.7557319223985893e-06
+#define EXP_5 2.48015873015873e-05
+#define EXP_6 0.0001984126984126984
+#define EXP_7 0.001388888888888889
+#define EXP_8 0.008333333333333333
+#define EXP_9 0.041666666666666664
+#define EXP_10 0.16666666666666666
+#define EXP_11 0.5
+#define ODD_0 0.043478260869565216
+#define ODD_1 0.047619047619047616
+#define ODD_2 0.05263157894736842
+#define ODD_3 0.058823529411764705
+#define ODD_4 0.06666666666666667
+#define ODD_5 0.07692307692307693
+#define ODD_6 0.09090909090909091
+#define ODD_7 0.1111111111111111
+#define ODD_8 0.14285714285714285
+#define ODD_9 0.2
+#define ODD_10 0.3333333333333333
 
 // Return exp(x) for x <= 700; 0 below LEAST_EXPONENT.
 double exp_of(const double x) {
@@ -28,11 +42,16 @@ double exp_of(const double x) {
     // 1.5 * 2^52: a sum with it is rounded to an integer.
     const double count = (held * INVERSE_LOG2 + 6755399441055744.0) - 6755399441055744.0;
     const double r = (held - count * LOG2_HIGH) - count * LOG2_LOW;
-    double series = EXP[0];
-#pragma unroll
-    for (int i = 1; i < 12; i++) series = series * r + EXP[i];
+    const double high = ((((EXP_0 * r + EXP_1) * r + EXP_2) * r + EXP_3) * r + EXP_4) * r + EXP_5;
+    const double series = (((((high * r + EXP_6) * r + EXP_7) * r + EXP_8) * r + EXP_9) * r + EXP_10) * r + EXP_11;
     const double power = as_double(((long)count + 1023) << 52);
     return x > LEAST_EXPONENT ? (1.0 + (r + r * r * series)) * power : 0.0;
+}
+
+// Return the power series of the logarithm and of the angle.
+double odd_series(const double z) {
+    const double high = (((ODD_0 * z + ODD_1) * z + ODD_2) * z + ODD_3) * z + ODD_4;
+    return (((((high * z + ODD_5) * z + ODD_6) * z + ODD_7) * z + ODD_8) * z + ODD_9) * z + ODD_10;
 }
 
 // Return log(x) of a normal number x > 0.
@@ -44,9 +63,7 @@ double log_of(const double x) {
     const double scaled = small ? 2.0 * m : m;
     const double s = (scaled - 1.0) / (scaled + 1.0);
     const double z = s * s;
-    double series = ODD[0];
-#pragma unroll
-    for (int i = 1; i < 11; i++) series = series * z + ODD[i];
+    const double series = odd_series(z);
     return exponent * LOG2_HIGH + (2.0 * s + (2.0 * s * z * series + exponent * LOG2_LOW));
 }
 
@@ -58,9 +75,7 @@ double angle_of(const double x, const double y) {
     t = t / (1.0 + sqrt(1.0 + t * t));
     t = t / (1.0 + sqrt(1.0 + t * t));
     const double z = -(t * t);
-    double series = ODD[0];
-#pragma unroll
-    for (int i = 1; i < 11; i++) series = series * z + ODD[i];
+    const double series = odd_series(z);
     double angle = 4.0 * (t + t * z * series);
     angle = size_y > size_x ? RIGHT_ANGLE - angle : angle;
     angle = x < 0.0 ? HALF_TURN - angle : angle;

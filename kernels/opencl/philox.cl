@@ -16,6 +16,7 @@
 uint4 random_words(const uint4 counter, const uint key_0, const uint key_1) {
     uint4 c = counter;
     uint k0 = key_0, k1 = key_1;
+#pragma unroll
     for (int i = 0; i < ROUNDS; i++) {
         const uint high_0 = mul_hi(c.x, MULTIPLIER_0), low_0 = c.x * MULTIPLIER_0;
         const uint high_1 = mul_hi(c.z, MULTIPLIER_1), low_1 = c.z * MULTIPLIER_1;

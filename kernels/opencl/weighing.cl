@@ -72,21 +72,27 @@ kernel void weigh_particles(global const double *score, global const double *bef
     if (begin >= particles) return;
     const double high = largest_of(largest, blocks), left = left_of(state, stage), scale = settings[SCALE];
     const int end = min(begin + block, particles);
-    double weights[RUNGS], squares[RUNGS], old = 0.0;
-    for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
+    // A vector of RUNGS numbers: processors compute four or eight of them at once.
+    double8 weights = 0.0, squares = 0.0;
+    double old = 0.0;
     for (int n = begin; n < end; n++) {
-        double likelihood = tempered(score[n], high, left);
+        double8 likelihood;
+        likelihood.s0 = tempered(score[n], high, left);
+        likelihood.s1 = sqrt(likelihood.s0);
+        likelihood.s2 = sqrt(likelihood.s1);
+        likelihood.s3 = sqrt(likelihood.s2);
+        likelihood.s4 = sqrt(likelihood.s3);
+        likelihood.s5 = sqrt(likelihood.s4);
+        likelihood.s6 = sqrt(likelihood.s5);
+        likelihood.s7 = sqrt(likelihood.s6);
         old += floor(before[n] * scale);
-#pragma unroll
-        for (int k = 0; k < RUNGS; k++) {
-            const double weight = before[n] * likelihood;
-            weights[k] += floor(weight * scale);
-            squares[k] += floor(weight * weight * scale);
-            likelihood = sqrt(likelihood);
-        }
+        const double8 weight = before[n] * likelihood;
+        weights += floor(weight * scale);
+        squares += floor(weight * weight * scale);
     }
     global double *row = sums + (long)b * WEIGHT_SUMS;
-    for (int k = 0; k < RUNGS; k++) row[k] = weights[k], row[RUNGS + k] = squares[k];
+    vstore8(weights, 0, row);
+    vstore8(squares, 0, row + RUNGS);
     row[2 * RUNGS] = old;
 }
 

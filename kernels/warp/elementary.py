@@ -50,6 +50,15 @@ def exp_of(x: wp.float64):
     return wp.where(x > LEAST_EXPONENT, (ONE + (r + r * r * series)) * power, ZERO)
 
 
+# Return the power series of the logarithm and of the angle.
+@wp.func
+def odd_series(z: wp.float64):
+    series = ODD[0]
+    for i in range(1, 11):
+        series = series * z + ODD[i]
+    return series
+
+
 # Return log(x) of a normal number x > 0.
 @wp.func
 def log_of(x: wp.float64):
@@ -60,10 +69,7 @@ def log_of(x: wp.float64):
     scaled = wp.where(small, TWO * m, m)
     s = (scaled - ONE) / (scaled + ONE)
     z = s * s
-    series = ODD[0]
-    for i in range(1, 11):
-        series = series * z + ODD[i]
-    return exponent * LOG2_HIGH + (TWO * s + (TWO * s * z * series + exponent * LOG2_LOW))
+    return exponent * LOG2_HIGH + (TWO * s + (TWO * s * z * odd_series(z) + exponent * LOG2_LOW))
 
 
 # Return the angle of a vector in [-pi, pi]; 0 for the vector 0.
@@ -76,10 +82,7 @@ def angle_of(x: wp.float64, y: wp.float64):
     t = t / (ONE + wp.sqrt(ONE + t * t))
     t = t / (ONE + wp.sqrt(ONE + t * t))
     z = -(t * t)
-    series = ODD[0]
-    for i in range(1, 11):
-        series = series * z + ODD[i]
-    angle = FOUR * (t + t * z * series)
+    angle = FOUR * (t + t * z * odd_series(z))
     angle = wp.where(size_y > size_x, QUARTER - angle, angle)
     angle = wp.where(x < ZERO, HALF_TURN - angle, angle)
     return wp.where(y < ZERO, -angle, angle)

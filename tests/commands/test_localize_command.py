@@ -34,7 +34,7 @@ def place(tmp_path_factory):
         ranges = caster.cast(pose[None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS))
         numbers = [*ranges, *pose, *odometry]
         lines.append(f"FLASER 181 {' '.join(f'{value:.4f}' for value in numbers)} {step}.0 robot {step}.0")
-        pose = gs.compose_poses(pose, np.add((0.2, 0, 0.1), rng.normal(0, 0.01, 3)))
+        pose = gs.compose_poses(pose, rng.normal((0.2, 0, 0.1), 0.01))
         odometry = gs.compose_poses(odometry, (0.2, 0, 0.1))
     (folder / "run.log").write_text("\n".join(lines))
     (folder / "poses.yaml").write_text(

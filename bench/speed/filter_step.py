@@ -1,0 +1,73 @@
+"""Measure a step of the particle filter: predict, score, normalise, resample, estimate.
+
+The scene is a generated building, the cloud that of a tracked robot. One stage is the plain filter; the default is up
+to four stages, of which a step on a processor takes those that the cloud needs.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import json
+
+import numpy as np
+from common import make_parser
+
+import gpusense as gs
+from gpusense.evaluation.machine import machine, machine_line
+from gpusense.evaluation.worlds import building
+
+SIZES = ((2000, 60), (4000, 60), (100_000, 60))
+
+
+def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -> dict[str, object]:
+    """Return the median and least milliseconds of a step."""
+    grid = building()
+    scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
+    model = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    row, column = (int(index[len(index) // 2]) for index in np.nonzero(grid.free))
+    x0, y0, _ = grid.origin
+    pose = np.array([x0 + (column + 0.5) * grid.resolution, y0 + (row + 0.5) * grid.resolution, 0.3])
+    ranges = gs.RayCaster(grid, range_max=20.0, backend=backend).cast(pose[None], scanner.bearings)[0]
+    pf = gs.ParticleFilter(model, particles=particles, temperature=0.2, stages=stages)
+    pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.002]))
+    times = []
+    for _ in range(steps + 5):
+        begin = time.perf_counter()
+        pf.predict((0, 0, 0), (0, 0, 0))
+        pf.correct(ranges)
+        pf.mean_and_covariance()
+        times.append((time.perf_counter() - begin) * 1000)
+    late = times[5:]
+    return dict(
+        backend=backend, particles=particles, beams=beams, stages=stages, median_ms=float(np.median(late)),
+        least_ms=min(late), start=pf.explain(),
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = make_parser(__doc__, backend="auto")
+    parser.add_argument("--steps", type=int, default=100)
+    args = parser.parse_args()
+    rows = []
+    print("| particles x beams | stages | median ms | least ms | start |\n| --- | --- | --- | --- | --- |")
+    for particles, beams in SIZES:
+        for stages in (1, 4):
+            one = measure(args.backend, particles, beams, stages, max(args.steps * 2000 // particles, 10))
+            rows.append(one)
+            print(
+                f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
+                f"{one['start']} |",
+                flush=True,
+            )
+    print(f"\n{machine_line()}")
+    if args.output is not None:
+        Path(args.output).with_suffix(".json").write_text(json.dumps(dict(machine=machine(), rows=rows), indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -51,11 +51,12 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
 
 def main() -> None:
     parser = make_parser(__doc__, backend="auto")
-    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--steps", type=int, default=100, help="steps of 2000 particles; larger clouds take fewer")
+    parser.add_argument("--size", type=int, nargs=2, action="append", metavar=("PARTICLES", "BEAMS"), help="repeatable")
     args = parser.parse_args()
     rows = []
     print("| particles x beams | stages | median ms | least ms | start |\n| --- | --- | --- | --- | --- |")
-    for particles, beams in SIZES:
+    for particles, beams in args.size or SIZES:
         for stages in (1, 4):
             one = measure(args.backend, particles, beams, stages, max(args.steps * 2000 // particles, 10))
             rows.append(one)

@@ -57,7 +57,7 @@ def track(data, model, limit, **options):
         d[2] = gs.wrap_angle(d[2])
         squared = d @ np.linalg.solve(e.covariance + 1e-12 * np.eye(3), d)
         # Rank of the true x among weighted particles, for a histogram that is flat where weights are right.
-        weights, x = np.asarray(pf.weights), np.asarray(pf.particles)[:, 0]
+        weights, x = pf.host_weights(), pf.host_particles()[:, 0]
         rank = float(weights[x < scans[at].pose[0]].sum())
         rows.append((np.hypot(d[0], d[1]), abs(d[2]), squared, e.lost, e.temperature, e.explained, rank))
     return np.array(rows, float), (time.perf_counter() - begin) / len(odd) * 1000

@@ -472,6 +472,13 @@ class ParticleFilter:
         self.flush()
         return self._cloud.host_poses(self._cloud.shown, self._shown)
 
+    def host_weights(self) -> np.ndarray:
+        """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
+        self._check_started()
+        self.flush()
+        weights = self._cloud.host_weights(self._shown)
+        return weights / weights.sum()
+
     @property
     def particles(self) -> Any:
         """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
@@ -481,13 +488,12 @@ class ParticleFilter:
 
     @property
     def weights(self) -> Any:
-        """(N,) weights of the particles, with a mean near 1 on a GPU, and with the sum 1 as a NumPy array."""
-        self._check_started()
-        self.flush()
-        if self._backend.info.kind == "gpu":
-            return self._array(self._cloud.weight, (self._shown,))
-        weights = self._cloud.host_weights(self._shown)
-        return weights / weights.sum()
+        """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
+        weights = self.host_weights()
+        if self._backend.info.kind != "gpu":
+            return weights
+        buffer = self._backend.blank(self._shown, weights.dtype)
+        return self._backend.lend(self._backend.upload(weights, buffer), weights.shape, weights.dtype)
 
     def _array(self, buffer: Any, shape: tuple[int, ...]) -> Any:
         if self._backend.info.kind == "gpu":

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.backends import arrays
 from gpusense.backends.base import Backend
 from gpusense.interface.launches import Program
 from gpusense.localization.temperature import BeamCorrelation
@@ -87,12 +88,12 @@ class Sensor:
         count = self.model.scanner.count
         if self._ranges is None:
             self._ranges = self.backend.blank(count, _DOUBLE)
-        if self.backend.reads(ranges):
+        if arrays.on_device(ranges) and self.backend.reads(ranges):
             adopted = self.backend.adopt(ranges, "ranges")
             if adopted.dtype == _DOUBLE and adopted.shape == (count,) and adopted.contiguous:
                 self.backend.copy(adopted.buffer, self._ranges, count * _DOUBLE.itemsize)
                 return
-            ranges = adopted.to_host()
+        ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
         values = checks.array("ranges", ranges, (count,), finite=False)
         self.backend.upload(np.ascontiguousarray(values, _DOUBLE), self._ranges)
 

@@ -60,6 +60,11 @@ def walls(pose):
     return gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(pose[None], SCANNER.bearings)[0]
 
 
+def on_host(array):
+    """Return a NumPy array, or one of pyopencl or Warp, as NumPy's."""
+    return array.get() if hasattr(array, "get") else array.numpy() if hasattr(array, "numpy") else array
+
+
 def tracked(backend, count=400, **options):
     model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
     pf = gs.ParticleFilter(model, particles=count, seed=5, **options)
@@ -81,12 +86,16 @@ def test_a_robot_in_a_room_is_tracked(backend, options):
         assert np.hypot(*(found.pose - pose)[:2]) < 0.1 and abs(found.pose[2] - pose[2]) < 0.05
         assert not found.lost and found.explained > 0.9
     assert np.hypot(*(pf.estimate("best").pose - pose)[:2]) < 0.3
-    assert abs(np.sum(pf.weights) - 1) < 1e-12 and pf.particles.shape == (len(pf.weights), 3)
+    weights = pf.host_weights()
+    assert abs(weights.sum() - 1) < 1e-12 and pf.particles.shape == (len(weights), 3) == (*pf.weights.shape, 3)
+    assert np.array_equal(on_host(pf.particles), pf.host_particles())
+    assert np.array_equal(on_host(pf.weights), weights)
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_one_others(backend):
     one, two = tracked(backend)[0], tracked(backend)[0]
-    assert np.array_equal(one.particles, two.particles) and np.array_equal(one.weights, two.weights)
+    assert np.array_equal(one.host_particles(), two.host_particles())
+    assert np.array_equal(one.host_weights(), two.host_weights())
     # Random numbers are common to all backends: their estimates differ by less than those of two seeds.
     reference = tracked("numpy")[0].estimate().pose
     assert np.abs(one.estimate().pose - reference).max() < 0.03

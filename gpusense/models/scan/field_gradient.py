@@ -68,10 +68,18 @@ class _Gradient:
         space.download(numbers, rows)
 
 
+# Entries of the information (3, 3) among the numbers after log p and the gradient.
+_ENTRIES = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+
+
 def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return log p (M,), gradient (M, 3) and information (M, 3, 3) in the world from numbers in the grid's frame."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    information = numbers[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3)
-    real = numbers.dtype
-    return numbers[:, 0], (numbers[:, 1:4] @ turned.T).astype(real), (turned @ information @ turned.T).astype(real)
+    gradient, information = numbers[:, 1:4], numbers[:, 4 + _ENTRIES]
+    if yaw:
+        c, s = np.cos(yaw), np.sin(yaw)
+        turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        # One product for all poses: the information as a vector turns by a Kronecker product.
+        real = numbers.dtype
+        gradient = (gradient @ turned.T).astype(real)
+        information = (information @ np.kron(turned, turned).T).astype(real)
+    return numbers[:, 0], gradient, information.reshape(-1, 3, 3)

@@ -25,7 +25,7 @@ class Defaults(NamedTuple):
         slow: Rate of the slow average of the likelihood.
         fast: Rate of the fast average.
         most_injected: Largest share of injected particles.
-        temperature: Of the filter and of ``gpusense score``.
+        temperature: Of the filter.
         calibrations: Corrections from which the temperature is learned at first; later two of ten.
         field: Parameters of the likelihood field of ``gpusense localize``.
     """

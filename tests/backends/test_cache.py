@@ -355,6 +355,7 @@ def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, fa
     assert f"the cache folder {tmp_path / 'cold'} cannot be written" in errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("family", "how"), [("opencl", BLOCKED[0]), ("opencl", BLOCKED[2]), ("warp:cpu", BLOCKED[1])])
 def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
     """gpusense's own folder, and where PoCL and Warp would put theirs."""
@@ -372,6 +373,7 @@ def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_pa
     assert len(list((tmp_path / "tmp").rglob("*.bin"))) > 5
 
 
+@pytest.mark.slow
 def test_a_full_file_system_is_named_and_stops_nothing(needs, tmp_path, expected):
     """A file system of 256 KiB as the cache; the folder of the process goes elsewhere."""
     needs("opencl")

@@ -205,7 +205,7 @@ def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog
 
 @pytest.mark.parametrize(
     ("family", "lanes", "float64"),
-    [("opencl", 1, True), ("opencl", 8, False), ("opencl", 16, True), ("warp", 1, True), ("warp", 1, False)],
+    [("opencl", 8, False), ("opencl", 16, True), ("warp", 1, True)],
 )
 def test_the_scene_passes_on_real_devices_with_every_setting(needs, family, lanes, float64):
     """Within this process, with less time for the rate."""

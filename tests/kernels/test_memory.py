@@ -185,6 +185,7 @@ wp.launch(wrong.f, dim=4, inputs=[wp.zeros(4, dtype=wp.int32, device="cpu")], de
 """
 
 
+@pytest.mark.slow
 def test_every_opencl_kernel_runs_clean_and_right():
     check(run(_WORK, "opencl:oclgrind"))
 

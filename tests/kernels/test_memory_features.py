@@ -89,10 +89,12 @@ print("wrong", wrong, "worst", worst)
 """
 
 
+@pytest.mark.slow
 def test_every_opencl_kernel_runs_clean_and_right():
     check(run(_WORK, "opencl:oclgrind"))
 
 
+@pytest.mark.slow
 def test_every_warp_kernel_runs_clean_and_right_with_bounds_checks(needs):
     needs("warp")
     check(run(_WORK, "warp:cpu"))

@@ -50,7 +50,7 @@ SMALL = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+@pytest.mark.parametrize("selection", ["opencl"])
 def test_scaling_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script("speed/scaling.py", "--backend", needs(selection), *SMALL, output=tmp_path / "small")
     (device,) = report["devices"]
@@ -117,7 +117,7 @@ def test_rates_are_never_too_low(scaling: ModuleType) -> None:
     ]
 
 
-@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+@pytest.mark.parametrize("selection", ["opencl"])
 def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--particles", "120", "--beams", "8", "--repeats", "1", "--seconds", "0.01", "--size", "20"]
     arguments += ["--backend", needs(selection)]
@@ -150,7 +150,7 @@ def test_launches_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
         assert row["together_s"] > 0 and row["row_s"] > 0 and row["main_s"] > 0
 
 
-@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+@pytest.mark.parametrize("selection", ["opencl"])
 def test_point_models_run(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--beacons", "3", "--repeats", "1"]
     arguments += ["--seconds", "0.01", "--backend", needs(selection)]
@@ -192,7 +192,7 @@ def test_sonar_field_runs(tmp_path: Path) -> None:
     assert sorted(file.name for file in (tmp_path / "drawn").glob("*.png")) == ["sonar-scene.png", "sonar-scores.png"]
 
 
-@pytest.mark.parametrize("selection", ["numpy", "opencl"])
+@pytest.mark.parametrize("selection", ["opencl"])
 def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--particles", "50", "--particles", "90", "--beams", "12", "--scans", "3", "--calls", "4"]
     arguments += ["--models", "2", "--seconds", "0.01", "--size", "20", "--backend", needs(selection)]

@@ -111,11 +111,20 @@ class Interrupted:
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_a_call_that_was_interrupted_can_be_repeated(call, backend):
-    """Every line of every model with NumPy; lines outside the folder of tables once for all models."""
+def test_a_call_that_was_interrupted_can_be_repeated(call):
+    """Every line of every model; lines outside the folder of tables once for all models."""
+    interrupt_each_line(call, "numpy", everything=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", CALLS)
+def test_a_call_of_a_device_that_was_interrupted_can_be_repeated(call, device):
+    interrupt_each_line(call, device.info.selection, everything=False)
+
+
+def interrupt_each_line(call: str, backend: str, *, everything: bool) -> None:
     tested: set[tuple[object, ...]] = set()
     reached = 0
-    everything = backend == "numpy"
     for name in MODELS if everything else ON_DEVICES:
         case = Interrupted(MODELS[name], backend, call)
         for code, number in case.lines():

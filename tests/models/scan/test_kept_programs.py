@@ -41,7 +41,7 @@ def test_the_bound_of_rounding_errors_follows_the_longest_reading(backend, gpu, 
     lengths = [0.5, 4.0, 0.5, 4.0, 4.01]
     for length in lengths:
         model.log_likelihood(cloud(1), np.full(NEAR.count, length), per_beam=gpu)
-    needed = [model._pipeline._guard * (length / GRID.resolution + 2) for length in lengths]
+    needed = [model._pipeline.guard * (length / GRID.resolution + 2) for length in lengths]
     assert device.guards == pytest.approx(needed, rel=1e-15)
 
 

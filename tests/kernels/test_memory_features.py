@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from support.checkers import check, run
 
 _WORK = """

@@ -4,7 +4,7 @@
 
 For each run: parameters fitted at the logged poses with known and with unknown landmarks; landmarks whose readings
 stand where another one is; how often the likeliest landmark of a feature is the recorded one, at logged poses and at
-poses moved at random; and the error of a plain particle filter (odometry, ``LandmarkModel``, systematic resampling)
+poses moved at random; and the error of a particle filter (odometry, ``LandmarkModel``)
 that knows the landmarks, or does not, with the parameters of the fit of its kind. It starts 0.5 m and 0.3 rad (one
 deviation) around the first logged pose. Two landmarks of the UTIAS data are exchanged in the published positions: they
 are left so, and for comparison put back as reported ("repaired"). Fits and filters use the same run.

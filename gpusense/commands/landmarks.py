@@ -9,11 +9,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_seed, output_path, positive_number, whole_number
+from gpusense.commands.arguments import (
+    add_backend,
+    add_json,
+    add_seed,
+    not_negative_number,
+    output_path,
+    positive_number,
+    whole_number,
+)
 from gpusense.commands.output import print_json, print_table
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
+    from gpusense.evaluation.landmark_motion import DriftingOdometry
     from gpusense.evaluation.landmark_runs import Track
     from gpusense.learning.landmark.result import LandmarkFit
     from gpusense.learning.landmark.suspicious import Suspicions
@@ -21,6 +30,8 @@ if TYPE_CHECKING:
 
 NAME = "landmarks"
 HELP = "Fit the noise of landmark readings in a recorded run, check the map, and localise the robot."
+
+LOST = 1
 
 _EPILOG = """\
 The folder holds files in the format of the UTIAS MRCLAM data, plain or with .gz after the name:
@@ -31,7 +42,13 @@ Parameters are fitted at the logged poses. A particle filter then starts around 
 and uses odometry and readings only: with --known also the recorded landmark of each reading, with --unknown not. The
 map is used unchanged: readings of exchanged landmarks count as false positives.
 
-Exit codes: 0 success, 2 bad input.
+The filter's motion noise is that of the odometry and a random walk. The walk of the heading is measured at the logged
+poses unless --drift gives it: runs with poor odometry need a large one, and with a small one the robot gets lost.
+
+The verdict at the end does not need logged poses: it is 'lost' if the particles predict the last readings hardly better
+than poses anywhere among the landmarks, as on a wrong map.
+
+Exit codes: 0 success, 1 lost at the end, 2 bad input.
 
 example:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
@@ -50,6 +67,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kind.add_argument("--unknown", dest="known", action="store_false", help="the landmark of each reading is unknown")
     add("--particles", type=whole_number(low=2), default=2000, metavar="N",
         help="number of the filter's particles (default: %(default)s)")  # fmt: skip
+    add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
+        help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
+        "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
+        "(default: 0.09 0.01 0.04 0.0004)")  # fmt: skip
+    add("--reverse", type=_probability, metavar="P",
+        help="probability that a translation went the other direction (default: 0)")  # fmt: skip
+    add("--drift", type=not_negative_number, nargs=2, metavar=("M", "RAD"),
+        help="random walks of the translation [m/sqrt(s)] and of the heading [rad/sqrt(s)] "
+        "(default: 0.01 and the measured error of the odometer's heading)")  # fmt: skip
+    add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this run first")
     add("--scans", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
     add("--range-max", type=positive_number, metavar="M",
         help="the sensor's largest range [m] (default: the next metre above the largest reading)")  # fmt: skip
@@ -62,9 +89,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="draw path, estimate and landmarks")  # fmt: skip
 
 
+def _probability(text: str) -> float:
+    value = not_negative_number(text)
+    if value > 1:
+        raise argparse.ArgumentTypeError(f"must be in [0, 1], got {value:g}")
+    return value
+
+
 def run(args: argparse.Namespace) -> int:
     """Fit the noise, check the map, associate, localise, and print the results."""
     from gpusense.evaluation import landmark_runs
+    from gpusense.evaluation.landmark_motion import run_motion
     from gpusense.logs.mrclam import read_mrclam
     from gpusense.models.landmark.model import LandmarkModel
 
@@ -78,19 +113,22 @@ def run(args: argparse.Namespace) -> int:
     fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
     model = LandmarkModel(recorded_run.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
     agreement = landmark_runs.association(recorded_run, model, sigma_position=0.0, sigma_heading=0.0, seed=args.seed)
+    alpha = None if args.motion_noise is None else tuple(args.motion_noise)
+    drift = None if args.drift is None else tuple(args.drift)
+    motion = run_motion(recorded_run, alpha=alpha, reverse=args.reverse, drift=drift, fit=args.fit_motion)
     with progress((len(recorded_run.time) + 99) // 100) as step:
         track = landmark_runs.localise(
-            recorded_run, model, known=args.known, particles=args.particles, seed=args.seed, step=step
+            recorded_run, model, known=args.known, particles=args.particles, seed=args.seed, motion=motion, step=step
         )
     if args.json:
-        print_json(_document(args, recorded_run, fit, suspicions, agreement, track, model.device.selection))
+        print_json(_document(args, recorded_run, fit, suspicions, agreement, track, motion, model.device.selection))
     else:
-        _print(args, recorded_run, fit, suspicions, agreement, track)
+        _print(args, recorded_run, fit, suspicions, agreement, track, motion)
     if args.plot is not None:
         _draw(args.plot, recorded_run, track, suspicions)
         if not args.json:
             print(f"drawn: {args.plot}")
-    return 0
+    return LOST if track.lost else 0
 
 
 def _draw(path: Path, recorded_run: LandmarkRun, track: Track, suspicions: Suspicions) -> None:
@@ -102,7 +140,7 @@ def _draw(path: Path, recorded_run: LandmarkRun, track: Track, suspicions: Suspi
 
 def _document(
     args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
-    agreement: dict[str, float], track: Track, device: str,
+    agreement: dict[str, float], track: Track, motion: DriftingOdometry, device: str,
 ) -> dict[str, Any]:  # fmt: skip
     options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
     label = recorded_run.labels.tolist()
@@ -117,6 +155,7 @@ def _document(
         ],
         "misplaced": [asdict(each) | {"landmark": label[each.landmark]} for each in suspicions.misplaced],
         "association": agreement,
+        "motion": asdict(motion),
         "filter": track.summary(),
         "device": device,
         "machine": machine(),
@@ -125,7 +164,7 @@ def _document(
 
 def _print(
     args: argparse.Namespace, recorded_run: LandmarkRun, fit: LandmarkFit, suspicions: Suspicions,
-    agreement: dict[str, float], track: Track,
+    agreement: dict[str, float], track: Track, motion: DriftingOdometry,
 ) -> None:  # fmt: skip
     left_out = ", ".join(
         f"{count} of {reason}" if reason == "other robots" else f"{count} {reason}"
@@ -148,7 +187,23 @@ def _print(
          f"{float(track.error_heading.max()):.3f}"),
     ]  # fmt: skip
     print_table(("error", "median", "90 %", "largest"), rows, right=("median", "90 %", "largest"))
-    print(f"\n{args.particles} particles, {kind} landmarks\n{machine_line()}")
+    alpha = " ".join(f"{value:.3g}" for value in motion.alpha)
+    print(
+        f"\n{args.particles} particles, {kind} landmarks\nmotion noise {alpha}, reverse {motion.reverse:.2g}, "
+        f"random walk {motion.drift:.2g} m and {motion.drift_heading:.2g} rad per sqrt(s)\n\n"
+        f"verdict: {_verdict(track)}\n\n{machine_line()}"
+    )
+
+
+def _verdict(track: Track) -> str:
+    s = track.summary()
+    if s["gain_last"] is None:
+        return "none: too few scans with readings"
+    share = f"the particles predict a reading {s['gain_last']:.1f} nats better than chance"
+    if track.lost:
+        return f"LOST since {s['lost_since']:.0f} s: {share}; is this the map of the run, and --drift large enough?"
+    before = f"; lost in {s['scans_lost']} scans before" if s["scans_lost"] else ""
+    return f"not lost: {share}{before}"
 
 
 def _print_suspicions(recorded_run: LandmarkRun, suspicions: Suspicions) -> None:

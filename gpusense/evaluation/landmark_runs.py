@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.evaluation.landmark_motion import DriftingOdometry, run_motion
 from gpusense.learning.landmark.fit import fit_landmark_parameters
 from gpusense.learning.landmark.result import LandmarkFit
 from gpusense.learning.landmark.suspicious import Suspicions, suspicious_landmarks
-from gpusense.localization.weights import normalize_weights, resample
+from gpusense.localization.evidence import Evidence
+from gpusense.localization.filter import ParticleFilter
 from gpusense.logs.records import LandmarkRun
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.world.landmarks import LandmarkMap
@@ -25,25 +26,8 @@ Integers = NDArray[np.int64]
 LEAST_FALSE = 0.01
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Noise of the odometry motion model (book table 5.6), with a random walk in addition.
-
-    The first four are the roots of the book's alpha_1 to alpha_4.
-    """
-
-    turn_by_turn: float = 0.3
-    """Deviation of a turn per turn [rad/rad]."""
-    turn_by_distance: float = 0.1
-    """Deviation of a turn per distance [rad/m]."""
-    distance_by_distance: float = 0.2
-    """Deviation of a distance per distance [m/m]."""
-    distance_by_turn: float = 0.02
-    """Deviation of a distance per turn [m/rad]."""
-    drift: float = 0.01
-    """Random walk of the position, in x and in y [m / sqrt(s)]."""
-    drift_heading: float = 0.07
-    """Random walk of the heading [rad / sqrt(s)]."""
+# Tracks begin around the first logged pose, with these deviations of x and y [m], and of the heading [rad].
+START, START_HEADING = 0.5, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +39,43 @@ class Track:
         error: (S,) distance from the logged position [m].
         error_heading: (S,) absolute error of the heading [rad].
         degenerate: Number of scans that are impossible at every particle.
+        time: (S,) time of each scan [s].
+        gain: (S,) logarithm by which the particles predict recent features better than chance [nats for a feature].
+        scans_lost: (S,) verdict after each scan.
     """
 
     estimate: Floats
     error: Floats
     error_heading: Floats
     degenerate: int
+    time: Floats
+    gain: Floats
+    scans_lost: NDArray[np.bool_]
 
-    def summary(self) -> dict[str, float]:
-        """Return medians, 90 % quantiles and largest errors."""
+    @property
+    def lost(self) -> bool:
+        """Tell whether the filter is lost at the end: at most of the last tenth of the scans."""
+        return bool(np.mean(self.scans_lost[-max(len(self.time) // 10, 1) :]) > 0.5)
+
+    @property
+    def lost_since(self) -> float | None:
+        """Time from which the filter is lost to the end, after the first scan [s]; None where it is not lost."""
+        if not self.lost:
+            return None
+        found = np.flatnonzero(~self.scans_lost)
+        last = int(np.flatnonzero(self.scans_lost)[-1])
+        before = found[found < last]
+        return float(self.time[int(before[-1]) + 1 if len(before) else 0] - self.time[0])
+
+    def summary(self) -> dict[str, float | bool | None]:
+        """Return medians, 90 % quantiles and largest errors, and the verdict."""
+        tail = self.gain[-max(len(self.time) // 10, 1) :]
         return {
             "error_median": float(np.median(self.error)), "error_90": float(np.quantile(self.error, 0.9)),
             "error_max": float(self.error.max()), "heading_median": float(np.median(self.error_heading)),
             "heading_90": float(np.quantile(self.error_heading, 0.9)), "degenerate": self.degenerate,
+            "lost": self.lost, "lost_since": self.lost_since, "scans_lost": int(self.scans_lost.sum()),
+            "gain_last": None if np.isnan(tail).all() else float(np.nanmedian(tail)),
         }  # fmt: skip
 
 
@@ -128,12 +136,10 @@ def localise(
     known: bool,
     particles: int = 2000,
     seed: int = 0,
-    motion: Motion | None = None,
-    sigma_position: float = 0.5,
-    sigma_heading: float = 0.3,
+    motion: DriftingOdometry | None = None,
     step: Callable[[str], None] | None = None,
 ) -> Track:
-    """Run a plain particle filter (book table 8.2): odometry, the landmark model, systematic resampling.
+    """Run :class:`ParticleFilter` along a run, from around its first logged pose (``START``).
 
     Args:
         run: The run.
@@ -141,73 +147,40 @@ def localise(
         known: Whether the filter uses the recorded landmark of each feature.
         particles: Number of particles.
         seed: Seed of the random numbers.
-        motion: Noise of the odometry.
-        sigma_position: Deviation of the first particles from the first logged pose, in x and in y [m].
-        sigma_heading: Deviation of their headings [rad].
+        motion: Noise of the odometry; by default :func:`run_motion` of the run.
         step: Called with a text before each hundredth scan.
     """
-    rng, noise = np.random.default_rng(seed), motion or Motion()
-    cloud = run.truth[0] + rng.normal(size=(particles, 3)) * (sigma_position, sigma_position, sigma_heading)
-    estimate, log_w, degenerate = np.empty_like(run.truth), np.zeros(particles), 0
-    rows = {int(run.scan[first]): (first, last) for first, last in _scans(run)}
+    pf = ParticleFilter(model, motion=run_motion(run) if motion is None else motion, particles=particles, seed=seed)
+    pf.initialize(mean=run.truth[0], covariance=np.diag([START**2, START**2, START_HEADING**2]))
+    evidence, degenerate = Evidence(model, seed=seed), 0
+    estimate, gain, lost = np.empty_like(run.truth), np.empty(len(run.time)), np.zeros(len(run.time), np.bool_)
+    rows = {int(run.scan[first]): slice(first, last) for first, last in _scans(run)}
     for s in range(len(run.time)):
         if step is not None and s % 100 == 0:
-            step(f"scan {s}")
+            step(f"scan {s}" + (", lost" if s and lost[s - 1] else ""))
         if s:
-            _move(cloud, run.odometry[s - 1], run.odometry[s], float(run.time[s] - run.time[s - 1]), noise, rng)
+            pf.predict(run.odometry[s - 1], run.odometry[s], float(run.time[s] - run.time[s - 1]))
         if s in rows:
-            first, last = rows[s]
-            ids = run.ids[first:last] if known else None
-            log_w = log_w + model.log_likelihood(cloud, run.features[first:last], ids).astype(np.float64)
-        weights = normalize_weights(log_w)
-        if weights.degenerate:
-            degenerate, log_w = degenerate + 1, np.zeros(particles)
-        w = weights.weights
-        x, y = w @ cloud[:, :2]
-        estimate[s] = x, y, math.atan2(w @ np.sin(cloud[:, 2]), w @ np.cos(cloud[:, 2]))
-        if weights.effective_sample_size < particles / 2:
-            cloud, log_w = cloud[resample(w, particles, rng)], np.zeros(particles)
-    return _track(run, estimate, degenerate)
+            features, ids = run.features[rows[s]], run.ids[rows[s]] if known else None
+            evidence.predicted(pf.host_particles(), pf.host_weights(), features, ids)
+            pf.correct((features, ids))
+        found = pf.estimate()
+        degenerate += found.degenerate and s in rows
+        estimate[s], gain[s], lost[s] = found.pose, evidence.gain, evidence.lost
+    return _track(run, estimate, degenerate, gain, lost)
 
 
-def _track(run: LandmarkRun, estimate: Floats, degenerate: int) -> Track:
+def _track(run: LandmarkRun, estimate: Floats, degenerate: int, gain: Floats, lost: NDArray[np.bool_]) -> Track:
     """Return a filter's result with its errors against the logged poses."""
     away = estimate - run.truth
     turn = np.abs(np.arctan2(np.sin(away[:, 2]), np.cos(away[:, 2])))
-    return Track(estimate, np.hypot(away[:, 0], away[:, 1]), turn, degenerate)
+    return Track(estimate, np.hypot(away[:, 0], away[:, 1]), turn, degenerate, run.time, gain, lost)
 
 
 def _scans(run: LandmarkRun) -> list[tuple[int, int]]:
     """Return the first feature and the end (excluded) of each scan that has features."""
     starts = np.flatnonzero(np.diff(run.scan, prepend=-1))
     return list(zip(starts.tolist(), [*starts[1:].tolist(), len(run.scan)], strict=True))
-
-
-def _move(
-    cloud: Floats, before: Floats, after: Floats, seconds: float, noise: Motion, rng: np.random.Generator
-) -> None:
-    """Move particles by the odometry between two poses, each with its own noise."""
-    x, y, turn = (float(value) for value in after - before)
-    turn = math.remainder(turn, math.tau)
-    distance = math.hypot(x, y)
-    first = math.remainder(math.atan2(y, x) - before[2], math.tau) if distance > 1e-9 else 0.0
-    if abs(first) > math.pi / 2:
-        # Motion backwards: a negative distance, with turns as of a robot that moves ahead.
-        distance, first = -distance, math.remainder(first + math.pi, math.tau)
-    second = math.remainder(turn - first, math.tau)
-    size = math.sqrt(max(seconds, 0.0))
-    draws = rng.normal(size=(len(cloud), 6))
-
-    def turned(angle: float, column: int) -> Floats:
-        sigma = math.hypot(noise.turn_by_turn * angle, noise.turn_by_distance * distance)
-        return angle + sigma * draws[:, column]
-
-    heading = cloud[:, 2] + turned(first, 0)
-    sigma_distance = math.hypot(noise.distance_by_distance * distance, noise.distance_by_turn * turn)
-    travelled = distance + sigma_distance * draws[:, 1]
-    cloud[:, 0] += travelled * np.cos(heading) + noise.drift * size * draws[:, 3]
-    cloud[:, 1] += travelled * np.sin(heading) + noise.drift * size * draws[:, 4]
-    cloud[:, 2] = heading + turned(second, 2) + noise.drift_heading * size * draws[:, 5]
 
 
 def repaired(run: LandmarkRun, suspected: Suspicions) -> LandmarkRun:

@@ -51,8 +51,14 @@ def simulate(seed, *, scans=120, landmarks=12, field_of_view=2 * math.pi, bias=(
     return Seen(xy, poses, table[:, :2], table[:, 2].astype(int), table[:, 3].astype(int), false)
 
 
-def write_run(folder: Path, *, seed: int = 0, swap: tuple[int, int] | None = None, seconds: float = 60.0) -> Path:
-    """Write a run of robot 1 in MRCLAM's files: subjects 6 to 15, barcodes 100 more; subjects of ``swap`` exchanged."""
+def write_run(
+    folder: Path, *, seed: int = 0, swap: tuple[int, int] | None = None, seconds: float = 60.0, wander: float = 0.0,
+    wrong: bool = False,
+) -> Path:  # fmt: skip
+    """Write a run of robot 1 in MRCLAM's files: subjects 6 to 15, barcodes 100 more; subjects of ``swap`` exchanged.
+
+    The odometer's heading has a random walk of ``wander`` rad / sqrt(s); with ``wrong`` the map is of another room.
+    """
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-4, 4, (10, 2))
     time = np.arange(0, seconds, 0.1)
@@ -75,6 +81,9 @@ def write_run(folder: Path, *, seed: int = 0, swap: tuple[int, int] | None = Non
         a, b = swap[0] - 6, swap[1] - 6
         places[[a, b]] = places[[b, a]]
     noisy = np.column_stack([speed * (1 + rng.normal(0, 0.05, len(time))), turn + rng.normal(0, 0.03, len(time))])
+    noisy[:, 1] += np.random.default_rng(seed + 1).normal(0, wander / math.sqrt(0.1), len(time))
+    if wrong:
+        xy = np.random.default_rng(seed + 5).uniform(-4, 4, (10, 2))
     texts = {
         "Landmark_Groundtruth.dat": [f"{6 + j} {xy[k, 0]:.6f} {xy[k, 1]:.6f} 0.001 0.001" for j, k in
                                      enumerate(places)],

@@ -162,7 +162,7 @@ def localise(
             pf.predict(run.odometry[s - 1], run.odometry[s], float(run.time[s] - run.time[s - 1]))
         if s in rows:
             features, ids = run.features[rows[s]], run.ids[rows[s]] if known else None
-            evidence.predicted(pf.host_particles(), pf.host_weights(), features, ids)
+            evidence.predicted(pf.host_particles(), pf.host_weights(), features)
             pf.correct((features, ids))
         found = pf.estimate()
         degenerate += found.degenerate and s in rows

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.typing import AnyArray
 from gpusense.models.landmark.model import LandmarkModel
+
+Floats = NDArray[np.float64]
 
 # Least gain of a filter that is not lost [nats for a feature]; scans with features over which it is averaged; poses
 # anywhere, and their margin around the landmarks [m].
@@ -40,26 +41,27 @@ class Evidence:
         )
         self._recent: deque[tuple[float, int]] = deque(maxlen=_MEMORY)
 
-    def predicted(self, poses: AnyArray, weights: NDArray[np.float64], features: AnyArray, ids: Any = None) -> None:
+    def predicted(self, poses: Floats, weights: Floats, features: Floats) -> None:
         """Add a scan, before the filter is corrected by it.
+
+        Landmarks count as unknown: where two are exchanged in the map, a pose is right all the same.
 
         Args:
             poses: (N, 3) predicted particles.
             weights: (N,) their weights.
             features: (F, 2 or 3) features of the scan, F > 0.
-            ids: (F,) known landmarks; None where unknown.
         """
         count = len(features)
         false = self._log_p(self._poses[:1], features, np.full(count, -1))[0]
         z_false = self._model.parameters.z_false
-        chance = _log_mean(self._log_p(self._poses, features, ids), np.full(_ANYWHERE, 1 / _ANYWHERE))
+        chance = _log_mean(self._log_p(self._poses, features), np.full(_ANYWHERE, 1 / _ANYWHERE))
         if z_false > 0:
             chance = max(chance, float(false) - count * math.log(z_false))
-        reached = _log_mean(self._log_p(poses, features, ids), weights)
+        reached = _log_mean(self._log_p(poses, features), weights)
         if math.isfinite(chance) or math.isfinite(reached):
             self._recent.append((reached - chance, count))
 
-    def _log_p(self, poses: AnyArray, features: AnyArray, ids: Any) -> NDArray[np.float64]:
+    def _log_p(self, poses: Floats, features: Floats, ids: Any = None) -> Floats:
         return np.asarray(self._model.log_likelihood(poses, features, ids), np.float64)
 
     @property
@@ -75,7 +77,7 @@ class Evidence:
         return self.gain < LEAST_GAIN
 
 
-def _log_mean(log_p: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+def _log_mean(log_p: Floats, weights: Floats) -> float:
     """Return the logarithm of a weighted mean of likelihoods."""
     largest = float(log_p.max())
     if not math.isfinite(largest):

@@ -13,6 +13,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "e_step": (set(),),
     "field_gradient": ({"LINEAR"},),
+    "match_scans": (set(),),
     "score_beams": ({"LINEAR"},),
     "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),

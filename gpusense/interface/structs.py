@@ -131,6 +131,7 @@ class MatchRules(NamedTuple):
 
     iterations: int
     stride: int
+    skip: int
     score_stride: int
     thin: int
     capture: real

@@ -11,6 +11,7 @@ from gpusense.backends import Backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import ScanPoints
@@ -89,8 +90,9 @@ class IcpPairs:
         padded[..., :3] = guesses
         space = self._space
         buffer = space.empty("match result", result.size, self._real)
+        flags = widened(self._backend.info.lanes, "match_scans", self._flags)
         matching = launch(
-            "match_scans", self._flags, (count * starts,), point=self._point, start=self._start, line=self._line,
+            "match_scans", flags, (count * starts,), point=self._point, start=self._start, line=self._line,
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),
             result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, rules=rules,
         )  # fmt: skip

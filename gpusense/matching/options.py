@@ -40,7 +40,7 @@ class MatchOptions:
         stride = max(points // _COARSE_POINTS, 1)
         scale, least = self.capture, self.least_scale
         near = max(0.3 * self.capture, 3 * least)
-        return MatchRules(40, stride, (stride + 1) // 2, 0, self.capture, near, max(scale, least), least, 0.85, gap,
+        return MatchRules(40, stride, 1, (stride + 1) // 2, 0, self.capture, near, max(scale, least), least, 0.85, gap,
                           near, 1e-4 * self.capture)  # fmt: skip
 
     def search_rules(self, points: int, gap: float) -> MatchRules:

@@ -13,29 +13,18 @@ import numpy as np
 
 from gpusense.interface import structs
 from gpusense.interface.constants import MATCH_RESULT
+from gpusense.reference.icp_step import FULL_TURN, bearing_of, points_before, solve
 
-FULL_TURN = 6.283185307179586
 # Weight in the score of a point that the other scan did not see; one that disagrees has 1.
 UNSEEN = 0.13
 
 
-def bearing_of(place: np.ndarray) -> np.ndarray:
-    """Return the bearings of (N, 2) places in [0, 2 pi)."""
-    bearing = np.arctan2(place[:, 1], place[:, 0])
-    return np.where(bearing < 0, bearing + place.dtype.type(FULL_TURN), bearing)
-
-
-def points_before(point: np.ndarray, bearing: np.ndarray) -> np.ndarray:
-    """Return the numbers of points of a scan whose bearings are less than some bearings."""
-    return np.searchsorted(point[:, 2], bearing, side="left")
-
-
-def nearest_point(point: np.ndarray, place: np.ndarray, squared: float) -> np.ndarray:
-    """Return the nearest points of a scan that are nearer than the square root of ``squared``, -1 without one."""
-    d = point[None, :, :2] - place[:, None]
+def nearest_point(point: np.ndarray, skip: int, place: np.ndarray, squared: float) -> np.ndarray:
+    """Return the nearest of every skip-th point that are nearer than the square root of ``squared``, -1 without one."""
+    d = point[None, ::skip, :2] - place[:, None]
     distance = d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1]
     which = distance.argmin(axis=1)
-    return np.where(distance[np.arange(len(place)), which] < squared, which, -1)
+    return np.where(distance[np.arange(len(place)), which] < squared, skip * which, -1)
 
 
 def add_pairing(
@@ -61,25 +50,11 @@ def add_pairing(
     )  # fmt: skip
 
 
-def solve(information: np.ndarray, gradient: np.ndarray) -> np.ndarray | None:
-    """Solve the damped normal equations: the step in x, y and theta, None without one."""
-    real = information.dtype.type
-    damped = information.copy()
-    damping = real(1e-5) * (damped[0, 0] + damped[1, 1]) + real(1e-9)
-    damped[0, 0] += damping
-    damped[1, 1] += damping
-    damped[2, 2] = damped[2, 2] * real(1.00001) + real(1e-9)
-    try:
-        factor = np.linalg.cholesky(damped)
-    except np.linalg.LinAlgError:
-        return None
-    return np.linalg.solve(factor.T, np.linalg.solve(factor, gradient)).astype(real)
-
-
 def agreement(
-    point: np.ndarray, line: np.ndarray, other: np.ndarray, stride: int, pose: np.ndarray, near: float, gap: float
-) -> np.ndarray:
-    """Return how well every stride-th point of one scan agrees with another scan.
+    point: np.ndarray, line: np.ndarray, other: np.ndarray, stride: int, skip: int, pose: np.ndarray, near: float,
+    gap: float,
+) -> np.ndarray:  # fmt: skip
+    """Return how well every stride-th point of one scan agrees with every skip-th point of another scan.
 
     The four numbers are the sum of agreements, points that the other scan should see, points that contradict it because
     it saw through them, and points that it did not see. ``pose`` is (x, y, cos, sin).
@@ -88,7 +63,7 @@ def agreement(
     x = pose[2] * p[:, 0] - pose[3] * p[:, 1] + pose[0]
     y = pose[3] * p[:, 0] + pose[2] * p[:, 1] + pose[1]
     place = np.stack([x, y], axis=1)
-    which = nearest_point(point, place, near * near)
+    which = nearest_point(point, skip, place, near * near)
     at = line[which]
     ratio = (at[:, 0] * x + at[:, 1] * y - at[:, 2]) / (near / 3)
     ahead, count = points_before(point, bearing_of(place)), len(point)
@@ -170,11 +145,11 @@ def match_scans(
 ) -> None:
     """Match pairs of scans (reference, second scan) from guesses (x, y, theta).
 
-    A guess is the pose of the second scan in the reference's frame. Every ``stride``-th point takes part until capture
-    radius and scale have shrunk, with ``thin`` also afterwards. A result is the pose (3), the score, iterations,
-    whether the last step was below ten tolerances, the information (6), its part that is due to errors of the lines
-    (6), pairs, sum of weights, weighted sum of squared errors, points that the other scan should see, points that
-    contradict it, and points that it did not see.
+    A guess is the pose of the second scan in the reference's frame. Every ``stride``-th point and every ``skip``-th of
+    the reference take part until capture radius and scale have shrunk, with ``thin`` also afterwards. A result is the
+    pose (3), the score, iterations, whether the last step was below ten tolerances, the information (6), its part that
+    is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points that the other scan
+    should see, points that contradict it, and points that it did not see.
     """
     out = result[: MATCH_RESULT * pairs * starts].reshape(-1, MATCH_RESULT)
     upper = np.triu_indices(3)
@@ -186,9 +161,9 @@ def match_scans(
         if len(one) and len(other):
             (x, y), c, s = pose[:2], np.cos(pose[2]), np.sin(pose[2])
             inverse = np.array([-c * x - s * y, s * x - c * y, c, -s])
-            step, near, gap = rules.score_stride, rules.near, rules.gap
-            both += agreement(one, lines, other, step, np.array([x, y, c, s]), near, gap)
-            both += agreement(other, line[second], one, step, inverse, near, gap)
+            step, skip, near, gap = rules.score_stride, rules.skip if rules.thin else 1, rules.near, rules.gap
+            both += agreement(one, lines, other, step, skip, np.array([x, y, c, s]), near, gap)
+            both += agreement(other, line[second], one, step, skip, inverse, near, gap)
         everything = both[1] + both[2] + UNSEEN * both[3]
         out[n, :3] = pose
         out[n, 3] = (both[0] - 0.5 * both[2]) / everything if everything > 0 else 0
@@ -207,11 +182,12 @@ def _refine(
     numbers, iteration, settled, calm = np.zeros(3, real), 0, False, False
     while iteration < rules.iterations and not settled and len(one):
         last = bool(capture <= rules.least_capture and scale <= rules.least_scale)
-        p = other[:: 1 if last and not rules.thin else rules.stride]
+        full = last and not rules.thin
+        p = other[:: 1 if full else rules.stride]
         c, s = np.cos(pose[2]), np.sin(pose[2])
         arm = np.stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1]], axis=1)
         place = arm + pose[:2]
-        near = nearest_point(one, place, capture * capture)
+        near = nearest_point(one, 1 if full else rules.skip, place, capture * capture)
         used = (near >= 0) & (lines[near, 3] > 0)
         information, gradient, doubt, numbers = add_pairing(lines[near[used]], place[used], arm[used], scale, last)
         iteration += 1

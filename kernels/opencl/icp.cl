@@ -2,50 +2,34 @@
 // search from the bearing of a place outwards ends where no point farther in bearing can be nearer.
 // Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
 // Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+// requires: icp_step
 
 // Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 // and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
 // that the other scan should see, points that contradict it, points that it did not see.
 #define MATCH_RESULT 24
-// Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
-#define MATCH_SUMS 18
-#define FULL_TURN ((real)6.283185307179586)
 // Rounding errors of bounds are far below this share.
 #define ALMOST ((real)0.999)
 // Weight in the score of a point that the other scan did not see; one that disagrees has 1.
 #define UNSEEN ((real)0.13)
 
-// Return the bearing of a place in [0, 2 pi).
-real bearing_of(const real2 place) {
-    const real bearing = atan2(place.y, place.x);
-    return bearing < 0 ? bearing + FULL_TURN : bearing;
-}
-
-// Return the number of points of a scan whose bearing is less than a bearing.
-int points_before(global const real4 *point, const int count, const real bearing) {
-    const real span = point[count - 1].z - point[0].z;
-    const real share = span > 0 ? (bearing - point[0].z) / span : 0;
-    int i = share <= 0 ? 0 : share >= 1 ? count : (int)(share * (count - 1));
-    while (i < count && point[i].z < bearing) ++i;
-    while (i > 0 && point[i - 1].z >= bearing) --i;
-    return i;
-}
-
-// Return the nearest point of a scan that is nearer than the square root of squared, -1 without one; ahead points have
-// a smaller bearing than the place.
-int nearest_point(global const real4 *point, const int count, const int ahead, const real2 place, const real squared) {
+// Return the nearest of every skip-th point of a scan that is nearer than the square root of squared, -1 without one;
+// ahead points have a smaller bearing than the place.
+int nearest_point(global const real4 *point, const int count, const int ahead, const int skip, const real2 place,
+                  const real squared) {
+    const int kept = (count + skip - 1) / skip, before = (ahead + skip - 1) / skip;
     const real length = dot(place, place);
     real best = squared;
     int which = -1;
     for (int direction = 1; direction >= -1; direction -= 2) {
-        int i = direction > 0 ? ahead : ahead - 1;
-        for (int k = 0; k < count; ++k) {
-            i = i >= count ? i - count : i < 0 ? i + count : i;
-            const real2 p = point[i].xy, d = p - place;
+        int i = direction > 0 ? before : before - 1;
+        for (int k = 0; k < kept; ++k) {
+            i = i >= kept ? i - kept : i < 0 ? i + kept : i;
+            const real2 p = point[skip * i].xy, d = p - place;
             const real distance = d.x * d.x + d.y * d.y;
             if (distance < best) {
                 best = distance;
-                which = i;
+                which = skip * i;
             } else {
                 const real cross = place.x * p.y - place.y * p.x;
                 const int beside = place.x * p.x + place.y * p.y > 0;
@@ -85,33 +69,18 @@ void add_pairing(real *sums, const real4 line, const real2 place, const real2 ar
     sums[17] += 1;
 }
 
-// Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
-real4 solve(const real *sums) {
-    const real damping = (real)1e-5 * (sums[0] + sums[3]) + (real)1e-9;
-    const real xx = sums[0] + damping, yy = sums[3] + damping, tt = sums[5] * (real)1.00001 + (real)1e-9;
-    const real a = sqrt(xx), b = sums[1] / a, c = sums[2] / a;
-    const real second = yy - b * b;
-    if (!(second > 0)) return (real4)(0);
-    const real d = sqrt(second), e = (sums[4] - b * c) / d, third = tt - c * c - e * e;
-    if (!(third > 0)) return (real4)(0);
-    const real f = sqrt(third);
-    const real u = sums[6] / a, v = (sums[7] - b * u) / d, w = (sums[8] - c * u - e * v) / f;
-    const real theta = w / f, y = (v - e * theta) / d, x = (u - b * y - c * theta) / a;
-    return (real4)(x, y, theta, 1);
-}
-
-// Return how well every stride-th point of one scan agrees with another scan: sum of agreements, points that the other
+// Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of agreements, points that the other
 // scan should see, points that contradict it because it saw through them, and points that it did not see. pose is
 // (x, y, cos, sin).
 real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
-                const int others, const int stride, const real4 pose, const real near, const real gap) {
+                const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
     const real scale = near / 3;
     real4 sum = (real4)(0);
     for (int i = 0; i < others; i += stride) {
         const real2 p = other[i].xy;
         const real2 place = (real2)(pose.z * p.x - pose.w * p.y + pose.x, pose.w * p.x + pose.z * p.y + pose.y);
         const int ahead = points_before(point, count, bearing_of(place));
-        const int which = nearest_point(point, count, ahead, place, near * near);
+        const int which = nearest_point(point, count, ahead, skip, place, near * near);
         if (which >= 0) {
             const real ratio = (line[which].x * place.x + line[which].y * place.y - line[which].z) / scale;
             sum.x += 1 / (1 + ratio * ratio);
@@ -177,8 +146,8 @@ kernel void fit_lines(global const real4 *point, global const int *start, global
 }
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
-// scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with thin
-// also afterwards.
+// scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture radius
+// and scale have shrunk, with thin also afterwards.
 kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
                         global const int2 *pair, global const real4 *guess, global real *result, const int scans,
                         const int points, const int pairs, const int starts, const MatchRules rules) {
@@ -195,11 +164,12 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     while (iteration < rules.iterations && !settled && count > 0) {
         const int last = capture <= rules.least_capture && scale <= rules.least_scale;
         for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
-        for (int i = 0; i < others; i += last && !rules.thin ? 1 : rules.stride) {
+        const int full = last && !rules.thin, skip = full ? 1 : rules.skip;
+        for (int i = 0; i < others; i += full ? 1 : rules.stride) {
             const real2 p = point[second + i].xy;
             const real2 arm = (real2)(cosine * p.x - sine * p.y, sine * p.x + cosine * p.y), place = arm + pose.xy;
             const int ahead = points_before(point + first, count, bearing_of(place));
-            const int near = nearest_point(point + first, count, ahead, place, capture * capture);
+            const int near = nearest_point(point + first, count, ahead, skip, place, capture * capture);
             if (near >= 0 && line[first + near].w > 0) add_pairing(sums, line[first + near], place, arm, scale, last);
         }
         ++iteration;
@@ -222,10 +192,11 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     global real *out = result + (long)MATCH_RESULT * n;
     real4 there = (real4)(0), back = (real4)(0);
     if (count > 0 && others > 0) {
+        const int skip = rules.thin ? rules.skip : 1;
         const real4 inverse = (real4)(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine);
-        there = agreement(point + first, line + first, count, point + second, others, rules.score_stride,
+        there = agreement(point + first, line + first, count, point + second, others, rules.score_stride, skip,
                           (real4)(pose.x, pose.y, cosine, sine), rules.near, rules.gap);
-        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, inverse,
+        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
                          rules.near, rules.gap);
     }
     const real4 both = there + back;

@@ -12,14 +12,13 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import icp_step
 from .prelude import kernel, precision, work_item
 
 # Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 # and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
 # that the other scan should see, points that contradict it, points that it did not see.
 MATCH_RESULT = wp.constant(24)
-# Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
-MATCH_SUMS = 18
 
 
 @functools.cache
@@ -27,75 +26,56 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
+    step = icp_step.functions(flags)
+    Sums, bearing_of, points_before = step.Sums, step.bearing_of, step.points_before
     ZERO, ONE, THREE = real(0.0), real(1.0), real(3.0)
     FULL_TURN = real(6.283185307179586)
     # Rounding errors of bounds are far below this share.
     ALMOST = real(0.999)
-    DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
 
-    # Return the bearing of a place in [0, 2 pi).
-    @wp.func
-    def bearing_of(place: vec2):
-        bearing = wp.atan2(place.y, place.x)
-        if bearing < ZERO:
-            bearing += FULL_TURN
-        return bearing
-
-    # Return the number of points of a scan whose bearing is less than a bearing.
-    @wp.func
-    def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real):
-        low = point[first].z
-        span = point[first + count - 1].z - low
-        share = ZERO
-        if span > ZERO:
-            share = (bearing - low) / span
-        i = int(0)
-        if share >= ONE:
-            i = count
-        elif share > ZERO:
-            i = int(share * real(count - 1))
-        while i < count and point[first + wp.min(i, count - 1)].z < bearing:
-            i += 1
-        while i > 0 and point[first + wp.max(i - 1, 0)].z >= bearing:
-            i -= 1
-        return i
-
-    # Return the nearest point of a scan that is nearer than the square root of squared, -1 without one; ahead points
-    # have a smaller bearing than the place.
+    # Return the nearest of every skip-th point of a scan that is nearer than the square root of squared, -1 without
+    # one; ahead points have a smaller bearing than the place.
     @wp.func
     def nearest_point(
-        point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, ahead: wp.int32, place: vec2, squared: real
+        point: wp.array(dtype=vec4),
+        first: wp.int32,
+        count: wp.int32,
+        ahead: wp.int32,
+        skip: wp.int32,
+        place: vec2,
+        squared: real,
     ):
+        kept = (count + skip - 1) // skip
+        before = (ahead + skip - 1) // skip
         length = place.x * place.x + place.y * place.y
         best = squared
         which = int(-1)
         for side in range(2):
             direction = int(1)
-            i = int(ahead)
+            i = int(before)
             if side == 1:
                 direction = -1
-                i = ahead - 1
+                i = before - 1
             k = int(0)
-            while k < count:
-                if i >= count:
-                    i -= count
+            while k < kept:
+                if i >= kept:
+                    i -= kept
                 if i < 0:
-                    i += count
-                p = point[first + i]
+                    i += kept
+                p = point[first + skip * i]
                 x = p.x - place.x
                 y = p.y - place.y
                 distance = x * x + y * y
                 if distance < best:
                     best = distance
-                    which = i
+                    which = skip * i
                 else:
                     cross = place.x * p.y - place.y * p.x
                     if place.x * p.x + place.y * p.y > ZERO:
                         if ALMOST * cross * cross > best * (p.x * p.x + p.y * p.y):
-                            k = count
+                            k = kept
                     elif ALMOST * length > best:
-                        k = count
+                        k = kept
                 i += direction
                 k += 1
         return which
@@ -132,36 +112,9 @@ def functions(flags):
         sums[17] += ONE
         return sums
 
-    # Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
-    @wp.func
-    def solve(sums: Sums):
-        damping = DAMPING * (sums[0] + sums[3]) + LEAST_DAMPING
-        xx = sums[0] + damping
-        yy = sums[3] + damping
-        tt = sums[5] * DAMPED_TURN + LEAST_DAMPING
-        a = wp.sqrt(xx)
-        b = sums[1] / a
-        c = sums[2] / a
-        second = yy - b * b
-        if not second > ZERO:
-            return vec4()
-        d = wp.sqrt(second)
-        e = (sums[4] - b * c) / d
-        third = tt - c * c - e * e
-        if not third > ZERO:
-            return vec4()
-        f = wp.sqrt(third)
-        u = sums[6] / a
-        v = (sums[7] - b * u) / d
-        w = (sums[8] - c * u - e * v) / f
-        theta = w / f
-        y = (v - e * theta) / d
-        x = (u - b * y - c * theta) / a
-        return vec4(x, y, theta, ONE)
-
-    # Return how well every stride-th point of one scan agrees with another scan: sum of agreements, points that the
-    # other scan should see, points that contradict it because it saw through them, and points that it did not see.
-    # pose is (x, y, cos, sin).
+    # Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of
+    # agreements, points that the other scan should see, points that contradict it because it saw through them, and
+    # points that it did not see. pose is (x, y, cos, sin).
     @wp.func
     def agreement(
         point: wp.array(dtype=vec4),
@@ -171,6 +124,7 @@ def functions(flags):
         second: wp.int32,
         others: wp.int32,
         stride: wp.int32,
+        skip: wp.int32,
         pose: vec4,
         near: real,
         gap: real,
@@ -184,7 +138,7 @@ def functions(flags):
             y = pose.w * p.x + pose.z * p.y + pose.y
             place = vec2(x, y)
             ahead = points_before(point, first, count, bearing_of(place))
-            which = nearest_point(point, first, count, ahead, place, near * near)
+            which = nearest_point(point, first, count, ahead, skip, place, near * near)
             if which >= 0:
                 at = line[first + which]
                 ratio = (at.x * x + at.y * y - at.z) / scale
@@ -205,7 +159,7 @@ def functions(flags):
 
     return SimpleNamespace(
         Sums=Sums, bearing_of=bearing_of, points_before=points_before, nearest_point=nearest_point,
-        add_pairing=add_pairing, solve=solve, agreement=agreement,
+        add_pairing=add_pairing, solve=step.solve, agreement=agreement,
     )  # fmt: skip
 
 
@@ -347,16 +301,18 @@ def make(name, flags):
         while running == 1 and iteration < rules.iterations and settled == 0 and count > 0:
             last = capture <= rules.least_capture and scale <= rules.least_scale
             sums = Sums()
-            stride = rules.stride
+            stride = int(rules.stride)
+            skip = int(rules.skip)
             if last and rules.thin == 0:
                 stride = 1
+                skip = 1
             i = int(0)
             while i < others:
                 p = point[second + i]
                 arm = vec2(cosine * p.x - sine * p.y, sine * p.x + cosine * p.y)
                 place = vec2(arm.x + pose.x, arm.y + pose.y)
                 ahead = points_before(point, first, count, bearing_of(place))
-                near = nearest_point(point, first, count, ahead, place, capture * capture)
+                near = nearest_point(point, first, count, ahead, skip, place, capture * capture)
                 if near >= 0:
                     at = line[first + near]
                     if at.w > ZERO:
@@ -388,9 +344,12 @@ def make(name, flags):
         if count > 0 and others > 0:
             forward = vec4(pose.x, pose.y, cosine, sine)
             inverse = vec4(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine)
-            step_size = rules.score_stride
-            both = agreement(point, line, first, count, second, others, step_size, forward, rules.near, rules.gap)
-            both += agreement(point, line, second, others, first, count, step_size, inverse, rules.near, rules.gap)
+            stride = rules.score_stride
+            skip = int(1)
+            if rules.thin == 1:
+                skip = rules.skip
+            both = agreement(point, line, first, count, second, others, stride, skip, forward, rules.near, rules.gap)
+            both += agreement(point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap)
         everything = both.y + both.z + UNSEEN * both.w
         score = real(0.0)
         if everything > ZERO:

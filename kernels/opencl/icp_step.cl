@@ -1,0 +1,37 @@
+// Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a scan,
+// and the normal equations.
+
+// Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
+#define MATCH_SUMS 18
+#define FULL_TURN ((real)6.283185307179586)
+
+// Return the bearing of a place in [0, 2 pi).
+real bearing_of(const real2 place) {
+    const real bearing = atan2(place.y, place.x);
+    return bearing < 0 ? bearing + FULL_TURN : bearing;
+}
+
+// Return the number of points of a scan whose bearing is less than a bearing.
+int points_before(global const real4 *point, const int count, const real bearing) {
+    const real span = point[count - 1].z - point[0].z;
+    const real share = span > 0 ? (bearing - point[0].z) / span : 0;
+    int i = share <= 0 ? 0 : share >= 1 ? count : (int)(share * (count - 1));
+    while (i < count && point[i].z < bearing) ++i;
+    while (i > 0 && point[i - 1].z >= bearing) --i;
+    return i;
+}
+
+// Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
+real4 solve(const real *sums) {
+    const real damping = (real)1e-5 * (sums[0] + sums[3]) + (real)1e-9;
+    const real xx = sums[0] + damping, yy = sums[3] + damping, tt = sums[5] * (real)1.00001 + (real)1e-9;
+    const real a = sqrt(xx), b = sums[1] / a, c = sums[2] / a;
+    const real second = yy - b * b;
+    if (!(second > 0)) return (real4)(0);
+    const real d = sqrt(second), e = (sums[4] - b * c) / d, third = tt - c * c - e * e;
+    if (!(third > 0)) return (real4)(0);
+    const real f = sqrt(third);
+    const real u = sums[6] / a, v = (sums[7] - b * u) / d, w = (sums[8] - c * u - e * v) / f;
+    const real theta = w / f, y = (v - e * theta) / d, x = (u - b * y - c * theta) / a;
+    return (real4)(x, y, theta, 1);
+}

@@ -1,0 +1,267 @@
+// Point-to-line ICP for LANES points of a scan at once: match_scans of icp.cl. The points of a block are neighbours in
+// bearing, and so are their nearest points: all of them are compared with one point of the reference after another, first
+// with those between their bearings, then with those outside that may be nearer than the nearest so far.
+// requires: icp_step lanes/types
+
+// Numbers of a result; see icp.cl.
+#define MATCH_RESULT 24
+// Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+#define UNSEEN ((real)0.13)
+// arctan t of t in [0, 1], within 1e-5: Abramowitz and Stegun (1964), 4.4.49.
+#define ARC1 0.9998660f
+#define ARC3 -0.3302995f
+#define ARC5 0.1801410f
+#define ARC7 -0.0851330f
+#define ARC9 0.0208351f
+// arcsin s < s + ARCSIN s^3. Errors of bearings are far below BEARING_ERROR.
+#define ARCSIN 0.571f
+#define BEARING_ERROR 1e-4f
+
+// Return the smallest lane.
+real least_lane(const lanes a) {
+    const float8 eight = a.lo < a.hi ? a.lo : a.hi;
+    const float4 four = eight.lo < eight.hi ? eight.lo : eight.hi;
+    const float2 two = four.lo < four.hi ? four.lo : four.hi;
+    return two.x < two.y ? two.x : two.y;
+}
+
+// Return bearings in [0, 2 pi) within BEARING_ERROR.
+lanes bearing_lanes(const lanes x, const lanes y) {
+    const lanes a = as_lanes(size_bits(x)), b = as_lanes(size_bits(y));
+    const ilanes steep = b > a;
+    const lanes t = (steep ? a : b) / ((steep ? b : a) + 1e-30f), z = t * t;
+    const lanes arc = t * (ARC1 + z * (ARC3 + z * (ARC5 + z * (ARC7 + z * ARC9))));
+    const lanes octant = steep ? 0.5f * FULL_TURN / 2 - arc : arc;
+    const lanes half_plane = x < 0.0f ? 0.5f * FULL_TURN - octant : octant;
+    return y < 0.0f ? FULL_TURN - half_plane : half_plane;
+}
+
+// Return the bearing of the i-th point of a scan, whose points follow each other turn after turn; -count <= i < 2 count.
+real turned_bearing(global const real4 *point, const int count, const int skip, const int i) {
+    return i < 0 ? point[skip * (i + count)].z - FULL_TURN
+                 : i >= count ? point[skip * (i - count)].z + FULL_TURN : point[skip * i].z;
+}
+
+// Keep the points from one to before another where they are nearer; see turned_bearing.
+void compare_lanes(global const real4 *point, const int count, const int skip, const int from, const int to,
+                   const lanes x, const lanes y, lanes *best, ilanes *which) {
+    lanes least = *best;
+    ilanes nearest = *which;
+    for (int begin = from; begin < to;) {
+        const int shift = begin < 0 ? count : begin >= count ? -count : 0;
+        const int end = min(to, begin < 0 ? 0 : begin >= count ? 2 * count : count);
+        for (int i = skip * (begin + shift); i < skip * (end + shift); i += skip) {
+            const real2 p = point[i].xy;
+            const lanes dx = p.x - x, dy = p.y - y, distance = dx * dx + dy * dy;
+            const ilanes nearer = distance < least;
+            least = nearer ? distance : least;
+            nearest = nearer ? (ilanes)i : nearest;
+        }
+        begin = end;
+    }
+    *best = least;
+    *which = nearest;
+}
+
+// Return the nearest of every skip-th point of a scan that are nearer than the square root of squared, -1 without one.
+// The search begins at *hint, which becomes a good beginning for the next block.
+ilanes nearest_lanes(global const real4 *point, const int count, const int skip, const lanes x, const lanes y,
+                     const real squared, int *hint) {
+    const int kept = (count + skip - 1) / skip;
+    const lanes bearing = bearing_lanes(x, y);
+    lanes from = bearing - bearing.s0;
+    from = from > 0.5f * FULL_TURN ? from - FULL_TURN : from;
+    from = from < -0.5f * FULL_TURN ? from + FULL_TURN : from;
+    const real low = bearing.s0 + least_lane(from), turn = low < 0 ? FULL_TURN : low >= FULL_TURN ? -FULL_TURN : 0;
+    // Bearings of the block relative to the smallest one, which is in [0, 2 pi).
+    from += bearing.s0 - low;
+    const real first = low + turn, high = first - least_lane(-from);
+    int begin = min(*hint, kept);
+    while (begin < kept && point[skip * begin].z < first) ++begin;
+    while (begin > 0 && point[skip * (begin - 1)].z >= first) --begin;
+    int end = begin;
+    while (end < begin + kept && turned_bearing(point, kept, skip, end) <= high) ++end;
+    *hint = end < kept ? end : end - kept;
+    lanes best = squared;
+    ilanes which = -1;
+    compare_lanes(point, kept, skip, begin, end, x, y, &best, &which);
+    const lanes share = best / (x * x + y * y + 1e-30f), sine = sqrt(share);
+    const lanes width = share < 1.0f ? sine + sine * share * ARCSIN + BEARING_ERROR : (lanes)FULL_TURN;
+    const real last = first - least_lane(-(from + width)), earliest = first + least_lane(from - width);
+    int top = end, bottom = begin;
+    while (top < begin + kept && turned_bearing(point, kept, skip, top) <= last) ++top;
+    while (bottom > top - kept && turned_bearing(point, kept, skip, bottom - 1) >= earliest) --bottom;
+    compare_lanes(point, kept, skip, end, top, x, y, &best, &which);
+    compare_lanes(point, kept, skip, bottom, begin, x, y, &best, &which);
+    return which;
+}
+
+// Add pairs of lines and places, those with a weight of 0 without effect; arm is the place relative to the second scan's
+// origin.
+void add_pairing_lanes(lanes *sums, const lanes *line, const lanes x, const lanes y, const lanes arm_x,
+                       const lanes arm_y, const real scale, const int last, const lanes counted) {
+    const lanes error = line[0] * x + line[1] * y - line[2], ratio = error / scale;
+    lanes weight = 1 / (1 + ratio * ratio);
+    if (last) weight *= weight;
+    weight *= counted;
+    const lanes turn = line[1] * arm_x - line[0] * arm_y, along = line[0] * arm_x + line[1] * arm_y;
+    const lanes doubt = weight * line[3], pull = weight * error;
+    const lanes doubt_x = doubt * line[0], doubt_y = doubt * line[1], weight_x = weight * line[0];
+    const lanes weight_y = weight * line[1];
+    sums[0] += weight_x * line[0];
+    sums[1] += weight_x * line[1];
+    sums[2] += weight_x * turn;
+    sums[3] += weight_y * line[1];
+    sums[4] += weight_y * turn;
+    sums[5] += weight * turn * turn;
+    sums[6] -= pull * line[0];
+    sums[7] -= pull * line[1];
+    sums[8] -= pull * turn;
+    sums[9] += doubt_y * line[1];
+    sums[10] -= doubt_x * line[1];
+    sums[11] -= doubt_y * along;
+    sums[12] += doubt_x * line[0];
+    sums[13] += doubt_x * along;
+    sums[14] += doubt * along * along;
+    sums[15] += weight;
+    sums[16] += pull * error;
+    sums[17] += counted;
+}
+
+// Return the points of a block from the first-th on, every stride-th; the last one stands in for missing ones.
+ilanes block_of(const int first, const int stride, const int count) {
+    const ilanes i = first + stride * (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    return i < count ? i : (ilanes)(count - 1);
+}
+
+// Write lines of points, and return 1 where there is one and 0 elsewhere.
+lanes lines_lanes(global const real4 *line, const ilanes which, lanes *lines) {
+    global const real *numbers = (global const real *)line;
+    const ilanes at = 4 * (which < 0 ? (ilanes)0 : which);
+    const int *i = (const int *)&at;
+    for (int j = 0; j < 4; ++j) lines[j] = GATHER_AT(lanes, (numbers + j), i);
+    return which >= 0 ? (lanes)1 : (lanes)0;
+}
+
+// Return how well every stride-th point of one scan agrees with every skip-th point of another scan; see icp.cl.
+real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
+                const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
+    const real scale = near / 3;
+    global const real *numbers = (global const real *)other;
+    lanes sum = 0, seen = 0;
+    int hint = 0;
+    real4 all = (real4)(0);
+    for (int i = 0; i < others; i += LANES * stride) {
+        const ilanes block = block_of(i, stride, others), at = 4 * block;
+        const int *k = (const int *)&at;
+        const lanes px = GATHER_AT(lanes, numbers, k), py = GATHER_AT(lanes, (numbers + 1), k);
+        const lanes x = pose.z * px - pose.w * py + pose.x, y = pose.w * px + pose.z * py + pose.y;
+        const ilanes which = nearest_lanes(point, count, skip, x, y, near * near, &hint);
+        lanes lines[4];
+        const int size = min(LANES, (others - i + stride - 1) / stride);
+        const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;
+        const lanes found = present * lines_lanes(line, which, lines);
+        const lanes ratio = (lines[0] * x + lines[1] * y - lines[2]) / scale;
+        sum += found / (1 + ratio * ratio);
+        seen += found;
+        if (!any_lane(which < 0)) continue;
+        for (int l = 0; l < size; ++l) {
+            if (((const int *)&which)[l] >= 0) continue;
+            const real2 place = (real2)(((const real *)&x)[l], ((const real *)&y)[l]);
+            const int ahead = points_before(point, count, bearing_of(place));
+            const real4 low = point[ahead > 0 ? ahead - 1 : count - 1], high = point[ahead < count ? ahead : 0];
+            const real between = high.z < low.z ? high.z - low.z + FULL_TURN : high.z - low.z;
+            const real range = fmin(low.w, high.w);
+            if (between <= gap && dot(place, place) < range * range)
+                all.z += 1;
+            else
+                all.w += 1;
+        }
+    }
+    return all + (real4)(sum_lanes(sum), sum_lanes(seen), 0, 0);
+}
+
+// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin).
+void sum_pairs(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
+               const int others, const int stride, const int skip, const real4 pose, const real capture,
+               const real scale, const int last, real *sums) {
+    global const real *numbers = (global const real *)other;
+    lanes total[MATCH_SUMS];
+    int hint = 0;
+    for (int i = 0; i < MATCH_SUMS; ++i) total[i] = 0;
+    for (int i = 0; i < others; i += LANES * stride) {
+        const ilanes block = block_of(i, stride, others), at = 4 * block;
+        const int *k = (const int *)&at;
+        const lanes px = GATHER_AT(lanes, numbers, k), py = GATHER_AT(lanes, (numbers + 1), k);
+        const lanes arm_x = pose.z * px - pose.w * py, arm_y = pose.w * px + pose.z * py;
+        const lanes x = arm_x + pose.x, y = arm_y + pose.y;
+        const ilanes which = nearest_lanes(point, count, skip, x, y, capture * capture, &hint);
+        lanes lines[4];
+        const int size = min(LANES, (others - i + stride - 1) / stride);
+        const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;
+        const lanes found = present * lines_lanes(line, which, lines);
+        add_pairing_lanes(total, lines, x, y, arm_x, arm_y, scale, last, lines[3] > 0.0f ? found : (lanes)0);
+    }
+    for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = sum_lanes(total[i]);
+}
+
+// Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
+// scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture radius
+// and scale have shrunk, with thin also afterwards.
+kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
+                        global const int2 *pair, global const real4 *guess, global real *result, const int scans,
+                        const int points, const int pairs, const int starts, const MatchRules rules) {
+    const int n = get_global_id(0);
+    if (n >= pairs * starts) return;
+    const int2 which = pair[n / starts];
+    const int first = start[which.x], count = start[which.x + 1] - first;
+    const int second = start[which.y], others = start[which.y + 1] - second;
+    real4 pose = guess[n];
+    real sums[MATCH_SUMS];
+    real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
+    int iteration = 0, settled = 0, calm = 0;
+    for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
+    while (iteration < rules.iterations && !settled && count > 0) {
+        const int last = capture <= rules.least_capture && scale <= rules.least_scale;
+        const int full = last && !rules.thin;
+        sum_pairs(point + first, line + first, count, point + second, others, full ? 1 : rules.stride,
+                  full ? 1 : rules.skip, (real4)(pose.x, pose.y, cosine, sine), capture, scale, last, sums);
+        ++iteration;
+        real4 step = solve(sums);
+        if (step.w == 0) break;
+        const real length = sqrt(step.x * step.x + step.y * step.y), most = (real)0.5 * rules.capture;
+        if (length > most) step.xy *= most / length;
+        step.z = fmax(fmin(step.z, (real)0.3), (real)-0.3);
+        pose += step;
+        cosine = cos(pose.z);
+        sine = sin(pose.z);
+        const real change = fmax(length, fabs(step.z));
+        settled = last && change < rules.tolerance;
+        calm = last && change < 10 * rules.tolerance;
+        const int quiet = length < (real)0.1 * scale && fabs(step.z) < (real)0.03 * scale;
+        const real factor = quiet && !last ? rules.shrink * rules.shrink : rules.shrink;
+        capture = fmax(capture * factor, rules.least_capture);
+        scale = fmax(scale * factor, rules.least_scale);
+    }
+    global real *out = result + (long)MATCH_RESULT * n;
+    real4 there = (real4)(0), back = (real4)(0);
+    if (count > 0 && others > 0) {
+        const int skip = rules.thin ? rules.skip : 1;
+        const real4 inverse = (real4)(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine);
+        there = agreement(point + first, line + first, count, point + second, others, rules.score_stride, skip,
+                          (real4)(pose.x, pose.y, cosine, sine), rules.near, rules.gap);
+        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
+                         rules.near, rules.gap);
+    }
+    const real4 both = there + back;
+    const real all = both.y + both.z + UNSEEN * both.w;
+    out[0] = pose.x, out[1] = pose.y, out[2] = pose.z;
+    out[3] = all > 0 ? (both.x - (real)0.5 * both.z) / all : 0;
+    out[4] = iteration, out[5] = calm;
+    for (int i = 0; i < 6; ++i) {
+        out[6 + i] = sums[i];
+        out[12 + i] = sums[9 + i];
+    }
+    out[18] = sums[17], out[19] = sums[15], out[20] = sums[16];
+    out[21] = both.y, out[22] = both.z, out[23] = both.w;
+}

@@ -1,0 +1,80 @@
+"""Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a
+scan, and the normal equations.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import precision
+
+# Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
+MATCH_SUMS = 18
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
+    ZERO, ONE = real(0.0), real(1.0)
+    FULL_TURN = real(6.283185307179586)
+    DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
+
+    # Return the bearing of a place in [0, 2 pi).
+    @wp.func
+    def bearing_of(place: vec2):
+        bearing = wp.atan2(place.y, place.x)
+        if bearing < ZERO:
+            bearing += FULL_TURN
+        return bearing
+
+    # Return the number of points of a scan whose bearing is less than a bearing.
+    @wp.func
+    def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real):
+        low = point[first].z
+        span = point[first + count - 1].z - low
+        share = ZERO
+        if span > ZERO:
+            share = (bearing - low) / span
+        i = int(0)
+        if share >= ONE:
+            i = count
+        elif share > ZERO:
+            i = int(share * real(count - 1))
+        while i < count and point[first + wp.min(i, count - 1)].z < bearing:
+            i += 1
+        while i > 0 and point[first + wp.max(i - 1, 0)].z >= bearing:
+            i -= 1
+        return i
+
+    # Solve the damped normal equations by Cholesky's factors: step in x, y and theta, and whether there is one.
+    @wp.func
+    def solve(sums: Sums):
+        damping = DAMPING * (sums[0] + sums[3]) + LEAST_DAMPING
+        xx = sums[0] + damping
+        yy = sums[3] + damping
+        tt = sums[5] * DAMPED_TURN + LEAST_DAMPING
+        a = wp.sqrt(xx)
+        b = sums[1] / a
+        c = sums[2] / a
+        second = yy - b * b
+        if not second > ZERO:
+            return vec4()
+        d = wp.sqrt(second)
+        e = (sums[4] - b * c) / d
+        third = tt - c * c - e * e
+        if not third > ZERO:
+            return vec4()
+        f = wp.sqrt(third)
+        u = sums[6] / a
+        v = (sums[7] - b * u) / d
+        w = (sums[8] - c * u - e * v) / f
+        theta = w / f
+        y = (v - e * theta) / d
+        x = (u - b * y - c * theta) / a
+        return vec4(x, y, theta, ONE)
+
+    return SimpleNamespace(Sums=Sums, bearing_of=bearing_of, points_before=points_before, solve=solve)

@@ -1,21 +1,16 @@
 // Point-to-line ICP for LANES points of a scan at once: match_scans of icp.cl. The points of a block are neighbours in
 // bearing, and so are their nearest points: all of them are compared with one point of the reference after another, first
 // with those between their bearings, then with those outside that may be nearer than the nearest so far.
-// requires: icp_step lanes/types
+// requires: icp_step lanes/math
 
 // Numbers of a result; see icp.cl.
 #define MATCH_RESULT 24
 // Weight in the score of a point that the other scan did not see; one that disagrees has 1.
 #define UNSEEN ((real)0.13)
-// arctan t of t in [0, 1], within 1e-5: Abramowitz and Stegun (1964), 4.4.49.
-#define ARC1 0.9998660f
-#define ARC3 -0.3302995f
-#define ARC5 0.1801410f
-#define ARC7 -0.0851330f
-#define ARC9 0.0208351f
-// arcsin s < s + ARCSIN s^3. Errors of bearings are far below BEARING_ERROR.
+// tan(pi / 8). arcsin s < s + ARCSIN s^3. Errors of bearings are far below BEARING_ERROR.
+#define TAN_EIGHTH 0.414213562f
 #define ARCSIN 0.571f
-#define BEARING_ERROR 1e-4f
+#define BEARING_ERROR 1e-5f
 
 // Return the smallest lane.
 real least_lane(const lanes a) {
@@ -25,15 +20,25 @@ real least_lane(const lanes a) {
     return two.x < two.y ? two.x : two.y;
 }
 
-// Return bearings in [0, 2 pi) within BEARING_ERROR.
+// Return the bearings of places in [0, 2 pi].
 lanes bearing_lanes(const lanes x, const lanes y) {
     const lanes a = as_lanes(size_bits(x)), b = as_lanes(size_bits(y));
     const ilanes steep = b > a;
-    const lanes t = (steep ? a : b) / ((steep ? b : a) + 1e-30f), z = t * t;
-    const lanes arc = t * (ARC1 + z * (ARC3 + z * (ARC5 + z * (ARC7 + z * ARC9))));
-    const lanes octant = steep ? 0.5f * FULL_TURN / 2 - arc : arc;
-    const lanes half_plane = x < 0.0f ? 0.5f * FULL_TURN - octant : octant;
-    return y < 0.0f ? FULL_TURN - half_plane : half_plane;
+    const lanes low = steep ? a : b, high = (steep ? b : a) + 1e-30f;
+    // Above tan(pi/8): arctan t = pi/4 + arctan((t - 1) / (t + 1)).
+    const ilanes wide = low > TAN_EIGHTH * high;
+    const lanes t = (wide ? low - high : low) / (wide ? low + high : high);
+    const lanes arc = t + arc_rest_lanes(t) + (wide ? (lanes)(FULL_TURN / 8) : (lanes)0);
+    const lanes quarter = steep ? FULL_TURN / 4 - arc : arc, above = x < 0.0f ? FULL_TURN / 2 - quarter : quarter;
+    return y < 0.0f ? FULL_TURN - above : above;
+}
+
+// Return points_before of every skip-th point, walking from a guess.
+int points_before_from(global const real4 *point, const int count, const int skip, const real bearing, const int guess) {
+    int i = guess;
+    while (i < count && point[skip * i].z < bearing) ++i;
+    while (i > 0 && point[skip * (i - 1)].z >= bearing) --i;
+    return i;
 }
 
 // Return the bearing of the i-th point of a scan, whose points follow each other turn after turn; -count <= i < 2 count.
@@ -66,9 +71,8 @@ void compare_lanes(global const real4 *point, const int count, const int skip, c
 // Return the nearest of every skip-th point of a scan that are nearer than the square root of squared, -1 without one.
 // The search begins at *hint, which becomes a good beginning for the next block.
 ilanes nearest_lanes(global const real4 *point, const int count, const int skip, const lanes x, const lanes y,
-                     const real squared, int *hint) {
+                     const lanes bearing, const real squared, int *hint) {
     const int kept = (count + skip - 1) / skip;
-    const lanes bearing = bearing_lanes(x, y);
     lanes from = bearing - bearing.s0;
     from = from > 0.5f * FULL_TURN ? from - FULL_TURN : from;
     from = from < -0.5f * FULL_TURN ? from + FULL_TURN : from;
@@ -76,9 +80,7 @@ ilanes nearest_lanes(global const real4 *point, const int count, const int skip,
     // Bearings of the block relative to the smallest one, which is in [0, 2 pi).
     from += bearing.s0 - low;
     const real first = low + turn, high = first - least_lane(-from);
-    int begin = min(*hint, kept);
-    while (begin < kept && point[skip * begin].z < first) ++begin;
-    while (begin > 0 && point[skip * (begin - 1)].z >= first) --begin;
+    const int begin = points_before_from(point, kept, skip, first, min(*hint, kept));
     int end = begin;
     while (end < begin + kept && turned_bearing(point, kept, skip, end) <= high) ++end;
     *hint = end < kept ? end : end - kept;
@@ -149,14 +151,15 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
     const real scale = near / 3;
     global const real *numbers = (global const real *)other;
     lanes sum = 0, seen = 0;
-    int hint = 0;
+    int hint = 0, ahead = 0;
     real4 all = (real4)(0);
     for (int i = 0; i < others; i += LANES * stride) {
         const ilanes block = block_of(i, stride, others), at = 4 * block;
         const int *k = (const int *)&at;
-        const lanes px = GATHER_AT(lanes, numbers, k), py = GATHER_AT(lanes, (numbers + 1), k);
-        const lanes x = pose.z * px - pose.w * py + pose.x, y = pose.w * px + pose.z * py + pose.y;
-        const ilanes which = nearest_lanes(point, count, skip, x, y, near * near, &hint);
+        const lanes p = GATHER_AT(lanes, numbers, k), q = GATHER_AT(lanes, (numbers + 1), k);
+        const lanes x = pose.z * p - pose.w * q + pose.x, y = pose.w * p + pose.z * q + pose.y;
+        const lanes bearing = bearing_lanes(x, y);
+        const ilanes which = nearest_lanes(point, count, skip, x, y, bearing, near * near, &hint);
         lanes lines[4];
         const int size = min(LANES, (others - i + stride - 1) / stride);
         const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;
@@ -167,12 +170,12 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
         if (!any_lane(which < 0)) continue;
         for (int l = 0; l < size; ++l) {
             if (((const int *)&which)[l] >= 0) continue;
-            const real2 place = (real2)(((const real *)&x)[l], ((const real *)&y)[l]);
-            const int ahead = points_before(point, count, bearing_of(place));
+            const real px = ((const real *)&x)[l], py = ((const real *)&y)[l];
+            ahead = points_before_from(point, count, 1, ((const real *)&bearing)[l], ahead);
             const real4 low = point[ahead > 0 ? ahead - 1 : count - 1], high = point[ahead < count ? ahead : 0];
             const real between = high.z < low.z ? high.z - low.z + FULL_TURN : high.z - low.z;
             const real range = fmin(low.w, high.w);
-            if (between <= gap && dot(place, place) < range * range)
+            if (between <= gap && px * px + py * py < range * range)
                 all.z += 1;
             else
                 all.w += 1;
@@ -195,7 +198,7 @@ void sum_pairs(global const real4 *point, global const real4 *line, const int co
         const lanes px = GATHER_AT(lanes, numbers, k), py = GATHER_AT(lanes, (numbers + 1), k);
         const lanes arm_x = pose.z * px - pose.w * py, arm_y = pose.w * px + pose.z * py;
         const lanes x = arm_x + pose.x, y = arm_y + pose.y;
-        const ilanes which = nearest_lanes(point, count, skip, x, y, capture * capture, &hint);
+        const ilanes which = nearest_lanes(point, count, skip, x, y, bearing_lanes(x, y), capture * capture, &hint);
         lanes lines[4];
         const int size = min(LANES, (others - i + stride - 1) / stride);
         const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;

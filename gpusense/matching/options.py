@@ -12,6 +12,8 @@ from gpusense.interface.structs import MatchRules
 
 # Points that take part while the scale shrinks, and of each start of a search.
 _COARSE_POINTS, _SEARCH_POINTS = 200, 30
+# Most points of the reference in a search.
+_SEARCH_REFERENCE = 64
 # Largest translation of a guess between scans [m]; float32 has 6 cm there.
 _FARTHEST = 1e6
 
@@ -48,8 +50,9 @@ class MatchOptions:
         full = self.rules(points, gap)
         stride, least = max(points // _SEARCH_POINTS, 1), max(2.5 * full.least_scale, 0.08 * self.capture)
         return full._replace(
-            iterations=6, stride=stride, skip=max(points * 8 // 400, 1), score_stride=stride, thin=1, capture=max(0.7 * self.capture, full.near),
-            scale=max(0.35 * self.capture, least), least_scale=least, shrink=0.55, tolerance=3e-3 * self.capture,
+            iterations=6, stride=stride, skip=-(-points // _SEARCH_REFERENCE) or 1, score_stride=stride, thin=1,
+            capture=max(0.7 * self.capture, full.near), scale=max(0.35 * self.capture, least),
+            least_scale=least, shrink=0.55, tolerance=3e-3 * self.capture,
         )  # fmt: skip
 
     def final_rules(self, points: int, gap: float) -> MatchRules:

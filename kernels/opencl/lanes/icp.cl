@@ -11,6 +11,8 @@
 #define TAN_EIGHTH 0.414213562f
 #define ARCSIN 0.571f
 #define BEARING_ERROR 1e-5f
+// Up to as many points are compared one and all.
+#define FEW_POINTS 64
 
 // Return the smallest lane.
 real least_lane(const lanes a) {
@@ -71,8 +73,15 @@ void compare_lanes(global const real4 *point, const int count, const int skip, c
 // Return the nearest of every skip-th point of a scan that are nearer than the square root of squared, -1 without one.
 // The search begins at *hint, which becomes a good beginning for the next block.
 ilanes nearest_lanes(global const real4 *point, const int count, const int skip, const lanes x, const lanes y,
-                     const lanes bearing, const real squared, int *hint) {
+                     const real squared, int *hint) {
     const int kept = (count + skip - 1) / skip;
+    lanes best = squared;
+    ilanes which = -1;
+    if (kept <= FEW_POINTS) {
+        compare_lanes(point, kept, skip, 0, kept, x, y, &best, &which);
+        return which;
+    }
+    const lanes bearing = bearing_lanes(x, y);
     lanes from = bearing - bearing.s0;
     from = from > 0.5f * FULL_TURN ? from - FULL_TURN : from;
     from = from < -0.5f * FULL_TURN ? from + FULL_TURN : from;
@@ -84,8 +93,6 @@ ilanes nearest_lanes(global const real4 *point, const int count, const int skip,
     int end = begin;
     while (end < begin + kept && turned_bearing(point, kept, skip, end) <= high) ++end;
     *hint = end < kept ? end : end - kept;
-    lanes best = squared;
-    ilanes which = -1;
     compare_lanes(point, kept, skip, begin, end, x, y, &best, &which);
     const lanes share = best / (x * x + y * y + 1e-30f), sine = sqrt(share);
     const lanes width = share < 1.0f ? sine + sine * share * ARCSIN + BEARING_ERROR : (lanes)FULL_TURN;
@@ -158,8 +165,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
         const int *k = (const int *)&at;
         const lanes p = GATHER_AT(lanes, numbers, k), q = GATHER_AT(lanes, (numbers + 1), k);
         const lanes x = pose.z * p - pose.w * q + pose.x, y = pose.w * p + pose.z * q + pose.y;
-        const lanes bearing = bearing_lanes(x, y);
-        const ilanes which = nearest_lanes(point, count, skip, x, y, bearing, near * near, &hint);
+        const ilanes which = nearest_lanes(point, count, skip, x, y, near * near, &hint);
         lanes lines[4];
         const int size = min(LANES, (others - i + stride - 1) / stride);
         const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;
@@ -168,6 +174,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
         sum += found / (1 + ratio * ratio);
         seen += found;
         if (!any_lane(which < 0)) continue;
+        const lanes bearing = bearing_lanes(x, y);
         for (int l = 0; l < size; ++l) {
             if (((const int *)&which)[l] >= 0) continue;
             const real px = ((const real *)&x)[l], py = ((const real *)&y)[l];
@@ -198,7 +205,7 @@ void sum_pairs(global const real4 *point, global const real4 *line, const int co
         const lanes px = GATHER_AT(lanes, numbers, k), py = GATHER_AT(lanes, (numbers + 1), k);
         const lanes arm_x = pose.z * px - pose.w * py, arm_y = pose.w * px + pose.z * py;
         const lanes x = arm_x + pose.x, y = arm_y + pose.y;
-        const ilanes which = nearest_lanes(point, count, skip, x, y, bearing_lanes(x, y), capture * capture, &hint);
+        const ilanes which = nearest_lanes(point, count, skip, x, y, capture * capture, &hint);
         lanes lines[4];
         const int size = min(LANES, (others - i + stride - 1) / stride);
         const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;

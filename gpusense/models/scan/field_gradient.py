@@ -8,6 +8,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import GRADIENT_NUMBERS
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import launch
+from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
 from gpusense.models.run import Piece, run_pieces
 from gpusense.models.scan.classed import ClassedScans
@@ -55,14 +56,17 @@ class _Gradient:
         resolution = pipeline.grid.resolution
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
         flags = (pipeline.components | readings.flags) - _OTHERS
+        flags, per_scan = widened(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
+        # Vectors of particles hold those of one scan.
+        size = readings.scans * -(-per_scan // LANES) * LANES if "WIDE" in flags else piece.count
+        given = readings.arguments
         gradient = launch(
-            "field_gradient", widened(backend.info.lanes, "field_gradient", flags), (piece.count,), table=table,
-            pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, point=readings.arguments["point"],
-            point_low=readings.arguments["point_low"], terms=pipeline.terms, start=readings.arguments["start"],
-            constant_terms=readings.sums["constant_terms"], gradient=numbers, window=placed.frame.window,
-            particles=piece.count, readings=readings.readings, guard=pipeline.guard * readings.reach, mount_x=mount_x,
-            mount_y=mount_y, resolution=resolution, score=Score(readings.constant_term, pipeline.setting.temperature),
-            batch=ScanBatch(piece.count // readings.scans, 0),
+            "field_gradient", flags, (size,), table=table, pose_cell=placed.cell, pose=placed.pose,
+            pose_low=placed.low, point=given["point"], point_low=given["point_low"], terms=pipeline.terms,
+            start=given["start"], constant_terms=readings.sums["constant_terms"], gradient=numbers,
+            window=placed.frame.window, particles=piece.count, readings=readings.readings,
+            guard=pipeline.guard * readings.reach, mount_x=mount_x, mount_y=mount_y, resolution=resolution,
+            score=Score(readings.constant_term, pipeline.setting.temperature), batch=ScanBatch(per_scan, 0),
         )  # fmt: skip
         backend.run((*placing_launches(placed, readings.placing), gradient))
         space.download(numbers, rows)

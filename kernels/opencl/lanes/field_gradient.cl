@@ -1,8 +1,16 @@
 // Gradient and information of LANES particles at once: field_gradient of field_gradient.cl. End points are rounded to
 // the working precision: the interpolated distance is continuous, so an error of an end point moves it by as much.
-// requires: lanes/end_point
+// requires: lanes/end_point lanes/math
 
 #define GRADIENT_NUMBERS 10
+// Densities whose product is taken before the logarithm (a power of 2), if all are within these bounds.
+#define TOGETHER 4
+#define LEAST_DENSITY 1e-9f
+#define LARGEST_DENSITY 1e9f
+// Numbers of a table and their right neighbours for eight of the indices in memory.
+#define NEIGHBOURS(table, i)                                                                                             \
+    ((float16)(vload2(0, table + i[0]), vload2(0, table + i[1]), vload2(0, table + i[2]), vload2(0, table + i[3]),       \
+               vload2(0, table + i[4]), vload2(0, table + i[5]), vload2(0, table + i[6]), vload2(0, table + i[7])))
 
 // A work-item takes LANES particles of one scan.
 kernel void field_gradient(global const real *table, global const int2 *pose_cell, global const real4 *pose,
@@ -11,11 +19,23 @@ kernel void field_gradient(global const real *table, global const int2 *pose_cel
                            global real *gradient, const Window window, const int particles, const int readings,
                            const real guard, const real mount_x, const real mount_y, const real resolution,
                            const Score score, const ScanBatch batch) {
-    const int begin = LANES * get_global_id(0);
+    const int item = get_global_id(0);
+#if SCANS
+    // No work-item has particles of two scans.
+    const int items = (batch.per_scan + LANES - 1) / LANES, scan = item / items;
+    const int begin = scan * batch.per_scan + LANES * (item % items);
     if (begin >= particles) return;
-    const int count = particles - begin < LANES ? particles - begin : LANES;
+    const int left = (scan + 1) * batch.per_scan - begin, size = start[scan + 1] - start[scan];
+    const real constant_term = constant_terms[scan];
+    point += start[scan];
+#else
+    const int begin = LANES * item, left = particles - begin, size = readings;
+    if (left <= 0) return;
+    const real constant_term = score.constant_term;
+#endif
+    const int count = left < LANES ? left : LANES;
     const int stride = window.cols + 2 * FIELD_RING, last_row = window.rows + 2 * FIELD_RING - 2;
-    global const real *right = table + 1, *above = table + stride, *opposite = above + 1;
+    global const real *above = table + stride;
     ilanes col, row;
     lanes x, y, cos, sin;
     for (int i = 0; i < LANES; ++i) {
@@ -28,13 +48,17 @@ kernel void field_gradient(global const real *table, global const int2 *pose_cel
         ((real *)&cos)[i] = pose[n].z;
         ((real *)&sin)[i] = pose[n].w;
     }
-    const real peak = terms[0], twice = 2 * terms[1], per_cell = 1 / resolution;
-    lanes total = score.constant_term, total_low = 0;
+    const real peak = terms[0], twice = 2 * terms[1];
+    // The sensor's place on the robot, turned.
+    const lanes mounted_x = cos * mount_x - sin * mount_y, mounted_y = sin * mount_x + cos * mount_y;
+    lanes product = 1, total = constant_term, total_low = 0;
+    const int mask = peak + terms[2] < LARGEST_DENSITY && terms[2] > LEAST_DENSITY ? TOGETHER - 1 : 0;
     lanes sums[9];
     for (int i = 0; i < 9; ++i) sums[i] = 0;
-    for (int k = 0; k < readings; ++k) {
-        const real2 to = point[k], arm = to + (real2)(mount_x, mount_y);
-        const lanes at_x = x + (cos * to.x - sin * to.y), at_y = y + (sin * to.x + cos * to.y);
+    for (int k = 0; k < size; ++k) {
+        const real2 to = point[k];
+        const lanes arm_x = cos * to.x - sin * to.y, arm_y = sin * to.x + cos * to.y;
+        const lanes at_x = x + arm_x, at_y = y + arm_y;
         ilanes to_col = to_ilanes(at_x), to_row = to_ilanes(at_y);
         to_col += at_x < to_lanes(to_col);
         to_row += at_y < to_lanes(to_row);
@@ -42,37 +66,46 @@ kernel void field_gradient(global const real *table, global const int2 *pose_cel
         const ilanes c = within_lanes(col + to_col, stride - 2), r = within_lanes(row + to_row, last_row);
         const ilanes index = r * stride + c;
         const int *at = (const int *)&index;
-        const lanes a = GATHER_AT(lanes, table, at), b = GATHER_AT(lanes, right, at);
-        const lanes d = GATHER_AT(lanes, above, at), e = GATHER_AT(lanes, opposite, at);
+        const float16 below0 = NEIGHBOURS(table, at), below1 = NEIGHBOURS(table, (at + 8));
+        const float16 above0 = NEIGHBOURS(above, at), above1 = NEIGHBOURS(above, (at + 8));
+        const lanes a = (lanes)(below0.even, below1.even), b = (lanes)(below0.odd, below1.odd);
+        const lanes d = (lanes)(above0.even, above1.even), e = (lanes)(above0.odd, above1.odd);
         const lanes low = a + rest_x * (b - a), high = d + rest_x * (e - d);
         const lanes slope_x = (b - a) + rest_y * ((e - d) - (b - a)), slope_y = high - low;
         const lanes distance = low + rest_y * slope_y;
 #if HIT
-        const lanes hit = peak * exp(-(distance * (distance * terms[1])));
+        const lanes hit = peak * exp_lanes(-(distance * (distance * terms[1])));
 #else
         const lanes hit = 0;
 #endif
         const lanes density = hit + terms[2];
-        const lanes term = log(density), sum = total + term, shift = sum - total;
-        total_low += (total - (sum - shift)) + (term - shift);
-        total = sum;
-        const lanes weight = twice * (hit / density), pull = -weight * distance;
-        const lanes dx = slope_x * per_cell, dy = slope_y * per_cell;
-        const lanes turn = slope_y * (cos * arm.x - sin * arm.y) - slope_x * (sin * arm.x + cos * arm.y);
-        sums[0] += pull * dx;
-        sums[1] += pull * dy;
-        sums[2] += pull * turn;
-        sums[3] += weight * dx * dx;
-        sums[4] += weight * dx * dy;
-        sums[5] += weight * dx * turn;
-        sums[6] += weight * dy * dy;
-        sums[7] += weight * dy * turn;
+        product *= density;
+        if ((k & mask) == mask || k == size - 1) {
+            const lanes term = log_lanes(product), sum = total + term, shift = sum - total;
+            total_low += (total - (sum - shift)) + (term - shift);
+            total = sum;
+            product = 1;
+        }
+        const lanes weight = twice * (hit / density), pull = weight * distance;
+        const lanes turn = slope_y * (arm_x + mounted_x) - slope_x * (arm_y + mounted_y);
+        const lanes by_x = weight * slope_x, by_y = weight * slope_y;
+        sums[0] -= pull * slope_x;
+        sums[1] -= pull * slope_y;
+        sums[2] -= pull * turn;
+        sums[3] += by_x * slope_x;
+        sums[4] += by_x * slope_y;
+        sums[5] += by_x * turn;
+        sums[6] += by_y * slope_y;
+        sums[7] += by_y * turn;
         sums[8] += weight * turn * turn;
     }
+    // Slopes in x and y were per cell.
+    const real per_cell = 1 / resolution, scale[9] = {per_cell, per_cell, 1, per_cell * per_cell, per_cell * per_cell,
+                                                      per_cell, per_cell * per_cell, per_cell, 1};
     for (int i = 0; i < count; ++i) {
         global real *out = gradient + (long)GRADIENT_NUMBERS * (begin + i);
         const real high = ((const real *)&total)[i];
         out[0] = isinf(high) ? high : score.temperature * (high + ((const real *)&total_low)[i]);
-        for (int j = 0; j < 9; ++j) out[1 + j] = score.temperature * ((const real *)&sums[j])[i];
+        for (int j = 0; j < 9; ++j) out[1 + j] = score.temperature * scale[j] * ((const real *)&sums[j])[i];
     }
 }

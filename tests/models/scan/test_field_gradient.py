@@ -90,6 +90,17 @@ def test_several_scans_are_single_scans(backend):
     assert (together[1][2] == 0).all()
 
 
+def test_vectors_hold_particles_of_one_scan(device):
+    grid, poses, ranges = scene(poses=51)
+    scans = np.stack([ranges, np.where(np.arange(80) < 40, ranges, np.nan), ranges[::-1]])
+    for kind in ("linear", "max"):
+        expected, found = (
+            field(grid, name, "float32", kind).gradient(poses.reshape(3, 17, 3), scans) for name in ("numpy", device)
+        )
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4 * np.abs(other).max())
+
+
 def test_gradients_need_interpolation():
     grid, poses, ranges = scene()
     with pytest.raises(ValueError, match="interpolation"):

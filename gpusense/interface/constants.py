@@ -34,8 +34,8 @@ BEACON, BEACON_TERMS = 7, 12
 RAY_BITS = 12
 # Kernel file icp: numbers of the result of a match.
 MATCH_RESULT = 24
-# Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (6).
-GRADIENT_NUMBERS = 10
+# Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
+GRADIENT_NUMBERS = 13
 
 
 def strands_in(terms: int) -> int:

@@ -64,7 +64,7 @@ def field_gradient(
     score: structs.Score,
     batch: structs.ScanBatch,
 ) -> None:
-    """Write log p, its gradient (3) and the information (6) of poses in the grid's frame, each times the temperature.
+    """Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
 
     ``mount_x`` and ``mount_y`` are the sensor's place on the robot in cells.
     """
@@ -103,4 +103,4 @@ def field_gradient(
         out[part, 0] = sum_terms(flags, log_p, score, block_sums)
         out[part, 1:4] = score.temperature * np.einsum("nk,ink->ni", pull, jacobian)
         information = np.einsum("nk,ink,jnk->nij", weight, jacobian, jacobian)
-        out[part, 4:] = score.temperature * information[:, *np.triu_indices(3)]
+        out[part, 4:] = score.temperature * information.reshape(-1, 9)

@@ -4,7 +4,7 @@
 // derivatives of d and of r.
 // requires: field
 
-#define GRADIENT_NUMBERS 10
+#define GRADIENT_NUMBERS 13
 
 // Return the share of the hit density in the density at a distance.
 real hit_share(const real2 distance, global const real *terms) {
@@ -32,7 +32,7 @@ real4 distance_slope(global const real *table, const int2 cell, const EndPoint e
     return (real4)(distance.x, distance.y, x, y);
 }
 
-// Write log p, its gradient (3) and the information (6) of poses in the grid's frame, each times the temperature. One
+// Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature. One
 // work-item takes a particle. mount is the sensor's place on the robot in cells.
 kernel void field_gradient(global const real *table, global const int2 *pose_cell, global const real4 *pose,
                            global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
@@ -89,5 +89,12 @@ kernel void field_gradient(global const real *table, global const int2 *pose_cel
     }
     global real *out = gradient + (long)GRADIENT_NUMBERS * n;
     out[0] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
-    for (int i = 0; i < 9; ++i) out[1 + i] = score.temperature * sums[i];
+    for (int i = 0; i < 6; ++i) out[1 + i] = score.temperature * sums[i];
+    // The other rows of the information, which is symmetric.
+    out[7] = score.temperature * sums[4];
+    out[8] = score.temperature * sums[6];
+    out[9] = score.temperature * sums[7];
+    out[10] = score.temperature * sums[5];
+    out[11] = score.temperature * sums[7];
+    out[12] = score.temperature * sums[8];
 }

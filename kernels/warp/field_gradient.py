@@ -15,7 +15,7 @@ from . import error_free, field
 from .end_point import field_cell
 from .prelude import kernel, precision, reader, work_item
 
-GRADIENT_NUMBERS = wp.constant(10)
+GRADIENT_NUMBERS = wp.constant(13)
 
 
 @functools.cache
@@ -80,7 +80,7 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
 
-    # Write log p, its gradient (3) and the information (6) of poses in the grid's frame, each times the temperature.
+    # Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
     # One work-item takes a particle. mount is the sensor's place on the robot in cells.
     @kernel
     def field_gradient(
@@ -160,7 +160,14 @@ def make(name, flags):
             gradient[out] = total.x
         else:
             gradient[out] = score.temperature * (total.x + total.y)
-        for i in range(9):
+        for i in range(6):
             gradient[out + 1 + i] = score.temperature * sums[i]
+        # The other rows of the information, which is symmetric.
+        gradient[out + 7] = score.temperature * sums[4]
+        gradient[out + 8] = score.temperature * sums[6]
+        gradient[out + 9] = score.temperature * sums[7]
+        gradient[out + 10] = score.temperature * sums[5]
+        gradient[out + 11] = score.temperature * sums[7]
+        gradient[out + 12] = score.temperature * sums[8]
 
     return {"field_gradient": field_gradient}[name]

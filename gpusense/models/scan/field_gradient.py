@@ -21,7 +21,7 @@ _OTHERS = {"LOG_TABLE", "CUBES"}
 
 
 def gradients(pipeline: FieldPipeline, request: Request, space: Workspace) -> np.ndarray:
-    """Return log p, its gradient (3) and the information (6) of the S N poses, (S N, 10) in the grid's frame."""
+    """Return log p, its gradient (3) and the information (9) of the S N poses, (S N, 13) in the grid's frame."""
     result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
     for particles, scans in pipeline.groups(request):
         if particles.count:
@@ -72,13 +72,12 @@ class _Gradient:
         space.download(numbers, rows)
 
 
-# Entries of the information (3, 3) among the numbers after log p and the gradient.
-_ENTRIES = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
-
-
 def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return log p (M,), gradient (M, 3) and information (M, 3, 3) in the world from numbers in the grid's frame."""
-    gradient, information = numbers[:, 1:4], numbers[:, 4 + _ENTRIES]
+    """Return log p (M,), gradient (M, 3) and information (M, 3, 3) in the world from numbers in the grid's frame.
+
+    Without a turn between them they are views of the numbers.
+    """
+    gradient, information = numbers[:, 1:4], numbers[:, 4:]
     if yaw:
         c, s = np.cos(yaw), np.sin(yaw)
         turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])

@@ -2,7 +2,7 @@
 // the working precision: the interpolated distance is continuous, so an error of an end point moves it by as much.
 // requires: lanes/end_point lanes/math
 
-#define GRADIENT_NUMBERS 10
+#define GRADIENT_NUMBERS 13
 // Densities whose product is taken before the logarithm (a power of 2), if all are within these bounds.
 #define TOGETHER 4
 #define LEAST_DENSITY 1e-9f
@@ -100,12 +100,13 @@ kernel void field_gradient(global const real *table, global const int2 *pose_cel
         sums[8] += weight * turn * turn;
     }
     // Slopes in x and y were per cell.
-    const real per_cell = 1 / resolution, scale[9] = {per_cell, per_cell, 1, per_cell * per_cell, per_cell * per_cell,
-                                                      per_cell, per_cell * per_cell, per_cell, 1};
+    const real one = score.temperature, cell = one / resolution, square = cell / resolution;
+    const real scale[9] = {cell, cell, one, square, square, cell, square, cell, one};
+    const int entry[12] = {0, 1, 2, 3, 4, 5, 4, 6, 7, 5, 7, 8};
     for (int i = 0; i < count; ++i) {
         global real *out = gradient + (long)GRADIENT_NUMBERS * (begin + i);
         const real high = ((const real *)&total)[i];
         out[0] = isinf(high) ? high : score.temperature * (high + ((const real *)&total_low)[i]);
-        for (int j = 0; j < 9; ++j) out[1 + j] = score.temperature * scale[j] * ((const real *)&sums[j])[i];
+        for (int j = 0; j < 12; ++j) out[1 + j] = scale[entry[j]] * ((const real *)&sums[entry[j]])[i];
     }
 }

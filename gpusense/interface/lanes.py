@@ -13,6 +13,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "e_step": (set(),),
     "field_gradient": ({"LINEAR"},),
+    "fit_lines": (set(),),
     "match_scans": (set(),),
     "score_beams": ({"LINEAR"},),
     "score_features": ({"RANGE"}, {"BEARING"}),

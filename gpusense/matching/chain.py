@@ -100,23 +100,35 @@ def _search(
     if not len(which):
         return
     fine = device.run(poor[which], chosen[:, None], options.final_rules(most, gap))[:, 0]
-    for row, start, result in zip(poor[which], guess[which], fine, strict=True):
-        before = best.result[row].copy()
-        if result[3] - _prior(result, start, options) > before[3] - _prior(before, start, options):
-            best.result[row], result = result, before
-        offset = result[:3] - best.result[row, :3]
-        offset[2] = wrapped(offset[2])
-        far = np.hypot(*offset[:2]) > _OTHER * options.capture or abs(offset[2]) > _OTHER_TURN
-        if far and result[5] > 0 and result[3] > best.result[row, 3] - _CLOSE:
-            best.other[row] = offset
-        elif result is before and far:
-            best.other[row] = np.nan
+    rows = poor[which]
+    order = np.arange(len(rows)) - np.searchsorted(rows, rows)
+    # The starts of a pair one after another, those of all pairs together.
+    for turn in range(order.max() + 1):
+        now = order == turn
+        _compare(rows[now], guess[which[now]], fine[now], best, options)
 
 
-def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> float:
-    """Return what a result loses of its score by its distance from the guess, and by not having converged."""
-    distance = float(np.hypot(*(result[:2] - guess[:2]))) / options.capture
-    return _FARTHER * distance + _UNSETTLED * float(result[5] == 0)
+def _compare(rows: np.ndarray, guess: np.ndarray, found: np.ndarray, best: Best, options: MatchOptions) -> None:
+    """Put one result of each pair in place where it is better, and keep the other one if it agrees about as well."""
+    before = best.result[rows]
+    better = found[:, 3] - _prior(found, guess, options) > before[:, 3] - _prior(before, guess, options)
+    winner, loser = (np.where(choice[:, None], found, before) for choice in (better, ~better))
+    best.result[rows] = winner
+    offset = loser[:, :3] - winner[:, :3]
+    offset[:, 2] = wrapped(offset[:, 2])
+    far = (np.hypot(offset[:, 0], offset[:, 1]) > _OTHER * options.capture) | (np.abs(offset[:, 2]) > _OTHER_TURN)
+    close = far & (loser[:, 5] > 0) & (loser[:, 3] > winner[:, 3] - _CLOSE)
+    lost = far & ~close & better
+    best.other[rows[close]] = offset[close]
+    best.other[rows[lost]] = np.nan
+
+
+def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.ndarray:
+    """Return what results lose of their scores by the distance from their guesses, and by not having converged."""
+    offset = result[:, :2] - guess[:, :2]
+    distance = np.hypot(offset[:, 0], offset[:, 1]) / options.capture
+    lost: np.ndarray = _FARTHER * distance + _UNSETTLED * (result[:, 5] == 0)
+    return lost
 
 
 def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, most: int, gap: float) -> None:

@@ -17,7 +17,7 @@ from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import ScanPoints
 
 # Neighbours on either side to which a line is fitted, and how far they may be from one another: a share of the range
-# and a distance [m].
+# and a distance [m]. Bodies in vectors have room for 16.
 REACH, _MOST, _RATIO, _SLACK = 2, 16, 0.1, 0.05
 # Half of the least length of a line, in standard deviations of ranges.
 _WIDTH = 4.0
@@ -58,10 +58,11 @@ class IcpPairs:
         self._line = space.empty("match lines", point.size, real)
         most = int(points.counts.max(initial=0))
         if most:
+            flags = widened(backend.info.lanes, "fit_lines", self._flags)
             lines = launch(
-                "fit_lines", self._flags, (most, self._counts[0]), point=self._point, start=self._start,
-                line=self._line, scans=self._counts[0], points=self._counts[1], reach=REACH, most=_MOST,
-                ratio=_RATIO, slack=_SLACK, width=_WIDTH * noise,
+                "fit_lines", flags, (most, self._counts[0]), point=self._point, start=self._start, line=self._line,
+                scans=self._counts[0], points=self._counts[1], reach=REACH, most=_MOST, ratio=_RATIO, slack=_SLACK,
+                width=_WIDTH * noise,
             )  # fmt: skip
             backend.run((lines,))
 

@@ -24,11 +24,13 @@ class ScanPoints:
         point: (P, 4) x, y [m], bearing in [0, 2 pi) [rad] and range [m], sorted by bearing in each scan.
         start: (S + 1,) first point of each scan.
         gap: Largest step between the bearings of two neighbours that hides nothing [rad].
+        squares: (S,) sums of squared ranges [m^2].
     """
 
     point: np.ndarray
     start: np.ndarray
     gap: float
+    squares: np.ndarray
 
     @property
     def counts(self) -> np.ndarray:
@@ -37,9 +39,7 @@ class ScanPoints:
 
     def rms_range(self, scan: np.ndarray) -> np.ndarray:
         """Return the root mean square range of some scans, at least 1e-3 m."""
-        squares = np.append(0, np.cumsum(self.point[:, 3].astype(np.float64) ** 2))
-        sums = squares[self.start[1:]] - squares[self.start[:-1]]
-        return np.maximum(np.sqrt(sums / np.maximum(self.counts, 1)), 1e-3)[scan]
+        return np.maximum(np.sqrt(self.squares / np.maximum(self.counts, 1)), 1e-3)[scan]
 
 
 def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype) -> ScanPoints:
@@ -50,20 +50,22 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype) -> ScanPoi
         scanner: The scanner; its mount's yaw is added to bearings.
         real: Precision of the points.
     """
-    bearing = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
-    order = np.argsort(bearing, kind="stable")
-    bearing = bearing[order].astype(real)
-    hit = (classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT) & (ranges > _NEAREST)
-    hit = hit[:, order]
-    beam = np.nonzero(hit)[1]
-    z = ranges[:, order][hit].astype(np.float64)
-    angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)[order]
-    point = np.empty((len(z), 4), real)
-    point[:, 0] = z * np.cos(angle)[beam]
-    point[:, 1] = z * np.sin(angle)[beam]
-    point[:, 2] = bearing[beam]
-    point[:, 3] = z
+    angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
+    order = np.argsort(angle, kind="stable")
+    angle = angle[order]
+    bearing = angle.astype(real)
+    z = ranges[:, order]
+    hit = (classes(z, scanner.range_min, scanner.range_max) == Reading.HIT) & (z > _NEAREST)
+    z = np.where(hit, z, 0).astype(np.float64, copy=False)
+    everything = np.empty((*z.shape, 4), real)
+    np.multiply(z, np.cos(angle), out=everything[..., 0], casting="same_kind")
+    np.multiply(z, np.sin(angle), out=everything[..., 1], casting="same_kind")
+    everything[..., 2] = bearing
+    everything[..., 3] = z
+    # Points as single items, which a mask takes whole.
+    items = everything.view(np.dtype((np.void, 4 * everything.itemsize)))[..., 0]
+    point = items[hit].view(real).reshape(-1, 4)
     start = np.append(0, np.cumsum(np.count_nonzero(hit, axis=1))).astype(np.int32)
     steps = np.diff(bearing.astype(np.float64))
     gap = _GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
-    return ScanPoints(point, start, gap)
+    return ScanPoints(point, start, gap, np.einsum("sk,sk->s", z, z))

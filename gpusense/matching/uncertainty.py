@@ -6,6 +6,7 @@ lines seem to constrain the position along it. Its expected value, ``variance * 
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,13 @@ def noise_of(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         (S,) deviations in scales, at most 2, and E[w] E[w^2 e^2] / E[d(w e)/de]^2, by which the inverse of the sum of
         w J J' is multiplied.
     """
+    known, sigma, factor = _noise_table()
+    return np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
+
+
+@functools.cache
+def _noise_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return ratios, deviations and factors of noise_of."""
     e = np.linspace(-8, 8, 801)
     sigma = np.linspace(0.0, 2.0, 101)[1:]
     u = sigma[:, None] * e
@@ -55,8 +63,7 @@ def noise_of(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     mean_w, mean_wuu = w @ density, (w * u * u) @ density
     slope = ((1 - 3 * u * u) * (1 + u * u) ** -3.0) @ density
     factor = mean_w * ((w * w * u * u) @ density) / np.maximum(slope, 0.05) ** 2
-    known = np.append(0, mean_wuu / mean_w)
-    return np.interp(ratio, known, np.append(0, sigma)), np.interp(ratio, known, np.append(0, factor))
+    return np.append(0, mean_wuu / mean_w), np.append(0, sigma), np.append(0, factor)
 
 
 def uncertainty(

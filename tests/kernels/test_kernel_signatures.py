@@ -58,12 +58,13 @@ def test_opencl_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
         assert axes == set(range(len(KERNELS[kernel].launch)))
 
 
-def test_eight_kernels_have_a_second_body_in_lanes() -> None:
+def test_nine_kernels_have_a_second_body_in_lanes() -> None:
     twice = {name for name, bodies in opencl_declarations().items() if len(bodies) > 1}
     assert twice == {
         "cast_ranges",
         "e_step",
         "field_gradient",
+        "fit_lines",
         "match_scans",
         "score_beams",
         "score_features",

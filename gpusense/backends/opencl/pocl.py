@@ -15,6 +15,7 @@ memory.
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
 import re
 import struct
@@ -133,6 +134,7 @@ def _is_misfit(device: cl.Device) -> bool:
     return _has_libraries()
 
 
+@functools.cache
 def _has_libraries() -> bool:
     """Return whether PoCL has libraries for several processors, rather than one for the machine that compiled it.
 

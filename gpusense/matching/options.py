@@ -50,7 +50,7 @@ class MatchOptions:
         full = self.rules(points, gap)
         stride, least = max(points // _SEARCH_POINTS, 1), max(2.5 * full.least_scale, 0.08 * self.capture)
         return full._replace(
-            iterations=6, stride=stride, skip=-(-points // _SEARCH_REFERENCE) or 1, score_stride=stride, thin=1,
+            iterations=4, stride=stride, skip=-(-points // _SEARCH_REFERENCE) or 1, score_stride=stride, thin=1,
             capture=max(0.7 * self.capture, full.near), scale=max(0.35 * self.capture, least),
             least_scale=least, shrink=0.55, tolerance=3e-3 * self.capture,
         )  # fmt: skip

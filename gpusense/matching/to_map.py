@@ -163,11 +163,6 @@ class MapMatcher:
             [grid._to_world(best[:, :2] * grid.resolution), wrapped(best[:, 2] + grid.origin[2])]
         )  # fmt: skip
 
-    def score(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Return the mean of ``exp(-d^2 / (2 sigma^2))`` over the hits, with the finest field."""
-        near = self._nearness(ranges, pose)
-        return near.sum(axis=1) / np.maximum(self._hits(ranges).sum(axis=1), 1)
-
     def _nearness(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return (S, K) values of ``exp(-d^2 / (2 sigma^2))``, 0 where there is no hit."""
         model, sigma = self._models[-1], self._sigmas[-1]
@@ -185,10 +180,11 @@ class MapMatcher:
         self, ranges: np.ndarray, pose: np.ndarray, iterations: np.ndarray, calm: np.ndarray, method: str
     ) -> ScanMatch:
         """Return matches with covariance and status."""
-        sigma, hits, score = self._sigmas[-1], self._hits(ranges), self.score(ranges, pose)
+        sigma, hits, near = self._sigmas[-1], self._hits(ranges), self._nearness(ranges, pose)
+        # The mean of exp(-d^2 / (2 sigma^2)) over the hits, with the finest field.
+        score = near.sum(axis=1) / np.maximum(hits.sum(axis=1), 1)
         _, _, information = self._models[-1].gradient(pose[:, None], ranges)
         information = information[:, 0].astype(np.float64) * sigma**2
-        near = self._nearness(ranges, pose)
         squared = -2 * sigma**2 * np.log(np.clip(near, 1e-6, 1))
         variance = (near * squared).sum(axis=1) / np.maximum(near.sum(axis=1), 1e-9)
         squares = np.where(hits, ranges, 0).astype(np.float64) ** 2
@@ -222,6 +218,7 @@ def _climb(
         moving = ~calm
         if not moving.any():
             break
+        rows = np.flatnonzero(moving)
         diagonal = np.einsum("sii->si", information)
         damped = (
             information
@@ -232,7 +229,8 @@ def _climb(
         step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
         step[~moving] = 0
         trial = pose + step
-        new_value, new_gradient, new_information = _evaluated(model, ranges, trial)
+        new_value, new_gradient, new_information = value.copy(), gradient.copy(), information.copy()
+        new_value[rows], new_gradient[rows], new_information[rows] = _evaluated(model, ranges[rows], trial[rows])
         better = moving & (new_value >= value)
         pose = np.where(better[:, None], trial, pose)
         value = np.where(better, new_value, value)

@@ -76,10 +76,11 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
                 const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
     const real scale = near / 3;
     real4 sum = (real4)(0);
+    int ahead = 0;
     for (int i = 0; i < others; i += stride) {
         const real2 p = other[i].xy;
         const real2 place = (real2)(pose.z * p.x - pose.w * p.y + pose.x, pose.w * p.x + pose.z * p.y + pose.y);
-        const int ahead = points_before(point, count, bearing_of(place));
+        ahead = points_before(point, count, 1, bearing_of(place), ahead);
         const int which = nearest_point(point, count, ahead, skip, place, near * near);
         if (which >= 0) {
             const real ratio = (line[which].x * place.x + line[which].y * place.y - line[which].z) / scale;
@@ -159,7 +160,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     real4 pose = guess[n];
     real sums[MATCH_SUMS];
     real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
-    int iteration = 0, settled = 0, calm = 0;
+    int iteration = 0, settled = 0, calm = 0, ahead = 0;
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
     while (iteration < rules.iterations && !settled && count > 0) {
         const int last = capture <= rules.least_capture && scale <= rules.least_scale;
@@ -168,7 +169,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         for (int i = 0; i < others; i += full ? 1 : rules.stride) {
             const real2 p = point[second + i].xy;
             const real2 arm = (real2)(cosine * p.x - sine * p.y, sine * p.x + cosine * p.y), place = arm + pose.xy;
-            const int ahead = points_before(point + first, count, bearing_of(place));
+            ahead = points_before(point + first, count, 1, bearing_of(place), ahead);
             const int near = nearest_point(point + first, count, ahead, skip, place, capture * capture);
             if (near >= 0 && line[first + near].w > 0) add_pairing(sums, line[first + near], place, arm, scale, last);
         }

@@ -11,13 +11,14 @@ real bearing_of(const real2 place) {
     return bearing < 0 ? bearing + FULL_TURN : bearing;
 }
 
-// Return the number of points of a scan whose bearing is less than a bearing.
-int points_before(global const real4 *point, const int count, const real bearing) {
-    const real span = point[count - 1].z - point[0].z;
-    const real share = span > 0 ? (bearing - point[0].z) / span : 0;
-    int i = share <= 0 ? 0 : share >= 1 ? count : (int)(share * (count - 1));
-    while (i < count && point[i].z < bearing) ++i;
-    while (i > 0 && point[i - 1].z >= bearing) --i;
+// Return the number of points among count skip-th points of a scan whose bearing is less than a bearing: walk from a
+// guess, which for neighbours is the number of the one before, but for a full turn.
+int points_before(global const real4 *point, const int count, const int skip, const real bearing, const int guess) {
+    int i = guess;
+    if (4 * bearing < FULL_TURN && 4 * guess > 3 * count) i = 0;
+    if (4 * bearing > 3 * FULL_TURN && 4 * guess < count) i = count;
+    while (i < count && point[skip * i].z < bearing) ++i;
+    while (i > 0 && point[skip * (i - 1)].z >= bearing) --i;
     return i;
 }
 

@@ -132,12 +132,13 @@ def functions(flags):
         scale = near / THREE
         total = vec4()
         i = int(0)
+        ahead = int(0)
         while i < others:
             p = point[second + i]
             x = pose.z * p.x - pose.w * p.y + pose.x
             y = pose.w * p.x + pose.z * p.y + pose.y
             place = vec2(x, y)
-            ahead = points_before(point, first, count, bearing_of(place))
+            ahead = points_before(point, first, count, bearing_of(place), ahead)
             which = nearest_point(point, first, count, ahead, skip, place, near * near)
             if which >= 0:
                 at = line[first + which]
@@ -297,6 +298,7 @@ def make(name, flags):
         iteration = int(0)
         settled = int(0)
         calm = int(0)
+        ahead = int(0)
         running = int(1)
         while running == 1 and iteration < rules.iterations and settled == 0 and count > 0:
             last = capture <= rules.least_capture and scale <= rules.least_scale
@@ -311,7 +313,7 @@ def make(name, flags):
                 p = point[second + i]
                 arm = vec2(cosine * p.x - sine * p.y, sine * p.x + cosine * p.y)
                 place = vec2(arm.x + pose.x, arm.y + pose.y)
-                ahead = points_before(point, first, count, bearing_of(place))
+                ahead = points_before(point, first, count, bearing_of(place), ahead)
                 near = nearest_point(point, first, count, ahead, skip, place, capture * capture)
                 if near >= 0:
                     at = line[first + near]

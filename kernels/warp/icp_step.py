@@ -19,7 +19,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
-    ZERO, ONE = real(0.0), real(1.0)
+    ZERO, ONE, THREE, FOUR = real(0.0), real(1.0), real(3.0), real(4.0)
     FULL_TURN = real(6.283185307179586)
     DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
 
@@ -31,19 +31,15 @@ def functions(flags):
             bearing += FULL_TURN
         return bearing
 
-    # Return the number of points of a scan whose bearing is less than a bearing.
+    # Return the number of points of a scan whose bearing is less than a bearing: walk from a guess, which for
+    # neighbours is the number of the one before, but for a full turn.
     @wp.func
-    def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real):
-        low = point[first].z
-        span = point[first + count - 1].z - low
-        share = ZERO
-        if span > ZERO:
-            share = (bearing - low) / span
-        i = int(0)
-        if share >= ONE:
+    def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real, guess: wp.int32):
+        i = int(guess)
+        if FOUR * bearing < FULL_TURN and 4 * guess > 3 * count:
+            i = 0
+        elif FOUR * bearing > THREE * FULL_TURN and 4 * guess < count:
             i = count
-        elif share > ZERO:
-            i = int(share * real(count - 1))
         while i < count and point[first + wp.min(i, count - 1)].z < bearing:
             i += 1
         while i > 0 and point[first + wp.max(i - 1, 0)].z >= bearing:

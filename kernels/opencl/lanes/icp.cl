@@ -35,14 +35,6 @@ lanes bearing_lanes(const lanes x, const lanes y) {
     return y < 0.0f ? FULL_TURN - above : above;
 }
 
-// Return points_before of every skip-th point, walking from a guess.
-int points_before_from(global const real4 *point, const int count, const int skip, const real bearing, const int guess) {
-    int i = guess;
-    while (i < count && point[skip * i].z < bearing) ++i;
-    while (i > 0 && point[skip * (i - 1)].z >= bearing) --i;
-    return i;
-}
-
 // Return the bearing of the i-th point of a scan, whose points follow each other turn after turn; -count <= i < 2 count.
 real turned_bearing(global const real4 *point, const int count, const int skip, const int i) {
     return i < 0 ? point[skip * (i + count)].z - FULL_TURN
@@ -89,7 +81,7 @@ ilanes nearest_lanes(global const real4 *point, const int count, const int skip,
     // Bearings of the block relative to the smallest one, which is in [0, 2 pi).
     from += bearing.s0 - low;
     const real first = low + turn, high = first - least_lane(-from);
-    const int begin = points_before_from(point, kept, skip, first, min(*hint, kept));
+    const int begin = points_before(point, kept, skip, first, min(*hint, kept));
     int end = begin;
     while (end < begin + kept && turned_bearing(point, kept, skip, end) <= high) ++end;
     *hint = end < kept ? end : end - kept;
@@ -178,7 +170,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
         for (int l = 0; l < size; ++l) {
             if (((const int *)&which)[l] >= 0) continue;
             const real px = ((const real *)&x)[l], py = ((const real *)&y)[l];
-            ahead = points_before_from(point, count, 1, ((const real *)&bearing)[l], ahead);
+            ahead = points_before(point, count, 1, ((const real *)&bearing)[l], ahead);
             const real4 low = point[ahead > 0 ? ahead - 1 : count - 1], high = point[ahead < count ? ahead : 0];
             const real between = high.z < low.z ? high.z - low.z + FULL_TURN : high.z - low.z;
             const real range = fmin(low.w, high.w);

@@ -69,9 +69,9 @@ void add_pairing(real *sums, const real4 line, const real2 place, const real2 ar
     sums[17] += 1;
 }
 
-// Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of agreements, points that the other
-// scan should see, points that contradict it because it saw through them, and points that it did not see. pose is
-// (x, y, cos, sin).
+// Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of agreements,
+// points that the other scan should see, points that contradict it because it saw through them, and points that it did
+// not see. pose is (x, y, cos, sin).
 real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                 const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
     const real scale = near / 3;
@@ -147,8 +147,8 @@ kernel void fit_lines(global const real4 *point, global const int *start, global
 }
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
-// scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture radius
-// and scale have shrunk, with thin also afterwards.
+// scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture
+// radius and scale have shrunk, with thin also afterwards.
 kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
                         global const int2 *pair, global const real4 *guess, global real *result, const int scans,
                         const int points, const int pairs, const int starts, const MatchRules rules) {

@@ -1,5 +1,5 @@
-// Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a scan,
-// and the normal equations.
+// Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a
+// scan, and the normal equations.
 
 // Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
 #define MATCH_SUMS 18

@@ -1,6 +1,6 @@
-// Point-to-line ICP for LANES points of a scan at once: fit_lines and match_scans of icp.cl. The points of a block are neighbours in
-// bearing, and so are their nearest points: all of them are compared with one point of the reference after another, first
-// with those between their bearings, then with those outside that may be nearer than the nearest so far.
+// Point-to-line ICP for LANES points of a scan at once: fit_lines and match_scans of icp.cl. The points of a block are
+// neighbours in bearing, and so are their nearest points: all of them are compared with one point of the reference after
+// another, first with those between their bearings, then with those outside that may be nearer than the nearest so far.
 // requires: icp_step lanes/math
 
 // Numbers of a result; see icp.cl.
@@ -35,7 +35,8 @@ lanes bearing_lanes(const lanes x, const lanes y) {
     return y < 0.0f ? FULL_TURN - above : above;
 }
 
-// Return the bearing of the i-th point of a scan, whose points follow each other turn after turn; -count <= i < 2 count.
+// Return the bearing of the i-th point of a scan, whose points follow each other turn after turn; i is from -count to
+// 2 count.
 real turned_bearing(global const real4 *point, const int count, const int skip, const int i) {
     return i < 0 ? point[skip * (i + count)].z - FULL_TURN
                  : i >= count ? point[skip * (i - count)].z + FULL_TURN : point[skip * i].z;
@@ -97,8 +98,7 @@ ilanes nearest_lanes(global const real4 *point, const int count, const int skip,
     return which;
 }
 
-// Add pairs of lines and places, those with a weight of 0 without effect; arm is the place relative to the second scan's
-// origin.
+// Add pairs of lines and places that are counted (1, others 0); arm is the place relative to the second scan's origin.
 void add_pairing_lanes(lanes *sums, const lanes *line, const lanes x, const lanes y, const lanes arm_x,
                        const lanes arm_y, const real scale, const int last, const lanes counted) {
     const lanes error = line[0] * x + line[1] * y - line[2], ratio = error / scale;
@@ -263,8 +263,8 @@ kernel void fit_lines(global const real4 *point, global const int *start, global
 }
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
-// scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture radius
-// and scale have shrunk, with thin also afterwards.
+// scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture
+// radius and scale have shrunk, with thin also afterwards.
 kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
                         global const int2 *pair, global const real4 *guess, global real *result, const int scans,
                         const int points, const int pairs, const int starts, const MatchRules rules) {

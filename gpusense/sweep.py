@@ -5,6 +5,7 @@ from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor, WorkerDie
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.plan import read_plan
 from gpusense.sweeps.run import Sweep, SweepLost, run
+from gpusense.sweeps.split_filter import SplitParticleFilter
 from gpusense.sweeps.store import Store
 from gpusense.sweeps.table import read_table
 
@@ -13,6 +14,7 @@ __all__ = [
     "Job",
     "ProcessExecutor",
     "SerialExecutor",
+    "SplitParticleFilter",
     "Store",
     "Sweep",
     "SweepLost",

@@ -88,17 +88,17 @@ def run(args: argparse.Namespace) -> int:
 def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:
     if as_json:
         print_json({"jobs": [{"key": job.key, **_fields(job)} for job in jobs]})
-    else:
-        for job in jobs:
-            print(job.key, " ".join(f"{name}={value}" for name, value in _fields(job).items()))
-        print(f"\n{len(jobs)} jobs")
+        return 0
+    for job in jobs:
+        texts = [f"{name}={value}" for name, value in job.labels]
+        print(job.key, job.task, *(texts or (job.log, job.map, job.model)))
+    print(f"\n{len(jobs)} jobs")
     return 0
 
 
 def _fields(job: Job) -> dict[str, Any]:
-    return dict(
-        task=job.task, **dict(job.labels), options=dict(job.options), map=job.map, log=job.log
-    ) | {"model": job.model, "seed": job.seed}  # fmt: skip
+    plain = {name: getattr(job, name) for name in ("task", "map", "log", "model", "seed")}
+    return {**plain, "options": dict(job.options), "labels": dict(job.labels)}
 
 
 def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:

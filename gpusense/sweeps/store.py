@@ -1,4 +1,4 @@
-"""What a worker of a sweep keeps between jobs: maps, logs, and models with their compiled kernels."""
+"""Maps, logs, and models with their compiled kernels, which a worker of a sweep keeps between jobs."""
 
 from __future__ import annotations
 

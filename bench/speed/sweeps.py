@@ -5,8 +5,9 @@
 
 Jobs track a robot along a simulated run in a generated building, with another seed each. Every worker runs jobs before
 the clock starts, so that no kernel is compiled while it runs, and sweeps of all numbers of workers run in turns.
-Efficiency is the least time on one worker over the least on n, times 1 / n. "Busy" is the share of the workers' time that
-jobs take; the rest is that of the engine and the table. The tables of all sweeps must be equal, but for times and places.
+Efficiency is the least time on one worker over the least on n, times 1 / n. "Busy" is the share of the workers' time
+that jobs take; the rest is for the engine and the table. The tables of all sweeps must be equal, but for times and
+places.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A part of a filter's particles on one device: it moves, scores, weighs and draws them.
 
 Methods are generators that start work on the device before they yield and read its results after, so that one thread
-keeps several devices busy. What they take and return is plain data and crosses to other processes.
+keeps several devices busy. They take and return plain data, which crosses to other processes.
 """
 
 from __future__ import annotations

@@ -6,60 +6,35 @@ keeps several devices busy. They take and return plain data, which crosses to ot
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Generator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Hashable, Sequence
+from typing import Any
 
 import numpy as np
 
+from gpusense.backends.recording import Recording
 from gpusense.interface.constants import (
     DRAWN,
     ESTIMATE,
     ESTIMATE_SUMS,
     FIRST,
     LEFT,
+    SETTINGS,
     SHARE,
     STAGE,
+    TEMPERATURE,
     WEIGHT_SUMS,
     WHOLE,
 )
 from gpusense.interface.flags import flags_if
-from gpusense.interface.launches import launch
+from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.sensors import Sensor
 from gpusense.reference.weighing import rung_of
-from gpusense.sweeps.worker import device_of
+from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
 
 _PLAIN = frozenset[str]()
 _DOUBLE = np.dtype(np.float64)
-Step = Generator[None, None, Any]
-Piece = tuple[np.ndarray, np.ndarray]
-Marks = Sequence[tuple[float, float]] | None
-
-
-class Part(NamedTuple):
-    """Particles of a shard.
-
-    Attributes:
-        first: Index of the first one in the whole filter.
-        size: Their number.
-        whole: Particles of the whole filter.
-        block: Particles of a block of sums.
-    """
-
-    first: int
-    size: int
-    whole: int
-    block: int
-
-
-def parts_of(count: int, shards: int) -> list[Part]:
-    """Split particles into parts of whole blocks, so that sums over blocks are those of one device."""
-    block = max(math.ceil(math.sqrt(count)), 16)
-    blocks = -(-count // block)
-    ends = [min(blocks * shard // shards * block, count) for shard in range(shards + 1)]
-    return [Part(one, two - one, count, block) for one, two in itertools.pairwise(ends)]
 
 
 class Shard:
@@ -78,6 +53,11 @@ class Shard:
         self._settings = np.zeros(0)
         # Capacity and buffers of particles that came from other shards.
         self._gathered: tuple[int, Any, Any] = (0, None, None)
+        self._recordings: dict[Hashable, tuple[Recording, object]] = {}
+
+    @property
+    def _gpu(self) -> bool:
+        return self._backend.info.kind == "gpu"
 
     # ---- beginnings
 
@@ -121,28 +101,60 @@ class Shard:
             settings[SHARE] = changes["share"]
         self._backend.upload(settings, self._cloud.settings)
 
-    def score(self, source: int, given: Sequence[tuple[int, tuple[Any, ...]]]) -> Step:
+    def score(self, source: int, given: Sequence[Given]) -> Step:
         """Score the poses of a buffer by readings, and return the largest score."""
-        cloud, part, gpu = self._cloud, self._part, self._backend.info.kind == "gpu"
+        cloud, part = self._cloud, self._part
         if not part.size:
             yield
             return -math.inf
-        poses: Any = cloud.lent(cloud.poses[source], (part.size, 3)) if gpu else cloud.host_poses(source, part.size)
-        for place, (index, reading) in enumerate(given):
-            if gpu:
-                buffer = self._backend.part(cloud.log_p[place], 0, part.size, cloud.precision)
-                out = self._backend.lend(buffer, (part.size,), cloud.precision)
-                self._sensors[index].log_likelihood(poses, reading, out)
-            else:
-                self._backend.upload(self._sensors[index].log_likelihood(poses, reading), cloud.log_p[place])
-        flags = flags_if(FLOAT64=cloud.precision == np.float64)
-        self._backend.run(tuple(
-            launch("add_scores", flags, (cloud.blocks,), log_p=log_p, settings=cloud.settings, score=cloud.score,
-                   largest=cloud.largest, sensor=sensor, particles=part.size, block=part.block)
-            for sensor, log_p in enumerate(cloud.log_p[: len(given)])
-        ))  # fmt: skip
+        if self._gpu and all(self._sensors[index].records(reading) for index, reading in given):
+            for index, reading in given:
+                self._sensors[index].upload(reading)
+            self._recorded(source, given)()
+        else:
+            poses: Any = self._lent_poses(source) if self._gpu else cloud.host_poses(source, part.size)
+            for place, (index, reading) in enumerate(given):
+                if self._gpu:
+                    self._sensors[index].log_likelihood(poses, reading, self._lent_scores(place))
+                else:
+                    self._backend.upload(self._sensors[index].log_likelihood(poses, reading), cloud.log_p[place])
+            self._backend.run(self._sums_of_scores(len(given)))
         yield
         return float(self._read(cloud.largest, cloud.blocks).max())
+
+    def _recorded(self, source: int, given: Sequence[Given]) -> Recording:
+        """Return the recorded program that scores a buffer; its start does not wait, so that devices work together."""
+        sensors = tuple((index, self._sensors[index].version) for index, _ in given)
+        key = (source, self._part.size, self._part.block, sensors)
+        if key not in self._recordings:
+            if len(self._recordings) > 8:
+                self._recordings.clear()
+            program: Program = ()
+            poses, owners = self._lent_poses(source), []
+            for place, (index, _) in enumerate(given):
+                out = self._lent_scores(place)
+                launches, owner = self._sensors[index].program(poses, out)
+                program += launches
+                owners.append((out, owner))
+            program += self._sums_of_scores(len(given))
+            self._recordings[key] = self._backend.record(program), (poses, owners)
+        return self._recordings[key][0]
+
+    def _lent_poses(self, source: int) -> Any:
+        return self._cloud.lent(self._cloud.poses[source], (self._part.size, 3))
+
+    def _lent_scores(self, place: int) -> Any:
+        cloud, shape = self._cloud, (self._part.size,)
+        part = self._backend.part(cloud.log_p[place], 0, self._part.size, cloud.precision)
+        return self._backend.lend(part, shape, cloud.precision)
+
+    def _sums_of_scores(self, sensors: int) -> Program:
+        cloud, flags = self._cloud, flags_if(FLOAT64=self._cloud.precision == np.float64)
+        return tuple(
+            launch("add_scores", flags, (cloud.blocks,), log_p=log_p, settings=cloud.settings, score=cloud.score,
+                   largest=cloud.largest, sensor=sensor, particles=self._part.size, block=self._part.block)
+            for sensor, log_p in enumerate(cloud.log_p[:sensors])
+        )  # fmt: skip
 
     def weigh(self, high: float, stage: int) -> Step:
         """Return the sums of integer weights, given the largest score of the whole filter."""
@@ -207,17 +219,50 @@ class Shard:
             share = float(np.nextafter(share, math.inf if found < wanted else 0.0))
         self._upload_settings(self._part, share=share)
 
-    def draw(self, source: int, stage: int, drawn: Part, pieces: Sequence[Piece] | None) -> Step:
-        """Draw the particles of the next stage or step out of pieces of all shards; copy the own ones without pieces.
+    def shift_ends(self, offset: float) -> Step:
+        """Add the weights of the shards before to the cumulative weights on the device, and wait."""
+        cloud, part = self._cloud, self._part
+        if part.size and offset:
+            ones = self._backend.upload(np.ones(part.size))
+            factor = np.zeros(SETTINGS)
+            factor[TEMPERATURE + 1] = offset
+            # The kernel adds a multiple of an array to another: these integers are exact.
+            self._backend.run((
+                launch("add_scores", flags_if(FLOAT64=True), (cloud.blocks,), log_p=ones,
+                       settings=self._backend.upload(factor), score=cloud.ends, largest=cloud.largest, sensor=1,
+                       particles=part.size, block=part.block),
+            ))  # fmt: skip
+        yield
+        self._backend.synchronize()
+
+    def take(self, source: int, shards: Sequence[Shard]) -> Step:
+        """Copy the particles of all shards from device to device."""
+        poses, ends = self._room(self._part.whole)
+        for one in shards:
+            first, count = one._part.first * _DOUBLE.itemsize, one._part.size * _DOUBLE.itemsize
+            self._backend.copy(one._cloud.poses[source], poses, 3 * count, to=3 * first)
+            self._backend.copy(one._cloud.ends, ends, count, to=first)
+        yield
+
+    def reaches(self, other: Shard) -> bool:
+        """Tell whether the device copies from the device of another shard."""
+        return self._gpu and self._backend.copies_from(other._backend)
+
+    def draw(self, source: int, stage: int, drawn: Part, pieces: Sequence[Piece] | bool) -> Step:
+        """Draw the particles of the next stage or step.
 
         Args:
             source: Buffer of the poses.
             stage: The stage.
             drawn: Particles to draw.
-            pieces: Poses and cumulative weights in the order of the shards.
+            pieces: Poses and cumulative weights of shards in their order; True for those that the device has taken, and
+                False to copy the own ones.
         """
         cloud, poses, ends, count = self._cloud, self._cloud.poses[source], self._cloud.ends, self._part.size
-        if pieces is not None:
+        if pieces is True:
+            poses, ends = self._room(self._part.whole)
+            count = self._part.whole
+        elif pieces is not False:
             gathered, sums = (np.ascontiguousarray(np.concatenate(one)) for one in zip(*pieces, strict=True))
             poses, ends, count = self._gather(gathered, sums)
         if drawn.size:
@@ -232,14 +277,19 @@ class Shard:
 
     def _gather(self, poses: np.ndarray, ends: np.ndarray) -> tuple[Any, Any, int]:
         """Return buffers with particles of all shards, and their number."""
-        capacity, *buffers = self._gathered
-        if len(ends) > capacity:
-            capacity = 2 * len(ends)
-            buffers = [self._backend.empty(size, _DOUBLE) for size in (3 * capacity, capacity)]
-            self._gathered = (capacity, *buffers)
+        buffers = self._room(len(ends))
         for values, buffer in zip((poses, ends), buffers, strict=True):
             self._backend.upload(values, buffer)
-        return buffers[0], buffers[1], len(ends)
+        return *buffers, len(ends)
+
+    def _room(self, count: int) -> tuple[Any, Any]:
+        """Return buffers for poses and cumulative weights of particles of all shards."""
+        capacity, *buffers = self._gathered
+        if count > capacity:
+            capacity = count if count == self._part.whole else 2 * count
+            buffers = [self._backend.empty(size, _DOUBLE) for size in (3 * capacity, capacity)]
+            self._gathered = (capacity, *buffers)
+        return buffers[0], buffers[1]
 
     # ---- results
 
@@ -271,48 +321,3 @@ class Shard:
 
     def _read(self, buffer: Any, count: int) -> np.ndarray:
         return self._backend.download(buffer, np.empty(count))
-
-
-# Shards that live in this process for filters elsewhere.
-_HELD: dict[str, Shard] = {}
-
-
-def hold(name: str, make: Callable[[str], Any], device: str, capacity: int) -> str:
-    """Make a shard in this process, and return the name of its device.
-
-    Args:
-        name: Name of the shard.
-        make: Returns the models of a device.
-        device: Selection string, where the worker has no device of its own.
-        capacity: Most particles.
-    """
-    models = models_of(make, device_of(device))
-    _HELD[name] = Shard(models, capacity)
-    return str(models[0].device.selection)
-
-
-def call(name: str, method: str, *arguments: Any) -> Any:
-    """Run a method of a shard of this process to its end, and return its result."""
-    steps = getattr(_HELD[name], method)(*arguments)
-    next(steps)
-    return finished(steps)
-
-
-def release(name: str) -> None:
-    """Forget a shard of this process."""
-    _HELD.pop(name, None)
-
-
-def finished(steps: Step) -> Any:
-    """Run the second half of a method, and return its result."""
-    try:
-        next(steps)
-    except StopIteration as end:
-        return end.value
-    raise AssertionError("a method of a shard yields once")
-
-
-def models_of(make: Callable[[str], Any], device: str) -> list[Any]:
-    """Return the models of a device as a list."""
-    made = make(device)
-    return list(made) if isinstance(made, Sequence) else [made]

@@ -25,11 +25,14 @@ from gpusense.localization.cloud import Cloud
 from gpusense.reference.drawing import mark_of
 from gpusense.reference.estimate import finish_estimate
 from gpusense.reference.weighing import rung_of, set_weights, sum_weights
-from gpusense.sweeps import shard as shards
-from gpusense.sweeps.shard import Part, Shard, finished, parts_of
+from gpusense.sweeps import held
+from gpusense.sweeps.parts import Part, finished, parts_of
+from gpusense.sweeps.shard import Shard
 
 _PLAIN = frozenset[str]()
 _NONE = np.empty(0)
+# Bytes of a pose and a cumulative weight.
+_PARTICLE = 32
 
 
 class Here:
@@ -38,11 +41,16 @@ class Here:
     Args:
         models: Models of each shard.
         capacity: Most particles of a shard.
+
+    Attributes:
+        devices: Selection strings of the devices.
+        direct: Whether particles go from device to device, and not through the host.
     """
 
     def __init__(self, models: Sequence[Sequence[Any]], capacity: int) -> None:
         self._shards = [Shard(each, capacity) for each in models]
         self.devices = [str(each[0].device.selection) for each in models]
+        self.direct = all(one.reaches(other) for one in self._shards for other in self._shards)
 
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Run a method of all shards, each with its own arguments, and return the results."""
@@ -50,6 +58,10 @@ class Here:
         for one in steps:
             next(one)
         return [finished(one) for one in steps]
+
+    def hand_on(self, source: int) -> None:
+        """Copy the particles of all shards to each, from device to device."""
+        self.each("take", [(source, self._shards)] * len(self._shards))
 
     def close(self) -> None:
         """Forget the shards."""
@@ -64,7 +76,13 @@ class There:
         make: Function of a module that returns the models of a device.
         devices: Selection strings, for workers that have no device of their own.
         capacity: Most particles of a shard.
+
+    Attributes:
+        devices: Selection strings of the devices.
+        direct: False: particles go through this process.
     """
+
+    direct = False
 
     def __init__(
         self, executors: Sequence[Executor], make: Callable[[str], Any], devices: Sequence[str], capacity: int
@@ -72,7 +90,7 @@ class There:
         self._executors = list(executors)
         self._names = [secrets.token_hex(8) for _ in executors]
         made = [
-            executor.submit(shards.hold, name, make, device, capacity)
+            executor.submit(held.hold, name, make, device, capacity)
             for executor, name, device in zip(executors, self._names, devices, strict=True)
         ]
         self.devices = [future.result() for future in made]
@@ -80,15 +98,19 @@ class There:
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Run a method of all shards, each with its own arguments, and return the results."""
         running = [
-            executor.submit(shards.call, name, method, *own)
+            executor.submit(held.call, name, method, *own)
             for executor, name, own in zip(self._executors, self._names, arguments, strict=True)
         ]
         return [future.result() for future in running]
 
+    def hand_on(self, source: int) -> None:
+        """Refuse: the shards do not see one another."""
+        raise NotImplementedError
+
     def close(self) -> None:
         """Forget the shards."""
         for executor, name in zip(self._executors, self._names, strict=True):
-            executor.submit(shards.release, name).result()
+            executor.submit(held.release, name).result()
 
 
 class SplitCloud(Cloud):
@@ -201,10 +223,16 @@ class SplitCloud(Cloud):
         if marks is not None:
             # A filter that changes its size draws, whatever its weights.
             shown[stage * STAGE + RESAMPLED] = 1.0
-        own = [(source, totals, shown, place, float(offset), marks) for offset in offsets]
+        asked = None if self._team.direct else marks
+        own = [(source, totals, shown, place, float(offset), asked) for offset in offsets]
         found = self._team.each("set_weights", own)
-        pieces: list[Any] = [None] * self._size
-        if marks is not None:
+        pieces: list[Any] = [False] * self._size
+        if marks is not None and self._team.direct:
+            self._team.each("shift_ends", [(float(offset),) for offset in offsets])
+            self._team.hand_on(source)
+            pieces = [True] * self._size
+            self.exchanged += (self._size - 1) * self.count * _PARTICLE
+        elif marks is not None:
             pieces = [[one[target] for one in found] for target in range(self._size)]
             self.exchanged += sum(
                 one.nbytes for target, each in enumerate(pieces) for origin, piece in enumerate(each)

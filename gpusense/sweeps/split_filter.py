@@ -8,7 +8,8 @@ from typing import Any
 
 from gpusense._util import checks
 from gpusense.localization.filter import ParticleFilter
-from gpusense.sweeps.shard import models_of, parts_of
+from gpusense.sweeps.held import models_of
+from gpusense.sweeps.parts import parts_of
 from gpusense.sweeps.split import Here, SplitCloud, There
 
 

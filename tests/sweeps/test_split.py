@@ -14,7 +14,7 @@ from gpusense.interface import constants as c
 from gpusense.reference.drawing import draw_particles
 from gpusense.reference.motion import move_particles
 from gpusense.sweep import ProcessExecutor, SplitParticleFilter
-from gpusense.sweeps.shard import parts_of
+from gpusense.sweeps.parts import parts_of
 
 OPTIONS = [
     {},
@@ -60,7 +60,10 @@ def test_few_particles_leave_a_device_idle():
 @pytest.mark.parametrize("stages", [1, 3])
 def test_gpus_have_the_particles_of_one(warp_as_gpu, stages):
     expected = states(gs.ParticleFilter(field("warp:cpu"), particles=400, seed=5, stages=stages))
-    found = states(SplitParticleFilter(field, devices=["warp:cpu"] * 2, particles=400, seed=5, stages=stages))
+    pf = SplitParticleFilter(field, devices=["warp:cpu"] * 2, particles=400, seed=5, stages=stages)
+    found = states(pf)
+    # Particles went from device to device, and none through the host.
+    assert pf._cloud._team.direct and pf.exchanged % (400 * 32) == 0 < pf.exchanged
     # A GPU runs stages that have nothing left, which divides weights by their mean again.
     for one, two in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)

@@ -128,6 +128,8 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
                 jobs, table=args.table, executor=executor, root=args.root, backend=backend, resume=args.resume,
                 retry_failed=args.retry_failed, attempts=args.attempts, on_row=on_row,
             )  # fmt: skip
+        except ImportError as error:
+            raise ValueError(str(error)) from None
         except KeyboardInterrupt:
             sys.stderr.write(f"gpusense: {args.table} has the finished jobs: --resume runs the others\n")
             raise
@@ -185,12 +187,8 @@ def _dask(args: argparse.Namespace, names: list[str] | int) -> Iterator[DaskExec
 
 def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
     """Draw the picture, and print the summary."""
-    if args.plot is not None:
-        from gpusense.plots.drawing import save
-        from gpusense.plots.sweeps import sweep_figure
-        from gpusense.sweeps.table import read_table
-
-        save(sweep_figure(read_table(ended.table)), args.plot)
+    if args.plot is not None and not _drawn(ended.table, args.plot):
+        args.plot = None
     if args.json:
         figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
         print_json({"table": args.table, "plot": args.plot, **figures, "seconds": seconds, "machine": machine()})
@@ -202,3 +200,18 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
     for path in (args.table, args.plot):
         if path is not None:
             print(f"written: {path}")
+
+
+def _drawn(table: str, path: Path) -> bool:
+    """Draw the picture; tell whether there was anything to draw."""
+    from gpusense.plots.drawing import save
+    from gpusense.plots.sweeps import sweep_figure
+    from gpusense.sweeps.table import read_table
+
+    try:
+        figure = sweep_figure(read_table(table))
+    except ValueError as error:
+        sys.stderr.write(f"gpusense: no picture: {error}\n")
+        return False
+    save(figure, path)
+    return True

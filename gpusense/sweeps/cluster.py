@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from typing import Any
@@ -21,6 +23,8 @@ LOOPBACK = "127.0.0.1"
 RESOURCE = "gpusense"
 # Workers would write their life to standard error.
 _QUIET = "DASK_LOGGING__DISTRIBUTED"
+# Seconds for which the number of workers is believed.
+_FRESH = 2.0
 _ABSENT = "dask: must be installed for this executor: pip install 'gpusense[sweep]'"
 
 
@@ -71,6 +75,7 @@ class DaskExecutor(Executor):
             self._end()
             raise OSError(f"dask: must have a scheduler with workers at {address}, got none in {wait:g} s") from error
         self.address = str(self._client.scheduler.address)
+        self._slots, self._asked = 0, -math.inf
         self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in self._workers().values())
 
     def __repr__(self) -> str:
@@ -82,11 +87,12 @@ class DaskExecutor(Executor):
 
     @property
     def slots(self) -> int:
-        """Jobs that run at once now."""
-        workers = self._workers().values()
-        if self._pinned:
-            return int(sum(one.get("resources", {}).get(RESOURCE, 0) for one in workers))
-        return int(sum(one["nthreads"] for one in workers))
+        """Jobs that run at once, as the scheduler said within the last two seconds."""
+        if time.monotonic() > self._asked + _FRESH:
+            workers = self._workers().values()
+            counts = [one.get("resources", {}).get(RESOURCE, 0) if self._pinned else one["nthreads"] for one in workers]
+            self._slots, self._asked = int(sum(counts)), time.monotonic()
+        return self._slots
 
     @property
     def dashboard(self) -> str:

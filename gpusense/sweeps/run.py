@@ -98,10 +98,9 @@ def run(
     unique = {job.key: job for job in jobs}
     most = checks.integer("attempts", attempts, low=1)
     chosen = SerialExecutor() if executor is None else executor
-    slots = int(getattr(chosen, "slots", os.cpu_count() or 1))
-    size = _QUEUED * slots if window is None else checks.integer("window", window, low=1)
-    if isinstance(chosen, SerialExecutor):
-        size = 1
+    size = 1 if isinstance(chosen, SerialExecutor) else window
+    if size is not None:
+        size = checks.integer("window", size, low=1)
     with Table(table, resume=resume) as rows:
         kept = {key for key, row in rows.rows.items() if row["status"] == DONE or not retry_failed}
         pending = deque(job for job in unique.values() if job.key not in kept)
@@ -120,7 +119,7 @@ def run(
 
 
 def _outcomes(
-    pending: deque[Job], executor: Executor, size: int, most: int, root: str, backend: str
+    pending: deque[Job], executor: Executor, size: int | None, most: int, root: str, backend: str
 ) -> Iterable[tuple[Job, Outcome, int]]:
     """Yield each job with its outcome and the number of its starts, in the order in which they end.
 
@@ -129,22 +128,39 @@ def _outcomes(
     """
     running: dict[Future[Any], tuple[Job, int]] = {}
     again: deque[tuple[Job, int]] = deque()
+    error: SweepLost | None = None
     try:
         while pending or again or running:
-            while (pending or again) and len(running) < size:
+            limit = size or _window(executor)
+            while (pending or again) and len(running) < limit:
                 job, tries = again.popleft() if again else (pending.popleft(), 0)
                 running[_submitted(executor, job, root, backend)] = (job, tries + 1)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, tries = running.pop(future)
-                outcome = _outcome(future)
+                try:
+                    outcome = _outcome(future)
+                except SweepLost as lost:
+                    # Others of this round may have finished.
+                    error = lost
+                    continue
                 if outcome is None and tries < most:
                     again.append((job, tries))
                     continue
-                lost = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, "", "")
-                yield job, outcome or lost, tries
+                died = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, "", "")
+                yield job, outcome or died, tries
+            if error is not None:
+                raise error
     finally:
         for future in running:
             future.cancel()
+
+
+def _window(executor: Executor) -> int:
+    """Return the jobs to submit at once, which follow the workers of a cluster that grows or shrinks."""
+    try:
+        return _QUEUED * max(int(getattr(executor, "slots", os.cpu_count() or 1)), 1)
+    except (OSError, RuntimeError, TimeoutError) as error:
+        raise SweepLost(f"executor: must answer, got {type(error).__name__}: {error}") from error
 
 
 def _submitted(executor: Executor, job: Job, root: str, backend: str) -> Future[Any]:

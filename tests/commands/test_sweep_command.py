@@ -48,7 +48,7 @@ def test_a_plan_is_run_resumed_and_drawn(place, capsys):
     assert (found["done"], found["failed"], found["skipped"]) == (0, 4, 4) and err.count("absent.log") == 4
     table = gs.sweep.read_table(place / "t.csv")
     assert table["status"] == ["done"] * 4 + ["failed"] * 4 and table["axis.log"][4] == "absent"
-    assert cli.main(call(place, "--resume", "--retry-failed")) == 1
+    assert cli.main(call(place, "--plot", str(place / "no.png"), "--resume", "--retry-failed")) == 1
     assert "0 done, 4 failed, 4 were in the table already" in capsys.readouterr().out
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -106,22 +105,15 @@ def test_kernels_count_particles_from_the_first(device):
         assert np.array_equal(device.download(target, np.empty(300)), drawn[3 * first : 3 * first + 300])
 
 
-@pytest.mark.parametrize("engine", ["processes", "dask"])
-def test_other_processes_have_the_same_particles(engine):
-    if engine == "dask" and find_spec("distributed") is None:
-        pytest.skip("needs gpusense[sweep]")
+def test_other_processes_have_the_same_particles():
     expected = states(gs.ParticleFilter(field("numpy"), particles=300, seed=3), 3)
-    if engine == "dask":
-        owner = gs.sweep.DaskExecutor(devices=["numpy", "numpy"])
-        executors = owner.on_each()
-    else:
-        executors = [ProcessExecutor(["numpy"]) for _ in range(2)]
+    executors = [ProcessExecutor(["numpy"]) for _ in range(2)]
     try:
         pf = SplitParticleFilter(field, devices=["numpy", "numpy"], executors=executors, particles=300, seed=3)
         assert equal(states(pf, 3), expected)
         pf.close()
     finally:
-        for one in [owner] if engine == "dask" else executors:
+        for one in executors:
             one.shutdown()
 
 

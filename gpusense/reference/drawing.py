@@ -13,8 +13,10 @@ import numpy as np
 from gpusense.interface.constants import (
     DRAW_STREAM,
     DRAW_STREAMS,
+    DRAWN,
     FARTHEST_THETA,
     FARTHEST_X,
+    FIRST,
     INJECTED,
     JITTER,
     LEFT,
@@ -26,6 +28,7 @@ from gpusense.interface.constants import (
     STEP,
     STRATIFIED,
     TOTAL,
+    WHOLE,
 )
 from gpusense.reference.motion import wrap_once
 from gpusense.reference.philox import random_words, uniform_of
@@ -63,15 +66,17 @@ def draw_particles(
     total = state[stage * STAGE + TOTAL]
     if (state[stage * STAGE + RESAMPLED] == 0.0 and drawn == particles) or not total > 0.0:
         result[:] = poses[n % particles]
-        mean = total / (settings[SCALE] * particles)
+        mean = total / (settings[SCALE] * (settings[WHOLE] if settings[WHOLE] > 0.0 else particles))
         old = weight[n % particles]
         after[:drawn] = np.where(old > 0.0, np.maximum(old / mean, LEAST_WEIGHT), 0.0) if total > 0.0 else 1.0
         return
     step, key = zero + np.uint64(settings[STEP]), (int(settings[SEED]), int(settings[SEED + 1]))
     stream = DRAW_STREAM + DRAW_STREAMS * stage
+    n = n + int(settings[FIRST])
     first = n if settings[STRATIFIED] > 0.0 else zero
     start = uniform_of(random_words((first, step, zero + np.uint64(stream), zero), *key)[0])
-    chosen = found_at(ends, mark_of((n + start) / float(drawn), total), particles)
+    whole = settings[DRAWN] if settings[DRAWN] > 0.0 else float(drawn)
+    chosen = found_at(ends, mark_of((n + start) / whole, total), particles)
     pose = poses[chosen].copy()
     after[:drawn] = 1.0
     if state[stage * STAGE + LEFT] > 0.0:

@@ -11,6 +11,8 @@
 #define POOL 15
 #define SCALE 21
 #define STRATIFIED 26
+#define WHOLE 62
+#define DRAWN 63
 #define LEFT 0
 #define TOTAL 1
 #define RESAMPLED 3
@@ -50,20 +52,22 @@ kernel void draw_particles(global const double *source, global const double *wei
     if ((own[RESAMPLED] == 0.0 && drawn == particles) || !(total > 0.0)) {
         const long from = 3 * (long)(n % particles);
         for (int axis = 0; axis < 3; axis++) target[place + axis] = source[from + axis];
-        const double old = weight[n % particles], relative = old / (total / (settings[SCALE] * (double)particles));
+        const double whole = settings[WHOLE] > 0.0 ? settings[WHOLE] : (double)particles;
+        const double old = weight[n % particles], relative = old / (total / (settings[SCALE] * whole));
         const double kept = old > 0.0 ? (relative > LEAST_WEIGHT ? relative : LEAST_WEIGHT) : 0.0;
         after[n] = total > 0.0 ? kept : 1.0;
         return;
     }
     const uint step = (uint)settings[STEP], key_0 = (uint)settings[SEED], key_1 = (uint)settings[SEED + 1];
     const uint stream = DRAW_STREAM + DRAW_STREAMS * stage;
-    const uint first = settings[STRATIFIED] > 0.0 ? (uint)n : 0;
+    const uint index = (uint)settings[FIRST] + (uint)n, first = settings[STRATIFIED] > 0.0 ? index : 0;
+    const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
     const double start = uniform_of(random_words((uint4)(first, step, stream, 0), key_0, key_1).x);
-    const long chosen = 3 * (long)found_at(ends, mark_of(((double)n + start) / (double)drawn, total), particles);
+    const long chosen = 3 * (long)found_at(ends, mark_of(((double)index + start) / whole, total), particles);
     double x = source[chosen], y = source[chosen + 1], theta = source[chosen + 2];
     after[n] = 1.0;
     if (own[LEFT] > 0.0) {
-        const uint4 words = random_words((uint4)((uint)n, step, stream + 1, 0), key_0, key_1);
+        const uint4 words = random_words((uint4)(index, step, stream + 1, 0), key_0, key_1);
         const long one = 3 * (long)found_at(ends, mark_of(uniform_of(words.x), total), particles);
         const long other = 3 * (long)found_at(ends, mark_of(uniform_of(words.y), total), particles);
         const double dx = source[one] - source[other], dy = source[one + 1] - source[other + 1];
@@ -74,8 +78,8 @@ kernel void draw_particles(global const double *source, global const double *wei
         x += part * dx, y += part * dy, theta = wrap_once(theta + part * turn);
     }
     if (stage == 0 && state[INJECTED] > 0.0 && settings[POOL] > 0.0) {
-        const uint4 words = random_words((uint4)((uint)n, step, stream + 2, 0), key_0, key_1);
-        const uint4 more = random_words((uint4)((uint)n, step, stream + 3, 0), key_0, key_1);
+        const uint4 words = random_words((uint4)(index, step, stream + 2, 0), key_0, key_1);
+        const uint4 more = random_words((uint4)(index, step, stream + 3, 0), key_0, key_1);
         if (uniform_of(words.x) < state[INJECTED]) {
             const double row = floor(uniform_of(words.y) * settings[POOL]);
             const long from = 3 * (long)(row < settings[POOL] - 1.0 ? row : settings[POOL] - 1.0);

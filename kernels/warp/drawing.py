@@ -14,7 +14,7 @@ from . import motion, philox
 from .prelude import kernel
 
 SEED, STEP, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = (wp.constant(place) for place in (0, 2, 12, 13, 14, 15))
-SCALE, STRATIFIED = wp.constant(21), wp.constant(26)
+SCALE, STRATIFIED, FIRST, WHOLE, DRAWN = (wp.constant(place) for place in (21, 26, 61, 62, 63))
 LEFT, TOTAL, RESAMPLED, STAGE, INJECTED = (wp.constant(place) for place in (0, 1, 3, 8, 51))
 DRAW_STREAM, DRAW_STREAMS = wp.constant(16), wp.constant(4)
 LEAST_WEIGHT = wp.constant(wp.float64(1e-6))
@@ -72,7 +72,8 @@ def make(name, flags):
                 target[3 * n + axis] = source[3 * copied + axis]
             kept = ONE
             if total > ZERO:
-                kept = wp.max(weight[copied] / (total / (settings[SCALE] * wp.float64(particles))), LEAST_WEIGHT)
+                whole = wp.where(settings[WHOLE] > ZERO, settings[WHOLE], wp.float64(particles))
+                kept = wp.max(weight[copied] / (total / (settings[SCALE] * whole)), LEAST_WEIGHT)
                 if weight[copied] == ZERO:
                     kept = weight[copied]
             after[n] = kept
@@ -81,18 +82,20 @@ def make(name, flags):
         key_0 = wp.uint32(settings[SEED])
         key_1 = wp.uint32(settings[SEED + 1])
         stream = wp.uint32(DRAW_STREAM + DRAW_STREAMS * stage)
+        index = wp.uint32(settings[FIRST]) + wp.uint32(n)
         first = wp.uint32(0)
         if settings[STRATIFIED] > ZERO:
-            first = wp.uint32(n)
+            first = index
         start = random_words(first, step, stream, key_0, key_1)
-        fraction = (wp.float64(n) + uniform_of(start[0])) / wp.float64(drawn)
+        next_whole = wp.where(settings[DRAWN] > ZERO, settings[DRAWN], wp.float64(drawn))
+        fraction = (wp.float64(index) + uniform_of(start[0])) / next_whole
         chosen = 3 * found_at(ends, mark_of(fraction, total), particles)
         x = source[chosen]
         y = source[chosen + 1]
         theta = source[chosen + 2]
         after[n] = ONE
         if state[stage * STAGE + LEFT] > ZERO:
-            words = random_words(wp.uint32(n), step, stream + wp.uint32(1), key_0, key_1)
+            words = random_words(index, step, stream + wp.uint32(1), key_0, key_1)
             one = 3 * found_at(ends, mark_of(uniform_of(words[0]), total), particles)
             other = 3 * found_at(ends, mark_of(uniform_of(words[1]), total), particles)
             dx = source[one] - source[other]
@@ -105,8 +108,8 @@ def make(name, flags):
             y += part * dy
             theta = wrap_once(theta + part * turn)
         if stage == 0 and state[INJECTED] > ZERO and settings[POOL] > ZERO:
-            some = random_words(wp.uint32(n), step, stream + wp.uint32(2), key_0, key_1)
-            more = random_words(wp.uint32(n), step, stream + wp.uint32(3), key_0, key_1)
+            some = random_words(index, step, stream + wp.uint32(2), key_0, key_1)
+            more = random_words(index, step, stream + wp.uint32(3), key_0, key_1)
             if uniform_of(some[0]) < state[INJECTED]:
                 row = 3 * int(wp.min(wp.floor(uniform_of(some[1]) * settings[POOL]), settings[POOL] - ONE))
                 x = pool[row] + (TWO * uniform_of(more[0]) - ONE) * settings[POOL + 1]

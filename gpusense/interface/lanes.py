@@ -13,10 +13,14 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "e_step": (set(),),
     "field_gradient": ({"LINEAR"},),
+    "move_particles": (set(),),
     "score_beams": ({"LINEAR"},),
     "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),
+    "set_weights": (set(),),
     "shift_scores": (set(),),
+    "sum_poses": (set(),),
+    "weigh_particles": (set(),),
 }
 
 

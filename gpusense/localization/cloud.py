@@ -27,10 +27,18 @@ from gpusense.interface.constants import (
     WEIGHT_SUMS,
 )
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
+# Particles of a vector of float64.
+_VECTOR = 8
+
+
+def _block_of(count: int) -> int:
+    """Return the particles of a block: as many as there are blocks, in whole vectors."""
+    return max(-(-math.isqrt(count) // _VECTOR) * _VECTOR, 2 * _VECTOR)
 
 
 class Summary(NamedTuple):
@@ -69,7 +77,7 @@ class Cloud:
     def __init__(self, backend: Backend, capacity: int, sensors: int, precision: np.dtype) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.shown, self.next = capacity, 0, 0
-        self.block = max(math.ceil(math.sqrt(capacity)), 16)
+        self.block = _block_of(capacity)
         most = -(-capacity // 16)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
@@ -93,7 +101,7 @@ class Cloud:
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
         self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = max(math.ceil(math.sqrt(self.count)), 16)
+        self.block = _block_of(self.count)
         w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
         self.backend.synchronize()
         self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
@@ -119,11 +127,14 @@ class Cloud:
 
     # ---- programs
 
+    def _flags(self, kernel: str) -> frozenset[str]:
+        return widened(self.backend.info.lanes, kernel, _PLAIN)
+
     def motion(self, kind: int) -> Program:
         """Return the launch that moves the particles of the next step."""
         buffer = self.poses[self.next]
         return (
-            launch("move_particles", _PLAIN, (self.count,), source=buffer, settings=self.settings, target=buffer,
+            launch("move_particles", self._flags("move_particles"), (self.count,), source=buffer, settings=self.settings, target=buffer,
                    particles=self.count, kind=kind),
         )  # fmt: skip
 
@@ -139,10 +150,10 @@ class Cloud:
         shared = dict(largest=self.largest, sums=self.sums, settings=self.settings, state=self.state, stage=stage)
         return (
             *scores,
-            launch("weigh_particles", _PLAIN, (blocks,), score=self.score, before=self.before, blocks=blocks, **sizes,
+            launch("weigh_particles", self._flags("weigh_particles"), (blocks,), score=self.score, before=self.before, blocks=blocks, **sizes,
                    **shared),
             launch("sum_weights", _PLAIN, (WEIGHT_SUMS,), totals=self.totals, blocks=blocks, **shared),
-            launch("set_weights", _PLAIN, (blocks,), score=self.score, before=self.before, totals=self.totals,
+            launch("set_weights", self._flags("set_weights"), (blocks,), score=self.score, before=self.before, totals=self.totals,
                    weight=self.weight, ends=self.ends, blocks=blocks, stages=stages, **sizes, **shared),
             launch("draw_particles", _PLAIN, (drawn,), source=self.poses[source], weight=self.weight, ends=self.ends,
                    settings=self.settings, state=self.state, pool=self.pool, target=self.poses[1 - source],
@@ -232,7 +243,7 @@ class Cloud:
     def resized(self, drawn: int) -> None:
         """Set the number of particles, after a step that has drawn that number."""
         self.count = drawn
-        self.block = max(math.ceil(math.sqrt(drawn)), 16)
+        self.block = _block_of(drawn)
 
     # ---- what crosses to the host
 
@@ -255,7 +266,7 @@ class Cloud:
         program: Program = ()
         for again in (0, 1):
             program += (
-                launch("sum_poses", _PLAIN, (blocks,), poses=poses, weight=self.weight, estimate=self.estimated,
+                launch("sum_poses", self._flags("sum_poses"), (blocks,), poses=poses, weight=self.weight, estimate=self.estimated,
                        sums=self.sums, particles=count, block=self.block, again=again),
                 launch("finish_estimate", _PLAIN, (1,), poses=poses, sums=self.sums, estimate=self.estimated,
                        blocks=blocks, again=again),

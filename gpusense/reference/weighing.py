@@ -13,29 +13,22 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import (
-    DEGENERATE,
     EVIDENCE,
     FAST,
     FAST_RATE,
     INJECTED,
-    LEFT,
     MOST_INJECTED,
     PER_BEAM_SCALE,
-    RESAMPLED,
-    RUNG,
     RUNGS,
-    SAMPLE_SIZE,
     SCALE,
     SHARE,
     SLOW,
     SLOW_RATE,
-    STAGE,
     TEMPERATURE,
-    THRESHOLD,
-    TOTAL,
     WEIGHT_SUMS,
 )
 from gpusense.reference.elementary import exp_of, log_of
+from gpusense.reference.rungs import largest_of, left_of, rung_of, set_stage, tempered
 
 
 def add_scores(
@@ -53,23 +46,6 @@ def add_scores(
     score[:particles] = scaled if sensor == 0 else score[:particles] + scaled
     starts = np.arange(0, particles, block)
     largest[: len(starts)] = np.maximum.reduceat(score[:particles], starts)
-
-
-def largest_of(largest: np.ndarray, blocks: int) -> float:
-    """Return the largest score of all blocks."""
-    return float(largest[:blocks].max())
-
-
-def tempered(score: np.ndarray, largest: float, left: float) -> np.ndarray:
-    """Return the likelihoods of scores relative to the largest; 1 for all where none is possible or nothing is left."""
-    if largest == -np.inf or left == 0.0:
-        return np.ones_like(score)
-    return exp_of(left * (score - largest))
-
-
-def left_of(state: np.ndarray, stage: int) -> float:
-    """Return the part of the temperature that earlier stages have left."""
-    return float(state[(stage - 1) * STAGE + LEFT]) if stage > 0 else 1.0
 
 
 def weigh_particles(
@@ -127,14 +103,6 @@ def sum_weights(
         follow_evidence(totals[0], totals[2 * RUNGS], largest_of(largest, blocks), settings, state)
 
 
-def rung_of(totals: np.ndarray, settings: np.ndarray, least: float) -> int:
-    """Return the first rung with the effective sample size ``least``, or the last rung."""
-    for rung in range(RUNGS - 1):
-        if totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]:
-            return rung
-    return RUNGS - 1
-
-
 def set_weights(
     flags: frozenset[str],
     score: np.ndarray,
@@ -160,12 +128,4 @@ def set_weights(
         likelihood = np.sqrt(likelihood)
     weight[:particles] = before[:particles] * likelihood
     ends[:particles] = np.cumsum(np.floor(weight[:particles] * scale))
-    size = totals[rung] * totals[rung] / (scale * totals[RUNGS + rung])
-    rest = left - left * 0.5**rung
-    state[stage * STAGE + LEFT] = rest if stage + 1 < stages else 0.0
-    state[stage * STAGE + TOTAL] = totals[rung]
-    state[stage * STAGE + SAMPLE_SIZE] = size
-    wanted = size < settings[THRESHOLD] * particles or rest > 0.0 or (stage == 0 and state[INJECTED] > 0.0)
-    state[stage * STAGE + RESAMPLED] = 1.0 if wanted else 0.0
-    state[stage * STAGE + DEGENERATE] = 1.0 if high == -np.inf else 0.0
-    state[stage * STAGE + RUNG] = left * 0.5**rung
+    set_stage(totals, settings, state, high, left, rung, particles, stage, stages)

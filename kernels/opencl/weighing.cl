@@ -4,30 +4,7 @@
 // is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, "Annealed importance
 // sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
 // Recovery: augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
-// requires: elementary
-
-#define SHARE 19
-#define THRESHOLD 20
-#define SCALE 21
-#define PER_BEAM_SCALE 22
-#define SLOW_RATE 23
-#define FAST_RATE 24
-#define MOST_INJECTED 25
-#define TEMPERATURE 27
-#define RUNGS 8
-#define WEIGHT_SUMS (2 * RUNGS + 1)
-// Places in the state: of a stage, and of what lasts.
-#define LEFT 0
-#define TOTAL 1
-#define SAMPLE_SIZE 2
-#define RESAMPLED 3
-#define DEGENERATE 4
-#define RUNG 5
-#define STAGE 8
-#define EVIDENCE 48
-#define SLOW 49
-#define FAST 50
-#define INJECTED 51
+// requires: rungs
 
 // Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the largest: one
 // work-item takes a block of particles.
@@ -45,23 +22,6 @@ kernel void add_scores(global const real *log_p, global const double *settings, 
         high = sum > high ? sum : high;
     }
     largest[b] = high;
-}
-
-// Return the largest score of all blocks.
-double largest_of(global const double *largest, const int blocks) {
-    double high = -INFINITY;
-    for (int b = 0; b < blocks; b++) high = largest[b] > high ? largest[b] : high;
-    return high;
-}
-
-// Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
-double tempered(const double score, const double largest, const double left) {
-    return largest == -INFINITY || left == 0.0 ? 1.0 : exp_of(left * (score - largest));
-}
-
-// Return the part of the temperature that earlier stages have left.
-double left_of(global const double *state, const int stage) {
-    return stage > 0 ? state[(stage - 1) * STAGE + LEFT] : 1.0;
 }
 
 // Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a block.
@@ -126,13 +86,6 @@ kernel void sum_weights(global const double *sums, global const double *largest,
     if (stage == 0 && column == 0) follow_evidence(total, before, largest_of(largest, blocks), settings, state);
 }
 
-// Return the first rung with the effective sample size least, or the last rung.
-int rung_of(global const double *totals, global const double *settings, const double least) {
-    int rung = 0;
-    while (rung < RUNGS - 1 && !(totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung])) rung++;
-    return rung;
-}
-
 // Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first writes the
 // stage's state.
 kernel void set_weights(global const double *score, global const double *before, global const double *largest,
@@ -154,18 +107,5 @@ kernel void set_weights(global const double *score, global const double *before,
         sum += floor(chosen * scale);
         ends[n] = sum;
     }
-    if (b > 0) return;
-    const double size = totals[rung] * totals[rung] / (scale * totals[RUNGS + rung]);
-    double part = left;
-    for (int k = 0; k < rung; k++) part *= 0.5;
-    const double rest = left - part;
-    const int wanted = size < settings[THRESHOLD] * (double)particles || rest > 0.0 ||
-                       (stage == 0 && state[INJECTED] > 0.0);
-    global double *own = state + stage * STAGE;
-    own[LEFT] = stage + 1 < stages ? rest : 0.0;
-    own[TOTAL] = totals[rung];
-    own[SAMPLE_SIZE] = size;
-    own[RESAMPLED] = wanted ? 1.0 : 0.0;
-    own[DEGENERATE] = high == -INFINITY ? 1.0 : 0.0;
-    own[RUNG] = part;
+    if (b == 0) set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
 }

@@ -15,18 +15,15 @@ import warp as wp
 
 from .elementary import exp_of, log_of
 from .prelude import kernel, precision
+from .rungs import RUNGS, SCALE, SHARE, WEIGHT_SUMS, largest_of, left_of, rung_of, set_stage, tempered
 
-SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE = (wp.constant(place) for place in (19, 20, 21, 22))
-SLOW_RATE, FAST_RATE, MOST_INJECTED, TEMPERATURE = (wp.constant(place) for place in (23, 24, 25, 27))
-RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
-# Places in the state: of a stage, and of what lasts.
-LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
-STAGE = wp.constant(8)
+PER_BEAM_SCALE, SLOW_RATE, FAST_RATE = (wp.constant(place) for place in (22, 23, 24))
+MOST_INJECTED, TEMPERATURE = wp.constant(25), wp.constant(27)
 EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 51))
 NEVER = wp.constant(wp.float64(-math.inf))
-ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
-rungs = wp.types.vector(length=8, dtype=wp.float64)
+eight = wp.types.vector(length=8, dtype=wp.float64)
 
 
 @functools.cache
@@ -60,30 +57,6 @@ def make(name, flags):
             high = wp.max(high, value)
         largest[b] = high
 
-    # Return the largest score of all blocks.
-    @wp.func
-    def largest_of(largest: wp.array(dtype=wp.float64), blocks: wp.int32):
-        high = largest[0]
-        for b in range(1, blocks):
-            high = wp.max(high, largest[b])
-        return high
-
-    # Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
-    @wp.func
-    def tempered(score: wp.float64, largest: wp.float64, left: wp.float64):
-        value = ONE
-        if not wp.isinf(largest) and left > ZERO:
-            value = exp_of(left * (score - largest))
-        return value
-
-    # Return the part of the temperature that earlier stages have left.
-    @wp.func
-    def left_of(state: wp.array(dtype=wp.float64), stage: wp.int32):
-        left = ONE
-        if stage > 0:
-            left = state[(stage - 1) * STAGE + LEFT]
-        return left
-
     # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a
     # block.
     @kernel
@@ -106,8 +79,8 @@ def make(name, flags):
         high = largest_of(largest, blocks)
         left = left_of(state, stage)
         scale = settings[SCALE]
-        weights = rungs()
-        squares = rungs()
+        weights = eight()
+        squares = eight()
         old = ZERO + ZERO
         for n in range(begin, wp.min(begin + block, particles)):
             likelihood = tempered(score[n], high, left)
@@ -171,14 +144,6 @@ def make(name, flags):
         if stage == 0 and column == 0:
             follow_evidence(total, before, largest_of(largest, blocks), settings, state)
 
-    # Return the first rung with the effective sample size least, or the last rung.
-    @wp.func
-    def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), least: wp.float64):
-        rung = int(0)
-        while rung < RUNGS - 1 and not (totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]):
-            rung += 1
-        return rung
-
     # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
     # writes the stage's state.
     @kernel
@@ -220,21 +185,7 @@ def make(name, flags):
             total += wp.floor(chosen * scale)
             ends[n] = total
         if b == 0:
-            size = totals[rung] * totals[rung] / (scale * totals[RUNGS + rung])
-            part = left * ONE
-            for _k in range(rung):
-                part = part * HALF
-            rest = left - part
-            wanted = size < settings[THRESHOLD] * wp.float64(particles) or rest > ZERO
-            if stage == 0 and state[INJECTED] > ZERO:
-                wanted = True
-            first = stage * STAGE
-            state[first + LEFT] = wp.where(stage + 1 < stages, rest, ZERO)
-            state[first + TOTAL] = totals[rung]
-            state[first + SAMPLE_SIZE] = size
-            state[first + RESAMPLED] = wp.where(wanted, ONE, ZERO)
-            state[first + DEGENERATE] = wp.where(wp.isinf(high), ONE, ZERO)
-            state[first + RUNG] = part
+            set_stage(totals, settings, state, high, left, rung, particles, stage, stages)
 
     kernels = {"add_scores": add_scores, "weigh_particles": weigh_particles}
     return (kernels | {"sum_weights": sum_weights, "set_weights": set_weights})[name]

@@ -11,7 +11,7 @@ _LARGEST, _SUMS, _TOTALS = "double largest [blocks]", "double sums [17 * blocks]
 KERNELS: dict[str, Kernel] = {
     "move_particles": kernel(
         "motion", "pose", "double source [3 * particles]", _SETTINGS, "out double target [3 * particles]",
-        "int particles", "int kind",
+        "int particles", "int kind", wide=True,
     ),
     "add_scores": kernel(
         "weighing", "group", "real log_p [particles]", _SETTINGS, f"out {_SCORE}", "out double largest [particles]",

@@ -64,6 +64,6 @@ LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = range(6)
 STAGE = 8
 EVIDENCE, SLOW, FAST, INJECTED = 48, 49, 50, 51
 STATE = 64
-# Kernel file estimate: sums of a block, and numbers of an estimate: pose, covariance by rows of its upper half, the
-# sum of weights and the best particle.
-ESTIMATE_SUMS, ESTIMATE = 13, 12
+# Kernel file estimate: sums of a block, numbers of an estimate (pose, covariance by rows of its upper half, the sum of
+# weights, the best particle), and lanes of a block.
+ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 12, 8

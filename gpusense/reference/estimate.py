@@ -1,14 +1,15 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to a reference pose, block by block in the order of the particles: the first particle for the mean
-(PASS 0), and the mean for the covariance (PASS 1). Mardia and Jupp, *Directional Statistics* (2000), section 2.2.
+Sums are relative to a reference pose: the first particle for the mean, and the mean for the covariance (again). Mardia
+and Jupp, *Directional Statistics* (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the
+lanes are summed in the order of their particles, and then added one after the other.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import ESTIMATE_SUMS
+from gpusense.interface.constants import ESTIMATE_LANES, ESTIMATE_SUMS
 from gpusense.reference.elementary import angle_of
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.motion import wrap_once
@@ -37,8 +38,10 @@ def sum_poses(
         end = min(begin + block, particles)
         row = sums[b * ESTIMATE_SUMS : (b + 1) * ESTIMATE_SUMS]
         for k, column in enumerate(columns):
+            lanes = np.zeros((-(-(end - begin) // ESTIMATE_LANES), ESTIMATE_LANES))
+            lanes.reshape(-1)[: end - begin] = column[begin:end]
             # One after the other, as on devices.
-            row[k] = np.cumsum(column[begin:end])[-1]
+            row[k] = np.cumsum(np.cumsum(lanes, axis=0)[-1])[-1]
         best = begin + int(np.argmax(w[begin:end]))
         row[11], row[12] = w[best], best
 

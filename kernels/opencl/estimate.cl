@@ -1,9 +1,11 @@
 // Weighted mean, circular in the heading, and covariance of a cloud of particles.
-// Sums are relative to a reference pose, block by block in the order of the particles: the first particle for the mean,
-// and the mean for the covariance (again). Mardia and Jupp, "Directional Statistics" (2000), section 2.2.
+// Sums are relative to a reference pose: the first particle for the mean, and the mean for the covariance (again). Mardia
+// and Jupp, "Directional Statistics" (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the
+// lanes are summed in the order of their particles, and then added one after the other.
 // requires: motion
 
 #define ESTIMATE_SUMS 13
+#define ESTIMATE_LANES 8
 
 // Sum weights, offsets, products of offsets, cosines and sines of a block, and find its heaviest particle: one work-item
 // takes a block.
@@ -17,16 +19,22 @@ kernel void sum_poses(global const double *poses, global const double *weight, g
     double total[11], largest = -1.0;
     int best = begin;
     for (int k = 0; k < 11; k++) total[k] = 0.0;
-    for (int n = begin; n < end; n++) {
-        const double w = weight[n], x = poses[3 * (long)n] - x0, y = poses[3 * (long)n + 1] - y0;
-        const double angle = wrap_once(poses[3 * (long)n + 2] - theta0);
-        const double2 heading = cos_sin(angle);
-        total[0] += w, total[1] += w * x, total[2] += w * y;
-        total[3] += w * heading.x, total[4] += w * heading.y;
-        total[5] += w * x * x, total[6] += w * x * y, total[7] += w * x * angle;
-        total[8] += w * y * y, total[9] += w * y * angle, total[10] += w * angle * angle;
-        best = w > largest ? n : best;
-        largest = w > largest ? w : largest;
+    for (int lane = 0; lane < ESTIMATE_LANES; lane++) {
+        double part[11];
+        for (int k = 0; k < 11; k++) part[k] = 0.0;
+        for (int n = begin + lane; n < end; n += ESTIMATE_LANES) {
+            const double w = weight[n], x = poses[3 * (long)n] - x0, y = poses[3 * (long)n + 1] - y0;
+            const double angle = wrap_once(poses[3 * (long)n + 2] - theta0);
+            const double2 heading = cos_sin(angle);
+            part[0] += w, part[1] += w * x, part[2] += w * y;
+            part[3] += w * heading.x, part[4] += w * heading.y;
+            part[5] += w * x * x, part[6] += w * x * y, part[7] += w * x * angle;
+            part[8] += w * y * y, part[9] += w * y * angle, part[10] += w * angle * angle;
+            const int heavier = w > largest || (w == largest && n < best);
+            best = heavier ? n : best;
+            largest = heavier ? w : largest;
+        }
+        for (int k = 0; k < 11; k++) total[k] += part[k];
     }
     global double *row = sums + (long)b * ESTIMATE_SUMS;
     for (int k = 0; k < 11; k++) row[k] = total[k];

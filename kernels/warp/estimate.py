@@ -1,7 +1,8 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to a reference pose, block by block in the order of the particles: the first particle for the mean,
-and the mean for the covariance (again). Mardia and Jupp, *Directional Statistics* (2000), section 2.2.
+Sums are relative to a reference pose: the first particle for the mean, and the mean for the covariance (again). Mardia
+and Jupp, *Directional Statistics* (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the
+lanes are summed in the order of their particles, and then added one after the other.
 """
 
 import functools
@@ -11,7 +12,7 @@ import warp as wp
 from . import elementary, heading, motion
 from .prelude import kernel
 
-ESTIMATE_SUMS = wp.constant(13)
+ESTIMATE_SUMS, ESTIMATE_LANES = wp.constant(13), wp.constant(8)
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 totals = wp.types.vector(length=11, dtype=wp.float64)
 
@@ -49,26 +50,30 @@ def make(name, flags):
         total = totals()
         largest = wp.float64(0.0) - ONE
         best = int(begin)
-        for n in range(begin, wp.min(begin + block, particles)):
-            w = weight[n]
-            x = poses[3 * n] - x0
-            y = poses[3 * n + 1] - y0
-            angle = wrap_once(poses[3 * n + 2] - theta0)
-            turn = cos_sin(angle)
-            total[0] += w
-            total[1] += w * x
-            total[2] += w * y
-            total[3] += w * turn.x
-            total[4] += w * turn.y
-            total[5] += w * x * x
-            total[6] += w * x * y
-            total[7] += w * x * angle
-            total[8] += w * y * y
-            total[9] += w * y * angle
-            total[10] += w * angle * angle
-            if w > largest:
-                best = n
-                largest = w
+        for lane in range(ESTIMATE_LANES):
+            part = totals()
+            for n in range(begin + lane, wp.min(begin + block, particles), ESTIMATE_LANES):
+                w = weight[n]
+                x = poses[3 * n] - x0
+                y = poses[3 * n + 1] - y0
+                angle = wrap_once(poses[3 * n + 2] - theta0)
+                turn = cos_sin(angle)
+                part[0] += w
+                part[1] += w * x
+                part[2] += w * y
+                part[3] += w * turn.x
+                part[4] += w * turn.y
+                part[5] += w * x * x
+                part[6] += w * x * y
+                part[7] += w * x * angle
+                part[8] += w * y * y
+                part[9] += w * y * angle
+                part[10] += w * angle * angle
+                if w > largest or (w == largest and n < best):
+                    best = n
+                    largest = w
+            for k in range(11):
+                total[k] += part[k]
         for k in range(11):
             sums[b * ESTIMATE_SUMS + k] = total[k]
         sums[b * ESTIMATE_SUMS + 11] = largest

@@ -146,7 +146,7 @@ def _outcomes(
                 if outcome is None and tries < most:
                     again.append((job, tries))
                     continue
-                died = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, "", "")
+                died = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, 0.0, "", "")
                 yield job, outcome or died, tries
             if error is not None:
                 raise error

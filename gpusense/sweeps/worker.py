@@ -28,6 +28,7 @@ class Outcome(NamedTuple):
         error: The error in one line; empty after success.
         trace: Where the error was raised, for a log.
         seconds: Time of the job.
+        cpu_seconds: Processor time of the worker's process meanwhile.
         worker: Host and process.
         device: Selection string of the device.
     """
@@ -36,6 +37,7 @@ class Outcome(NamedTuple):
     error: str
     trace: str
     seconds: float
+    cpu_seconds: float
     worker: str
     device: str
 
@@ -69,7 +71,7 @@ def work(job: Job, root: str, device: str) -> Outcome:
     """
     chosen = device_of(device)
     with _LOCK:
-        begin = time.perf_counter()
+        begin, begin_cpu = time.perf_counter(), time.process_time()
         key = (root, chosen)
         if key not in _STORES:
             _STORES[key] = Store(root, chosen)
@@ -81,8 +83,8 @@ def work(job: Job, root: str, device: str) -> Outcome:
         except Exception as problem:
             text = " ".join(f"{type(problem).__name__}: {problem}".split())
             error, trace = text[:_LONGEST], traceback.format_exc()
-        seconds = time.perf_counter() - begin
-    return Outcome(values, error, trace, seconds, f"{platform.node()}:{os.getpid()}", chosen)
+        seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
 
 
 def _plain(value: Any) -> Any:

@@ -6,6 +6,7 @@ places them.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Hashable
 from typing import NamedTuple
@@ -200,9 +201,14 @@ def place(
     return PlacedPoses(
         count, corners, frame, space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real),
         space.empty("pose_low", 4 * count if careful else 4, real),
-        poses.flags | flags_if(FLOAT64=real == np.float64, CAREFUL=careful),
+        poses.flags | _precision_flags(real == _DOUBLE, careful),
         source, pose_status(space),
     )  # fmt: skip
+
+
+@functools.cache
+def _precision_flags(double: bool, careful: bool) -> frozenset[str]:
+    return flags_if(FLOAT64=double, CAREFUL=careful)
 
 
 def pose_status(space: Workspace) -> Buffer:

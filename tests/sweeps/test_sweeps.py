@@ -15,6 +15,7 @@ from support.room_log import write_room
 from support.split_scene import field, states
 
 import gpusense as gs
+from gpusense.commands import cli
 from gpusense.evaluation.tracking import Track, follow, read_steps, start, summary
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
@@ -218,6 +219,17 @@ def test_maps_and_logs_are_sent_to_workers_once(folder, cluster, tmp_path):
     # There is nothing at the root.
     ended, table = swept(jobs, tmp_path / "t.csv", cluster, root=tmp_path / "elsewhere")
     assert ended.done == 2, table["error"]
+
+
+@dask
+def test_the_command_sends_maps_and_logs_to_a_cluster(folder, cluster, tmp_path, capsys):
+    plan = {"options": {**SMALL, "map": "map.yaml", "log": "run.log"}, "axes": {"seed": [7, 8]}}
+    (folder / "plan.yaml").write_text(json.dumps(plan))
+    table = tmp_path / "t.csv"
+    assert cli.main(["sweep", str(folder / "plan.yaml"), "--table", str(table), "--dask", cluster.address]) == 0
+    out, err = capsys.readouterr()
+    assert "2 jobs: 2 done" in out and f"Dask at {cluster.address}, 2 slots" in err
+    assert set(gs.sweep.read_table(table)["device"]) == {"numpy"}
 
 
 def test_an_executor_that_is_shut_down_is_lost(tmp_path):

@@ -44,7 +44,8 @@ class Outcome(NamedTuple):
 
 # A worker runs one job at a time, as its device and its store serve one.
 _LOCK = threading.Lock()
-_STORES: dict[tuple[str, str], Store] = {}
+# Stores by root, device and sweep: files may have changed since another sweep.
+_STORES: dict[tuple[str, str, str], Store] = {}
 _SENT: dict[str, Any] = {}
 
 
@@ -52,8 +53,7 @@ def receive(sent: Mapping[str, Any]) -> None:
     """Keep maps and logs that were sent, for all jobs of this process."""
     with _LOCK:
         _SENT.update(sent)
-        for store in _STORES.values():
-            store.receive(sent)
+        _STORES.clear()
 
 
 def device_of(device: str) -> str:
@@ -61,19 +61,21 @@ def device_of(device: str) -> str:
     return os.environ.get(DEVICE) or device
 
 
-def work(job: Job, root: str, device: str) -> Outcome:
+def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
     """Run a job in this process; errors are part of the result.
 
     Args:
         job: The job.
         root: Folder of its files.
         device: Selection string of the device, where the worker has none of its own.
+        sweep: Name of the sweep: what a worker has read for another one is read again.
     """
     chosen = device_of(device)
     with _LOCK:
         begin, begin_cpu = time.perf_counter(), time.process_time()
-        key = (root, chosen)
+        key = (root, chosen, sweep)
         if key not in _STORES:
+            _STORES.clear()
             _STORES[key] = Store(root, chosen)
             _STORES[key].receive(_SENT)
         values: dict[str, Any] = {}

@@ -6,8 +6,9 @@
 Jobs track a robot along a simulated run in a generated building, with another seed each. Every worker runs jobs before
 the clock starts, so that no kernel is compiled while it runs, and sweeps of all numbers of workers run in turns.
 Efficiency is the least time on one worker over the least on n, times 1 / n. "Busy" is the share of the workers' time
-that jobs take; the rest is for the engine and the table. The tables of all sweeps must be equal, but for times and
-places; else the exit code is 1.
+that jobs take; the rest is for the engine and the table. On processors that others use, efficiency says little: then
+compare the processor time of a job, too. The tables of all sweeps must be equal, but for times and places; else the
+exit code is 1.
 """
 
 from __future__ import annotations
@@ -52,15 +53,22 @@ def executor_of(engine: str, devices: list[str]) -> Executor:
     return gs.sweep.ProcessExecutor(devices)
 
 
-def swept(jobs: list[Any], executor: Executor, folder: Path, name: str) -> tuple[float, float, dict[str, list[Any]]]:
-    """Return the seconds of a sweep, those of its jobs, and its table without times and places."""
+def swept(
+    jobs: list[Any], executor: Executor, folder: Path, name: str
+) -> tuple[float, float, float, dict[str, list[Any]]]:
+    """Return the seconds of a sweep, those of its jobs by clock and processor, and its table without these."""
     begin = time.perf_counter()
     ended = gs.sweep.run(jobs, table=folder / f"{name}.csv", executor=executor, root=folder)
     seconds = time.perf_counter() - begin
     columns = gs.sweep.read_table(ended.table)
     if ended.failed:
         raise SystemExit(f"jobs failed: {set(columns['error'])}")
-    return seconds, sum(columns["seconds"]), {key: value for key, value in columns.items() if not is_timing(key)}
+    return (
+        seconds,
+        sum(columns["seconds"]),
+        sum(columns["cpu_seconds"]),
+        {key: value for key, value in columns.items() if not is_timing(key)},
+    )
 
 
 def measure(arguments: Any, folder: Path) -> list[dict[str, Any]]:
@@ -74,6 +82,7 @@ def measure(arguments: Any, folder: Path) -> list[dict[str, Any]]:
     jobs, tables = jobs_of(0, arguments.jobs), []
     times: dict[int, list[float]] = {n: [] for n in arguments.workers}
     busy: dict[int, list[float]] = {n: [] for n in arguments.workers}
+    used: dict[int, list[float]] = {n: [] for n in arguments.workers}
     devices = {n: [arguments.device[k % len(arguments.device)] for k in range(n)] for n in arguments.workers}
     with contextlib.ExitStack() as stack:
         executors = {n: stack.enter_context(executor_of(arguments.engine, devices[n])) for n in arguments.workers}
@@ -81,16 +90,18 @@ def measure(arguments: Any, folder: Path) -> list[dict[str, Any]]:
             swept(jobs_of(100_000, 4 * n), executor, folder, f"warm{n}")
         for turn in range(arguments.repeats):
             for n, executor in executors.items():
-                seconds, own, columns = swept(jobs, executor, folder, f"run{n}_{turn}")
+                seconds, own, cpu, columns = swept(jobs, executor, folder, f"run{n}_{turn}")
                 times[n].append(seconds)
                 busy[n].append(own / seconds / n)
+                used[n].append(cpu / len(jobs))
                 tables.append(columns)
                 note(f"{n} workers: {seconds:.2f} s")
     arguments.differing = sorted({name for one in tables for name in one if one[name] != tables[0].get(name)})
     base = min(times[arguments.workers[0]]) * arguments.workers[0]
     return [
         dict(workers=n, devices=devices[n], seconds=min(each), all_seconds=each, jobs_per_second=len(jobs) / min(each),
-             speedup=base / min(each), efficiency=base / min(each) / n, busy=float(np.median(busy[n])))
+             speedup=base / min(each), efficiency=base / min(each) / n, busy=float(np.median(busy[n])),
+             cpu_seconds=min(used[n]))
         for n, each in times.items()
     ]  # fmt: skip
 
@@ -112,11 +123,11 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         write_run(Path(folder), arguments.beams, arguments.scans, arguments.seed)
         rows = measure(arguments, Path(folder))
-    columns = ("workers", "devices", "jobs", "s", "jobs/s", "times", "efficiency", "busy")
+    columns = ("workers", "devices", "jobs", "s", "jobs/s", "times", "efficiency", "busy", "CPU s a job")
     lines = [
         (row["workers"], ", ".join(dict.fromkeys(row["devices"])), arguments.jobs, f"{row['seconds']:.2f}",
          f"{row['jobs_per_second']:.2f}", f"{row['speedup']:.2f}", f"{row['efficiency']:.2f}",
-         f"{row['busy']:.2f}")
+         f"{row['busy']:.2f}", f"{row['cpu_seconds']:.3f}")
         for row in rows
     ]  # fmt: skip
     equal = f"tables that differ in {', '.join(arguments.differing)}" if arguments.differing else "equal tables"

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import multiprocessing.connection
 import os
 import queue
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
@@ -144,7 +146,16 @@ def _pool(device: str) -> ProcessPoolExecutor:
 
 
 def start_worker(device: str) -> None:
-    """Set the device of a worker's process; Ctrl-C is the parent's."""
+    """Set the device of a worker's process, which ends with its parent; Ctrl-C is the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     if device:
         os.environ[DEVICE] = device
+
+
+def _end_with(sentinel: int) -> None:
+    """Wait for the parent's end: a pool's process would wait for its next job for ever."""
+    multiprocessing.connection.wait([sentinel])
+    os._exit(1)

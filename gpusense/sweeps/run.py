@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
@@ -106,9 +107,9 @@ def run(
         pending = deque(job for job in unique.values() if job.key not in kept)
         left = len(pending)
         counts: Counter[str] = Counter()
-        folder = str(Path(root).resolve())
+        setting = str(Path(root).resolve()), backend, secrets.token_hex(8)
         try:
-            for job, outcome, tries in _outcomes(pending, chosen, size, most, folder, backend):
+            for job, outcome, tries in _outcomes(pending, chosen, size, most, setting):
                 row = rows.add(job, outcome, tries)
                 counts[row["status"]] += 1
                 counts["repeated"] += tries - 1
@@ -119,7 +120,7 @@ def run(
 
 
 def _outcomes(
-    pending: deque[Job], executor: Executor, size: int | None, most: int, root: str, backend: str
+    pending: deque[Job], executor: Executor, size: int | None, most: int, setting: tuple[str, ...]
 ) -> Iterable[tuple[Job, Outcome, int]]:
     """Yield each job with its outcome and the number of its starts, in the order in which they end.
 
@@ -134,7 +135,7 @@ def _outcomes(
             limit = size or _window(executor)
             while (pending or again) and len(running) < limit:
                 job, tries = again.popleft() if again else (pending.popleft(), 0)
-                running[_submitted(executor, job, root, backend)] = (job, tries + 1)
+                running[_submitted(executor, job, setting)] = (job, tries + 1)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, tries = running.pop(future)
                 try:
@@ -146,7 +147,7 @@ def _outcomes(
                 if outcome is None and tries < most:
                     again.append((job, tries))
                     continue
-                died = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, "", "")
+                died = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, 0.0, "", "")
                 yield job, outcome or died, tries
             if error is not None:
                 raise error
@@ -163,9 +164,9 @@ def _window(executor: Executor) -> int:
         raise SweepLost(f"executor: must answer, got {type(error).__name__}: {error}") from error
 
 
-def _submitted(executor: Executor, job: Job, root: str, backend: str) -> Future[Any]:
+def _submitted(executor: Executor, job: Job, setting: tuple[str, ...]) -> Future[Any]:
     try:
-        return executor.submit(work, job, root, backend)
+        return executor.submit(work, job, *setting)
     except (RuntimeError, OSError, CancelledError) as error:
         raise SweepLost(f"executor: must take jobs, got {type(error).__name__}: {error}") from error
 

@@ -34,6 +34,8 @@ from gpusense.reference.weighing import rung_of
 from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
 
 _PLAIN = frozenset[str]()
+# Units in the last place within which the product of two numbers reaches a neighbour of another product.
+_UNITS = 16
 _DOUBLE = np.dtype(np.float64)
 
 
@@ -53,6 +55,8 @@ class Shard:
         self._settings = np.zeros(0)
         # Capacity and buffers of particles that came from other shards.
         self._gathered: tuple[int, Any, Any] = (0, None, None)
+        # Ones, and numbers of a step whose only temperature is a sum of weights.
+        self._ones: tuple[Any, Any] | None = None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
 
     @property
@@ -214,22 +218,29 @@ class Shard:
             return
         count, least = float(self._part.size), self._settings[SHARE] * self._part.whole
         wanted, share = rung_of(totals, self._settings, least), least / count
-        while (found := rung_of(totals, self._settings, share * count)) != wanted:
-            # One unit in the last place off.
+        for _ in range(_UNITS):
+            found = rung_of(totals, self._settings, share * count)
+            if found == wanted:
+                break
+            # A unit in the last place off.
             share = float(np.nextafter(share, math.inf if found < wanted else 0.0))
+        else:
+            raise RuntimeError(f"weights: must have a share for rung {wanted} of {count:g} particles, got none")
         self._upload_settings(self._part, share=share)
 
     def shift_ends(self, offset: float) -> Step:
         """Add the weights of the shards before to the cumulative weights on the device, and wait."""
         cloud, part = self._cloud, self._part
         if part.size and offset:
-            ones = self._backend.upload(np.ones(part.size))
-            factor = np.zeros(SETTINGS)
-            factor[TEMPERATURE + 1] = offset
+            if self._ones is None:
+                self._ones = self._backend.upload(np.ones(cloud.capacity)), self._backend.empty(SETTINGS, _DOUBLE)
+            (ones, factor), settings = self._ones, np.zeros(SETTINGS)
+            settings[TEMPERATURE + 1] = offset
+            self._backend.upload(settings, factor)
             # The kernel adds a multiple of an array to another: these integers are exact.
             self._backend.run((
                 launch("add_scores", flags_if(FLOAT64=True), (cloud.blocks,), log_p=ones,
-                       settings=self._backend.upload(factor), score=cloud.ends, largest=cloud.largest, sensor=1,
+                       settings=factor, score=cloud.ends, largest=cloud.largest, sensor=1,
                        particles=part.size, block=part.block),
             ))  # fmt: skip
         yield

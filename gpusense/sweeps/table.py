@@ -23,7 +23,7 @@ from gpusense.sweeps.worker import Outcome
 Row = dict[str, str]
 # Columns of every table, before those of options, labels and results.
 FIRST = ("key", "status", "task", "map", "log", "model", "seed")
-LAST = ("seconds", "attempts", "worker", "device", "error")
+LAST = ("seconds", "cpu_seconds", "attempts", "worker", "device", "error")
 DONE, FAILED = "done", "failed"
 _INTEGER = re.compile(r"[-+]?\d{1,18}")
 
@@ -136,8 +136,8 @@ def row_of(job: Job, outcome: Outcome, attempts: int) -> Row:
         "model": job.model, "seed": job.seed,
     }  # fmt: skip
     last = dict(
-        seconds=round(outcome.seconds, 6), attempts=attempts, worker=outcome.worker, device=outcome.device,
-        error=outcome.error,
+        seconds=round(outcome.seconds, 6), cpu_seconds=round(outcome.cpu_seconds, 6), attempts=attempts,
+        worker=outcome.worker, device=outcome.device, error=outcome.error,
     )  # fmt: skip
     own = fields | job.by_name
     # A label that is the value itself has no column of its own.

@@ -28,6 +28,7 @@ class Outcome(NamedTuple):
         error: The error in one line; empty after success.
         trace: Where the error was raised, for a log.
         seconds: Time of the job.
+        cpu_seconds: Processor time of the worker's process meanwhile.
         worker: Host and process.
         device: Selection string of the device.
     """
@@ -36,13 +37,15 @@ class Outcome(NamedTuple):
     error: str
     trace: str
     seconds: float
+    cpu_seconds: float
     worker: str
     device: str
 
 
 # A worker runs one job at a time, as its device and its store serve one.
 _LOCK = threading.Lock()
-_STORES: dict[tuple[str, str], Store] = {}
+# Stores by root, device and sweep: files may have changed since another sweep.
+_STORES: dict[tuple[str, str, str], Store] = {}
 _SENT: dict[str, Any] = {}
 
 
@@ -50,8 +53,7 @@ def receive(sent: Mapping[str, Any]) -> None:
     """Keep maps and logs that were sent, for all jobs of this process."""
     with _LOCK:
         _SENT.update(sent)
-        for store in _STORES.values():
-            store.receive(sent)
+        _STORES.clear()
 
 
 def device_of(device: str) -> str:
@@ -59,19 +61,21 @@ def device_of(device: str) -> str:
     return os.environ.get(DEVICE) or device
 
 
-def work(job: Job, root: str, device: str) -> Outcome:
+def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
     """Run a job in this process; errors are part of the result.
 
     Args:
         job: The job.
         root: Folder of its files.
         device: Selection string of the device, where the worker has none of its own.
+        sweep: Name of the sweep: what a worker has read for another one is read again.
     """
     chosen = device_of(device)
     with _LOCK:
-        begin = time.perf_counter()
-        key = (root, chosen)
+        begin, begin_cpu = time.perf_counter(), time.process_time()
+        key = (root, chosen, sweep)
         if key not in _STORES:
+            _STORES.clear()
             _STORES[key] = Store(root, chosen)
             _STORES[key].receive(_SENT)
         values: dict[str, Any] = {}
@@ -81,8 +85,8 @@ def work(job: Job, root: str, device: str) -> Outcome:
         except Exception as problem:
             text = " ".join(f"{type(problem).__name__}: {problem}".split())
             error, trace = text[:_LONGEST], traceback.format_exc()
-        seconds = time.perf_counter() - begin
-    return Outcome(values, error, trace, seconds, f"{platform.node()}:{os.getpid()}", chosen)
+        seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
 
 
 def _plain(value: Any) -> Any:

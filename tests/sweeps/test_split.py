@@ -68,6 +68,14 @@ def test_gpus_have_the_particles_of_one(warp_as_gpu, stages):
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
 
 
+def test_gpus_weigh_by_several_sensors(warp_as_gpu):
+    """Readings that cannot be recorded are scored by calls."""
+    expected = states(gs.ParticleFilter(field_and_compass("warp:cpu"), particles=300, seed=5, stages=2), 2)
+    pf = SplitParticleFilter(field_and_compass, devices=["warp:cpu"] * 2, particles=300, seed=5, stages=2)
+    for one, two in zip(states(pf, 2), expected, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
+
+
 def test_shares_are_whole_blocks():
     for count in (1, 16, 17, 1000, 12345):
         for shards in (1, 2, 3, 8):

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,13 +16,14 @@ from support.room_log import write_room
 from support.split_scene import field, states
 
 import gpusense as gs
+from gpusense.commands import cli
 from gpusense.evaluation.tracking import Track, follow, read_steps, start, summary
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
 from gpusense.sweeps.plan import jobs_of
 from gpusense.sweeps.sending import contents_of
 from gpusense.sweeps.tasks import is_timing
-from gpusense.sweeps.worker import _STORES, work
+from gpusense.sweeps.worker import work
 
 SMALL = {"limit": 4, "particles": 100, "beams": 20, "range_max": 20}
 PLAN = {
@@ -126,12 +128,12 @@ def test_failures_are_rows_and_resuming_repeats_none_of_the_finished(tmp_path):
 
 
 def test_what_a_worker_keeps_is_made_once(tmp_path):
-    _STORES.clear()
     jobs = [Job(task="support.sweep_tasks:plain", map=name, seed=seed) for name in "ab" for seed in range(3)]
     assert swept(jobs, tmp_path / "t.csv")[1]["made"] == [True, False, False] * 2
-    # The least recently used one is evicted.
-    more = [Job(task="support.sweep_tasks:plain", map=name, seed=9) for name in "cdeab"]
-    assert swept(more, tmp_path / "more.csv")[1]["made"] == [True, True, True, True, True]
+    # The least recently used one is evicted, and nothing is kept for another sweep, whose files may have changed.
+    more = [Job(task="support.sweep_tasks:plain", map=name, seed=9) for name in "bcdea"]
+    more += [Job(task="support.sweep_tasks:plain", map=name, seed=8) for name in "eb"]
+    assert swept(more, tmp_path / "more.csv")[1]["made"] == [True] * 5 + [False, True]
 
 
 @pytest.mark.parametrize("name", ["processes", pytest.param("cluster", marks=dask)])
@@ -148,6 +150,36 @@ def test_a_job_that_kills_its_workers_fails_alone(tmp_path, processes):
     ended, table = swept(jobs, tmp_path / "t.csv", processes, attempts=2)
     assert (ended.done, ended.failed, ended.repeated) == (5, 1, 2)
     assert table["error"][4] == "WorkerDied: the worker ended, 2 times" and table["attempts"] == [1, 1, 1, 2, 2, 1]
+
+
+def alive(process):
+    """Tell whether a process runs: one that nothing has waited for is none."""
+    try:
+        os.kill(process, 0)
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except ProcessLookupError:
+        return False
+    except FileNotFoundError:
+        return Path("/proc/self").exists() is False
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    code = "\n".join([
+        "import gpusense as gs, os, sys, time", "if __name__ == '__main__':",
+        "    ex = gs.sweep.ProcessExecutor(1)", "    print(ex.submit(os.getpid).result(), flush=True)",
+        "    time.sleep(60)",
+    ])  # fmt: skip
+    (tmp_path / "main.py").write_text(code)
+    path = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, str(tmp_path / "main.py")], stdout=subprocess.PIPE, env=path) as parent:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    end = time.monotonic() + 20
+    while alive(worker):
+        if time.monotonic() > end:
+            os.kill(worker, 9)
+            pytest.fail("the worker outlived its parent")
+        time.sleep(0.05)
 
 
 @dask
@@ -167,7 +199,7 @@ def test_a_killed_scheduler_leaves_finished_jobs(tmp_path):
             time.sleep(0.05)
         address = json.loads(file.read_text())["address"]
         program = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
-        worker = subprocess.Popen([*program, "--resources", "gpusense=1", "--death-timeout", "2"], **quiet)
+        worker = subprocess.Popen([*program, "--resources", "gpusense=1", "--no-nanny"], **quiet)
         jobs = made("slow", 8, folder=str(tmp_path), seconds=0.02)
 
         def kill(row):
@@ -218,6 +250,17 @@ def test_maps_and_logs_are_sent_to_workers_once(folder, cluster, tmp_path):
     # There is nothing at the root.
     ended, table = swept(jobs, tmp_path / "t.csv", cluster, root=tmp_path / "elsewhere")
     assert ended.done == 2, table["error"]
+
+
+@dask
+def test_the_command_sends_maps_and_logs_to_a_cluster(folder, cluster, tmp_path, capsys):
+    plan = {"options": {**SMALL, "map": "map.yaml", "log": "run.log"}, "axes": {"seed": [7, 8]}}
+    (folder / "plan.yaml").write_text(json.dumps(plan))
+    table = tmp_path / "t.csv"
+    assert cli.main(["sweep", str(folder / "plan.yaml"), "--table", str(table), "--dask", cluster.address]) == 0
+    out, err = capsys.readouterr()
+    assert "2 jobs: 2 done" in out and f"Dask at {cluster.address}, 2 slots" in err
+    assert set(gs.sweep.read_table(table)["device"]) == {"numpy"}
 
 
 def test_an_executor_that_is_shut_down_is_lost(tmp_path):

@@ -27,6 +27,6 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 def widened(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
     """Return the flags of a launch, with WIDE where the device asks for lanes and the kernel has a body in vectors."""
     never = (_NEVER | _NEVER_OF.get(kernel, set())) - ({"FLOAT64"} if kernel in _FLOAT64 else set())
-    if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED[kernel]):
+    if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
         return frozenset(flags)
     return frozenset(flags) | {"WIDE"}

@@ -46,13 +46,20 @@ def sum_poses(
         row[11], row[12] = w[best], best
 
 
+def join_poses(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, fan: int) -> None:
+    """Add up each ``fan`` rows of sums, one after the other, and find the heaviest particle."""
+    table = sums[: rows * ESTIMATE_SUMS].reshape(rows, ESTIMATE_SUMS)
+    for group, begin in enumerate(range(0, rows, fan)):
+        part, row = table[begin : begin + fan], joined[group * ESTIMATE_SUMS : (group + 1) * ESTIMATE_SUMS]
+        row[:11] = np.cumsum(part[:, :11], axis=0)[-1]
+        row[11:] = part[int(np.argmax(part[:, 11])), 11:]
+
+
 def finish_estimate(
-    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, blocks: int, again: int
+    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, again: int
 ) -> None:
-    """Add up the blocks; write the mean pose, or the covariance about it."""
-    table = sums[: blocks * ESTIMATE_SUMS].reshape(blocks, ESTIMATE_SUMS)
-    total = np.cumsum(table[:, :11], axis=0)[-1]
-    best = int(table[int(np.argmax(table[:, 11])), 12])
+    """Write the mean pose, or the covariance about it, from the sums of all particles."""
+    total, best = sums[:11], int(sums[12])
     weight = total[0] if total[0] > 0.0 else 1.0
     x, y = total[1] / weight, total[2] / weight
     if not again:

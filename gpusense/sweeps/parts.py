@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Generator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from gpusense.localization.sums import block_of
 
 # A method of a shard, which yields once; poses with cumulative weights; the index of a sensor with its readings; the
 # lowest and the highest mark that each shard draws at.
@@ -35,7 +36,7 @@ class Part(NamedTuple):
 
 def parts_of(count: int, shards: int) -> list[Part]:
     """Split particles into parts of whole blocks, so that sums over blocks are those of one device."""
-    block = max(math.ceil(math.sqrt(count)), 16)
+    block = block_of(count)
     blocks = -(-count // block)
     ends = [min(blocks * shard // shards * block, count) for shard in range(shards + 1)]
     return [Part(one, two - one, count, block) for one, two in itertools.pairwise(ends)]

@@ -30,10 +30,9 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.sensors import Sensor
-from gpusense.reference.weighing import rung_of
+from gpusense.reference.rungs import rung_of
 from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
 
-_PLAIN = frozenset[str]()
 # Units in the last place within which the product of two numbers reaches a neighbour of another product.
 _UNITS = 16
 _DOUBLE = np.dtype(np.float64)
@@ -122,9 +121,9 @@ class Shard:
                     self._sensors[index].log_likelihood(poses, reading, self._lent_scores(place))
                 else:
                     self._backend.upload(self._sensors[index].log_likelihood(poses, reading), cloud.log_p[place])
-            self._backend.run(self._sums_of_scores(len(given)))
+            self._backend.run(cloud.scoring(len(given)))
         yield
-        return float(self._read(cloud.largest, cloud.blocks).max())
+        return float(self._read(cloud.sums.largest, cloud.blocks).max())
 
     def _recorded(self, source: int, given: Sequence[Given]) -> Recording:
         """Return the recorded program that scores a buffer; its start does not wait, so that devices work together."""
@@ -140,7 +139,7 @@ class Shard:
                 launches, owner = self._sensors[index].program(poses, out)
                 program += launches
                 owners.append((out, owner))
-            program += self._sums_of_scores(len(given))
+            program += self._cloud.scoring(len(given))
             self._recordings[key] = self._backend.record(program), (poses, owners)
         return self._recordings[key][0]
 
@@ -152,29 +151,16 @@ class Shard:
         part = self._backend.part(cloud.log_p[place], 0, self._part.size, cloud.precision)
         return self._backend.lend(part, shape, cloud.precision)
 
-    def _sums_of_scores(self, sensors: int) -> Program:
-        cloud, flags = self._cloud, flags_if(FLOAT64=self._cloud.precision == np.float64)
-        return tuple(
-            launch("add_scores", flags, (cloud.blocks,), log_p=log_p, settings=cloud.settings, score=cloud.score,
-                   largest=cloud.largest, sensor=sensor, particles=self._part.size, block=self._part.block)
-            for sensor, log_p in enumerate(cloud.log_p[:sensors])
-        )  # fmt: skip
-
     def weigh(self, high: float, stage: int) -> Step:
         """Return the sums of integer weights, given the largest score of the whole filter."""
         cloud, part = self._cloud, self._part
         if not part.size:
             yield
             return np.zeros(WEIGHT_SUMS)
-        self._backend.upload(np.full(cloud.blocks, high), cloud.largest)
-        self._backend.run((
-            launch("weigh_particles", _PLAIN, (cloud.blocks,), score=cloud.score, before=cloud.before,
-                   largest=cloud.largest, settings=cloud.settings, state=cloud.state, sums=cloud.sums,
-                   particles=part.size, block=part.block, blocks=cloud.blocks, stage=stage),
-        ))  # fmt: skip
+        self._backend.upload(np.array([high]), cloud.sums.largest)
+        self._backend.run(cloud.sums.weigh(cloud.numbers(), (cloud.sums.largest, 1), stage))
         yield
-        # Integers below 2^53: exact in any order.
-        return self._read(cloud.sums, cloud.blocks * WEIGHT_SUMS).reshape(-1, WEIGHT_SUMS).sum(axis=0)
+        return self._read(cloud.sums.totals, WEIGHT_SUMS)
 
     def set_weights(
         self, source: int, totals: np.ndarray, state: np.ndarray, place: tuple[int, int], offset: float, marks: Marks
@@ -196,13 +182,9 @@ class Shard:
         cloud.shown, cloud.next = source, 1 - source
         if part.size:
             self._choose_rung(totals, float(state[(stage - 1) * STAGE + LEFT]) if stage else 1.0)
-            self._backend.upload(totals, cloud.totals)
-            self._backend.run((
-                launch("set_weights", _PLAIN, (cloud.blocks,), score=cloud.score, before=cloud.before,
-                       largest=cloud.largest, sums=cloud.sums, totals=cloud.totals, settings=cloud.settings,
-                       state=cloud.state, weight=cloud.weight, ends=cloud.ends, particles=part.size,
-                       block=part.block, blocks=cloud.blocks, stage=stage, stages=place[1]),
-            ))  # fmt: skip
+            self._backend.upload(totals, cloud.sums.totals)
+            out = cloud.weight, cloud.ends
+            self._backend.run(cloud.sums.set_weights(cloud.numbers(), (cloud.sums.largest, 1), place, out))
         yield
         # The kernel knows the number of particles of the shard only: the state is that of the filter.
         self._backend.upload(state, cloud.state)
@@ -240,7 +222,7 @@ class Shard:
             # The kernel adds a multiple of an array to another: these integers are exact.
             self._backend.run((
                 launch("add_scores", flags_if(FLOAT64=True), (cloud.blocks,), log_p=ones,
-                       settings=factor, score=cloud.ends, largest=cloud.largest, sensor=1,
+                       settings=factor, score=cloud.ends, largest=cloud.sums.largest, sensor=1,
                        particles=part.size, block=part.block),
             ))  # fmt: skip
         yield
@@ -278,11 +260,7 @@ class Shard:
             poses, ends, count = self._gather(gathered, sums)
         if drawn.size:
             self._upload_settings(drawn)
-            self._backend.run((
-                launch("draw_particles", _PLAIN, (drawn.size,), source=poses, weight=cloud.weight, ends=ends,
-                       settings=cloud.settings, state=cloud.state, pool=cloud.pool, target=cloud.poses[1 - source],
-                       after=cloud.before, particles=count, drawn=drawn.size, stage=stage),
-            ))  # fmt: skip
+            self._backend.run(cloud.drawing((poses, ends, count), cloud.poses[1 - source], drawn.size, stage))
         self._part, cloud.count, cloud.block = drawn, drawn.size, drawn.block
         yield
 
@@ -323,12 +301,12 @@ class Shard:
         estimate = np.zeros(ESTIMATE)
         estimate[:3] = reference
         self._backend.upload(estimate, cloud.estimated)
-        self._backend.run((
-            launch("sum_poses", _PLAIN, (blocks,), poses=cloud.poses[index], weight=cloud.weight,
-                   estimate=cloud.estimated, sums=cloud.sums, particles=count, block=block, again=1),
-        ))  # fmt: skip
+        self._backend.run(
+            cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[index], weight=cloud.weight,
+                              estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block, again=1),
+        )  # fmt: skip
         yield
-        return self._read(cloud.sums, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)
+        return self._read(cloud.sums.rows, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)
 
     def _read(self, buffer: Any, count: int) -> np.ndarray:
         return self._backend.download(buffer, np.empty(count))

@@ -12,6 +12,7 @@ import numpy as np
 from gpusense.backends.base import Backend
 from gpusense.interface.constants import (
     ESTIMATE,
+    ESTIMATE_SUMS,
     LEFT,
     RESAMPLED,
     SETTINGS,
@@ -22,9 +23,11 @@ from gpusense.interface.constants import (
     WEIGHT_SUMS,
 )
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.sums import fans_of
 from gpusense.reference.drawing import mark_of
-from gpusense.reference.estimate import finish_estimate
-from gpusense.reference.weighing import rung_of, set_weights, sum_weights
+from gpusense.reference.estimate import finish_estimate, join_poses
+from gpusense.reference.rungs import rung_of
+from gpusense.reference.weighing import join_weights, set_weights
 from gpusense.sweeps import held
 from gpusense.sweeps.parts import Part, finished, parts_of
 from gpusense.sweeps.shard import Shard
@@ -211,11 +214,27 @@ class SplitCloud(Cloud):
         high = max(self._all("score", source, given))
         each = self._all("weigh", high, stage)
         totals, largest = np.zeros(WEIGHT_SUMS), np.array([high])
-        sum_weights(_PLAIN, np.concatenate(each), largest, self._settings, state, totals, self._size, stage)
+        join_weights(_PLAIN, np.concatenate(each), totals, self._size, self._size)
         left = state[(stage - 1) * STAGE + LEFT] if stage else 1.0
         rung = rung_of(totals, self._settings, self._settings[SHARE] * self.count) if left > 0.0 else 0
         set_weights(
-            _PLAIN, _NONE, _NONE, largest, _NONE, totals, self._settings, state, _NONE, _NONE, self.count, 1, 1, *place
+            _PLAIN,
+            _NONE,
+            _NONE,
+            largest,
+            _NONE,
+            _NONE,
+            totals,
+            self._settings,
+            state,
+            _NONE,
+            _NONE,
+            self.count,
+            1,
+            1,
+            1,
+            1,
+            *place,
         )
         marks = self._marks(stage, drawn)
         offsets = np.cumsum([0.0, *(one[rung] for one in each[:-1])])
@@ -274,7 +293,10 @@ class SplitCloud(Cloud):
             for part, sums in zip(parts, rows, strict=True):
                 sums[:, 12] += part.first
             table = np.concatenate(rows)
-            finish_estimate(_PLAIN, first, table.reshape(-1), result, len(table), again)
+            for fan in fans_of(len(table)):
+                sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
+                join_poses(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, fan)
+            finish_estimate(_PLAIN, first, table.reshape(-1), result, again)
             reference = result[:3].copy()
         return result
 

@@ -1,5 +1,6 @@
 // The ladder of temperatures of a correction, and the state of its stages: b_k = b / 2^k, where b is what earlier stages
 // have left. See weighing.cl.
+// Recovery: augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
 // requires: elementary
 
 #define SHARE 19
@@ -25,10 +26,10 @@
 #define FAST 50
 #define INJECTED 51
 
-// Return the largest score of all blocks.
-double largest_of(global const double *largest, const int blocks) {
+// Return the largest score of all groups.
+double largest_of(global const double *largest, const int groups) {
     double high = -INFINITY;
-    for (int b = 0; b < blocks; b++) high = largest[b] > high ? largest[b] : high;
+    for (int g = 0; g < groups; g++) high = largest[g] > high ? largest[g] : high;
     return high;
 }
 
@@ -49,9 +50,26 @@ int rung_of(global const double *totals, global const double *settings, const do
     return rung;
 }
 
-// Write the state of a stage that uses a rung.
+// Update the averages of the likelihood per beam, and the share of particles to inject.
+void follow_evidence(const double total, const double before, const double largest, global const double *settings,
+                     global double *state) {
+    if (largest == -INFINITY || !(total > 0.0) || !(before > 0.0)) return;
+    const double evidence = largest + log_of(total / before);
+    const double scaled = settings[PER_BEAM_SCALE] * evidence;
+    const double mean = exp_of(scaled < 700.0 ? scaled : 700.0);
+    const int first = state[SLOW] == 0.0;
+    const double slow = first ? mean : state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW]);
+    const double fast = first ? mean : state[FAST] + settings[FAST_RATE] * (mean - state[FAST]);
+    const double share = slow > 0.0 ? 1.0 - fast / slow : 0.0;
+    const double least = share > 0.0 ? share : 0.0;
+    state[EVIDENCE] = evidence, state[SLOW] = slow, state[FAST] = fast;
+    state[INJECTED] = least < settings[MOST_INJECTED] ? least : settings[MOST_INJECTED];
+}
+
+// Write the state of a stage that uses a rung; at stage 0, follow the evidence.
 void set_stage(global const double *totals, global const double *settings, global double *state, const double high,
                const double left, const int rung, const int particles, const int stage, const int stages) {
+    if (stage == 0) follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state);
     const double size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung]);
     double part = left;
     for (int k = 0; k < rung; k++) part *= 0.5;

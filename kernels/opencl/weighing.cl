@@ -3,7 +3,6 @@
 // = b / 2^k a ladder. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of that before
 // is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, "Annealed importance
 // sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
-// Recovery: augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
 // requires: rungs
 
 // Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the largest: one
@@ -24,13 +23,21 @@ kernel void add_scores(global const real *log_p, global const double *settings, 
     largest[b] = high;
 }
 
+// Find the largest score of each fan blocks: one work-item takes a group of blocks.
+kernel void join_scores(global const double *scores, global double *largest, const int blocks, const int fan) {
+    const int g = get_global_id(0), begin = g * fan;
+    if (begin >= blocks) return;
+    largest[g] = largest_of(scores + begin, min(fan, blocks - begin));
+}
+
 // Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a block.
 kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
                             global const double *settings, global const double *state, global double *sums,
-                            const int particles, const int block, const int blocks, const int stage) {
+                            const int particles, const int block, const int blocks, const int groups,
+                            const int stage) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double high = largest_of(largest, blocks), left = left_of(state, stage), scale = settings[SCALE];
+    const double high = largest_of(largest, groups), left = left_of(state, stage), scale = settings[SCALE];
     const int end = min(begin + block, particles);
     // A vector of RUNGS numbers: processors compute four or eight of them at once.
     double8 weights = 0.0, squares = 0.0;
@@ -56,49 +63,30 @@ kernel void weigh_particles(global const double *score, global const double *bef
     row[2 * RUNGS] = old;
 }
 
-// Update the averages of the likelihood per beam, and the share of particles to inject.
-void follow_evidence(const double total, const double before, const double largest, global const double *settings,
-                     global double *state) {
-    if (largest == -INFINITY || !(total > 0.0) || !(before > 0.0)) return;
-    const double evidence = largest + log_of(total / before);
-    const double scaled = settings[PER_BEAM_SCALE] * evidence;
-    const double mean = exp_of(scaled < 700.0 ? scaled : 700.0);
-    const int first = state[SLOW] == 0.0;
-    const double slow = first ? mean : state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW]);
-    const double fast = first ? mean : state[FAST] + settings[FAST_RATE] * (mean - state[FAST]);
-    const double share = slow > 0.0 ? 1.0 - fast / slow : 0.0;
-    const double least = share > 0.0 ? share : 0.0;
-    state[EVIDENCE] = evidence, state[SLOW] = slow, state[FAST] = fast;
-    state[INJECTED] = least < settings[MOST_INJECTED] ? least : settings[MOST_INJECTED];
+// Add up each fan rows of sums: one work-item takes a column of a group of rows.
+kernel void join_weights(global const double *sums, global double *joined, const int rows, const int fan) {
+    const int i = get_global_id(0), g = i / WEIGHT_SUMS, begin = g * fan, end = min(begin + fan, rows);
+    if (begin >= rows) return;
+    double total = 0.0;
+    for (int row = begin; row < end; row++) total += sums[(long)row * WEIGHT_SUMS + i % WEIGHT_SUMS];
+    joined[i] = total;
 }
 
-// Add up the sums of all blocks: one work-item takes a column. At stage 0 the first follows the evidence.
-kernel void sum_weights(global const double *sums, global const double *largest, global const double *settings,
-                        global double *state, global double *totals, const int blocks, const int stage) {
-    const int column = get_global_id(0);
-    if (column >= WEIGHT_SUMS) return;
-    double total = 0.0, before = 0.0;
-    for (int b = 0; b < blocks; b++) {
-        total += sums[(long)b * WEIGHT_SUMS + column];
-        before += sums[(long)b * WEIGHT_SUMS + 2 * RUNGS];
-    }
-    totals[column] = total;
-    if (stage == 0 && column == 0) follow_evidence(total, before, largest_of(largest, blocks), settings, state);
-}
-
-// Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first writes the
-// stage's state.
+// Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
+// writes the stage's state.
 kernel void set_weights(global const double *score, global const double *before, global const double *largest,
-                        global const double *sums, global const double *totals, global const double *settings,
-                        global double *state, global double *weight, global double *ends, const int particles,
-                        const int block, const int blocks, const int stage, const int stages) {
+                        global const double *sums, global const double *joined, global const double *totals,
+                        global const double *settings, global double *state, global double *weight,
+                        global double *ends, const int particles, const int block, const int blocks, const int fan,
+                        const int groups, const int stage, const int stages) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double scale = settings[SCALE], left = left_of(state, stage), high = largest_of(largest, blocks);
+    const double scale = settings[SCALE], left = left_of(state, stage), high = largest_of(largest, groups);
     const int rung = left > 0.0 ? rung_of(totals, settings, settings[SHARE] * (double)particles) : 0;
     const int end = min(begin + block, particles);
     double sum = 0.0;
-    for (int i = 0; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
+    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + rung];
+    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
     for (int n = begin; n < end; n++) {
         double likelihood = tempered(score[n], high, left);
         for (int k = 0; k < rung; k++) likelihood = sqrt(likelihood);

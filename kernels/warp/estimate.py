@@ -79,43 +79,61 @@ def make(name, flags):
         sums[b * ESTIMATE_SUMS + 11] = largest
         sums[b * ESTIMATE_SUMS + 12] = wp.float64(best)
 
-    # Add up the blocks; write the mean pose, or the covariance about it: one work-item takes all.
+    # Add up each fan rows of sums, one after the other, and find the heaviest particle: one work-item takes a column of
+    # a group of rows, and the last but one the last two.
+    @kernel
+    def join_poses(
+        sums: wp.array(dtype=wp.float64),
+        joined: wp.array(dtype=wp.float64),
+        rows: wp.int32,
+        fan: wp.int32,
+    ):
+        i = wp.tid()
+        begin = i / ESTIMATE_SUMS * fan
+        column = i % ESTIMATE_SUMS
+        if begin >= rows or column == 12:
+            return
+        total = ZERO + ZERO
+        largest = wp.float64(0.0) - ONE
+        best = ZERO + ZERO
+        for b in range(begin, wp.min(begin + fan, rows)):
+            value = sums[b * ESTIMATE_SUMS + column]
+            total += value
+            if value > largest:
+                best = sums[b * ESTIMATE_SUMS + 12]
+                largest = value
+        if column == 11:
+            joined[i] = largest
+            joined[i + 1] = best
+        else:
+            joined[i] = total
+
+    # Write the mean pose, or the covariance about it, from the sums of all particles: one work-item takes all.
     @kernel
     def finish_estimate(
         poses: wp.array(dtype=wp.float64),
         sums: wp.array(dtype=wp.float64),
         estimate: wp.array(dtype=wp.float64),
-        blocks: wp.int32,
         again: wp.int32,
     ):
         i = wp.tid()
         if i > 0:
             return
-        total = totals()
-        largest = wp.float64(0.0) - ONE
-        best = wp.float64(0.0)
-        for b in range(blocks):
-            row = b * ESTIMATE_SUMS
-            for k in range(11):
-                total[k] += sums[row + k]
-            if sums[row + 11] > largest:
-                best = sums[row + 12]
-                largest = sums[row + 11]
-        weight = wp.where(total[0] > ZERO, total[0], ONE)
-        x = total[1] / weight
-        y = total[2] / weight
+        weight = wp.where(sums[0] > ZERO, sums[0], ONE)
+        x = sums[1] / weight
+        y = sums[2] / weight
         if again == 0:
             estimate[0] = poses[0] + x
             estimate[1] = poses[1] + y
-            estimate[2] = wrap_once(poses[2] + angle_of(total[3], total[4]))
+            estimate[2] = wrap_once(poses[2] + angle_of(sums[3], sums[4]))
             estimate[9] = weight
-            estimate[10] = best
+            estimate[10] = sums[12]
             return
-        estimate[3] = total[5] / weight - x * x
-        estimate[4] = total[6] / weight - x * y
-        estimate[5] = total[7] / weight
-        estimate[6] = total[8] / weight - y * y
-        estimate[7] = total[9] / weight
-        estimate[8] = total[10] / weight
+        estimate[3] = sums[5] / weight - x * x
+        estimate[4] = sums[6] / weight - x * y
+        estimate[5] = sums[7] / weight
+        estimate[6] = sums[8] / weight - y * y
+        estimate[7] = sums[9] / weight
+        estimate[8] = sums[10] / weight
 
-    return {"sum_poses": sum_poses, "finish_estimate": finish_estimate}[name]
+    return {"sum_poses": sum_poses, "join_poses": join_poses, "finish_estimate": finish_estimate}[name]

@@ -1,26 +1,31 @@
 """The ladder of temperatures of a correction, and the state of its stages: b_k = b / 2^k, where b is what is left.
 
 See weighing.py.
+
+Recovery: augmented MCL, *Probabilistic Robotics* table 8.3, with the mean likelihood per beam.
 """
 
 import warp as wp
 
-from .elementary import exp_of
+from .elementary import exp_of, log_of
 
 SHARE, THRESHOLD, SCALE = (wp.constant(place) for place in (19, 20, 21))
+PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED = (wp.constant(place) for place in (22, 23, 24, 25))
 RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
 # Places in the state: of a stage, and of what lasts.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
-STAGE, INJECTED = wp.constant(8), wp.constant(51)
+STAGE = wp.constant(8)
+EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 51))
+LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
 ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
 
 
-# Return the largest score of all blocks.
+# Return the largest score of all groups.
 @wp.func
-def largest_of(largest: wp.array(dtype=wp.float64), blocks: wp.int32):
+def largest_of(largest: wp.array(dtype=wp.float64), groups: wp.int32):
     high = largest[0]
-    for b in range(1, blocks):
-        high = wp.max(high, largest[b])
+    for g in range(1, groups):
+        high = wp.max(high, largest[g])
     return high
 
 
@@ -51,7 +56,33 @@ def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.floa
     return rung
 
 
-# Write the state of a stage that uses a rung.
+# Update the averages of the likelihood per beam, and the share of particles to inject.
+@wp.func
+def follow_evidence(
+    total: wp.float64,
+    before: wp.float64,
+    largest: wp.float64,
+    settings: wp.array(dtype=wp.float64),
+    state: wp.array(dtype=wp.float64),
+):
+    if not wp.isinf(largest) and total > ZERO and before > ZERO:
+        evidence = largest + log_of(total / before)
+        mean = exp_of(wp.min(settings[PER_BEAM_SCALE] * evidence, LARGEST_EXPONENT))
+        slow = mean
+        fast = mean
+        if state[SLOW] != ZERO:
+            slow = state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW])
+            fast = state[FAST] + settings[FAST_RATE] * (mean - state[FAST])
+        share = ZERO
+        if slow > ZERO:
+            share = ONE - fast / slow
+        state[EVIDENCE] = evidence
+        state[SLOW] = slow
+        state[FAST] = fast
+        state[INJECTED] = wp.min(wp.max(share, ZERO), settings[MOST_INJECTED])
+
+
+# Write the state of a stage that uses a rung; at stage 0, follow the evidence.
 @wp.func
 def set_stage(
     totals: wp.array(dtype=wp.float64),
@@ -64,6 +95,8 @@ def set_stage(
     stage: wp.int32,
     stages: wp.int32,
 ):
+    if stage == 0:
+        follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
     size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
     part = left * ONE
     for _k in range(rung):

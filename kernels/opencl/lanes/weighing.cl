@@ -9,10 +9,11 @@ doubles tempered_lanes(const doubles score, const double largest, const double l
 // A work-item takes a block.
 kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
                             global const double *settings, global const double *state, global double *sums,
-                            const int particles, const int block, const int blocks, const int stage) {
+                            const int particles, const int block, const int blocks, const int groups,
+                            const int stage) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double high = largest_of(largest, blocks), left = left_of(state, stage), scale = settings[SCALE];
+    const double high = largest_of(largest, groups), left = left_of(state, stage), scale = settings[SCALE];
     const int end = min(begin + block, particles);
     doubles weights[RUNGS], squares[RUNGS], old = 0.0;
     for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
@@ -37,16 +38,18 @@ kernel void weigh_particles(global const double *score, global const double *bef
 
 // A work-item takes a block, and adds up its weights in the order of the particles.
 kernel void set_weights(global const double *score, global const double *before, global const double *largest,
-                        global const double *sums, global const double *totals, global const double *settings,
-                        global double *state, global double *weight, global double *ends, const int particles,
-                        const int block, const int blocks, const int stage, const int stages) {
+                        global const double *sums, global const double *joined, global const double *totals,
+                        global const double *settings, global double *state, global double *weight,
+                        global double *ends, const int particles, const int block, const int blocks, const int fan,
+                        const int groups, const int stage, const int stages) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double scale = settings[SCALE], left = left_of(state, stage), high = largest_of(largest, blocks);
+    const double scale = settings[SCALE], left = left_of(state, stage), high = largest_of(largest, groups);
     const int rung = left > 0.0 ? rung_of(totals, settings, settings[SHARE] * (double)particles) : 0;
     const int end = min(begin + block, particles);
     double sum = 0.0;
-    for (int i = 0; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
+    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + rung];
+    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
         doubles likelihood = tempered_lanes(load_doubles(score, n, 1, count), high, left);

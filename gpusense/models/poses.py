@@ -19,6 +19,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
@@ -145,6 +146,7 @@ class PlacedPoses(NamedTuple):
         flags: Flags of the kernels that place them.
         source: The poses of the request; None where the host has placed them.
         status: The non-finite flag.
+        lanes: Particles that the device computes at once.
     """
 
     count: int  # type: ignore[assignment]  # hides tuple.count
@@ -156,6 +158,7 @@ class PlacedPoses(NamedTuple):
     flags: frozenset[str] = _PLAIN
     source: Buffer = None
     status: Buffer = None
+    lanes: int = 1
 
     @property
     def headings(self) -> frozenset[str]:
@@ -178,7 +181,9 @@ class PlacedPoses(NamedTuple):
         """Return the launch that places them; none where the host has placed them."""
         if self.source is None:
             return ()
-        return (launch("place_poses", self.flags, (self.count,), **self.arguments()),)
+        return (
+            launch("place_poses", widened(self.lanes, "place_poses", self.flags), (self.count,), **self.arguments()),
+        )
 
 
 def place(
@@ -202,7 +207,7 @@ def place(
         count, corners, frame, space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real),
         space.empty("pose_low", 4 * count if careful else 4, real),
         poses.flags | _precision_flags(real == _DOUBLE, careful),
-        source, pose_status(space),
+        source, pose_status(space), backend.info.lanes,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from gpusense.interface.constants import (
 )
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.sums import fans_of
-from gpusense.reference.drawing import mark_of
+from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate, join_poses
 from gpusense.reference.rungs import rung_of
 from gpusense.reference.weighing import join_weights, set_weights

@@ -35,7 +35,7 @@ KERNELS: dict[str, Kernel] = {
     "draw_particles": kernel(
         "drawing", "pose", "double source [3 * particles]", "double weight [particles]", "double ends [particles]",
         _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]", "out double after [drawn]",
-        "int particles", "int drawn", "int stage",
+        "int particles", "int drawn", "int stage", wide=True,
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [12]",

@@ -410,6 +410,15 @@ def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
 
 
+def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
+    small = ["--particles", "60", "--beams", "11", "--repeats", "1", "--backend", needs("opencl")]
+    report = run_script("speed/field_gradient.py", *small, output=tmp_path / "small")
+    assert [(row["poses"], row["scans"]) for row in report["rows"]] == [
+        ("all over", 1), ("all over", 20), ("around", 1), ("around", 20),
+    ]  # fmt: skip
+    assert all(row["lookups"] > 0 and row["call_ms"] > 0 and row["kernels_ms"] > 0 for row in report["rows"])
+
+
 def test_split_filters_are_measured(tmp_path: Path) -> None:
     small = ["--device", "numpy", "--device", "numpy", "--size", "200", "15", "--steps", "2", "--stages", "2"]
     (row,) = run_script("speed/split_filter.py", *small, output=tmp_path / "split")["rows"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import weakref
+from dataclasses import replace
 from typing import Literal, cast
 
 import numpy as np
@@ -14,6 +15,7 @@ from gpusense._util import checks
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
 from gpusense.interface.terms import log_weight
+from gpusense.matching.climb import climb
 from gpusense.matching.location import Location, PoseMode, Status
 from gpusense.matching.score_tables import TOP, ScoreTables, quantized
 from gpusense.matching.search import Found, PoseGrid, Search
@@ -49,12 +51,14 @@ def locate_scan(
     positions: Literal["free", "all"] = "free",
     modes: int = 10,
     min_agreement: float = 0.7,
+    refine: bool = True,
 ) -> Location:
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
 
     Positions are centres of map cells. Branch and bound (Hess et al., 2016) over integer scores finds every pose whose
     score can belong to the largest log-likelihood; the model evaluates these. So the pose is that of brute force with
-    ``model.log_likelihood``, ties by the lowest row, then column, then heading.
+    ``model.log_likelihood``, ties by the lowest row, then column, then heading. Damped Gauss-Newton on the model's
+    interpolated field then refines it.
 
     A pose is only reported as ``"found"`` if no distinct pose is as good, and the expected ranges there agree with at
     least 85 % of the hits, or with ``min_agreement`` of them where the score is at least 0.99.
@@ -68,6 +72,7 @@ def locate_scan(
         positions: ``"free"``: the robot's position must lie in a free cell; ``"all"``: anywhere on the map.
         modes: Largest number of modes.
         min_agreement: Least share of hits that must agree with expected ranges, from 0 to 1.
+        refine: Whether ``pose`` may lie between the poses of the grid, up to two steps from the likeliest of them.
 
     Raises:
         TypeError: the model is not a LikelihoodFieldModel, or an argument is of the wrong kind.
@@ -110,8 +115,12 @@ def locate_scan(
     best = _likeliest(model, ranges, grid, searched, found, stride, len(points))
     chosen = _modes(model, ranges, hits, place, grid, searched, found, stride, best, modes)
     top = chosen[0]
+    pose = top.pose
+    if refine:
+        near = _refined(place.smooth, np.asarray(ranges, np.float64), pose, 2 * stride * cell, 4 * math.pi / turns)
+        pose = near if positions == "all" or _is_free(grid, near) else pose
     return Location(
-        top.pose, top.score, top.log_likelihood, top.agreement, chosen, _status(chosen, min_agreement),
+        pose, top.score, top.log_likelihood, top.agreement, chosen, _status(chosen, min_agreement),
         evaluated=found.evaluated, **options,  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -140,6 +149,10 @@ class _Place:
             )
         )
         self.caster = RayCaster(model.grid, model.scanner.range_max, backend=backend, unknown=unknown, outside=outside)
+        self.smooth = LikelihoodFieldModel(
+            model.grid, model.scanner, replace(p, interpolation="bilinear"), backend=backend,
+            precision=model.precision, unknown=unknown, outside=outside, beams=model.beams,
+        )  # fmt: skip
 
 
 _PLACES: weakref.WeakKeyDictionary[LikelihoodFieldModel, _Place] = weakref.WeakKeyDictionary()
@@ -238,6 +251,23 @@ def _modes(
         PoseMode(poses[i], float(found.score[i]) / scale, float(log_p[n]), float(agreement[n]))
         for n, i in enumerate(chosen)
     )
+
+
+def _refined(
+    smooth: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray, farthest: float, most: float
+) -> np.ndarray:
+    """Return the pose of maximal likelihood near a pose, or that pose itself if the other is too far away [m, rad]."""
+    near: np.ndarray = climb(smooth, ranges[None], pose[None])[0][0]
+    near[2] = math.remainder(near[2], 2 * math.pi)
+    turn = abs(math.remainder(near[2] - pose[2], 2 * math.pi))
+    return near if math.hypot(*(near - pose)[:2]) <= farthest and turn <= most else pose
+
+
+def _is_free(grid: OccupancyGrid, pose: np.ndarray) -> bool:
+    """Return whether a pose lies in a free cell."""
+    col, row = np.floor(grid.world_to_cells(pose[None, :2])[0]).astype(int)
+    inside = 0 <= row < grid.shape[0] and 0 <= col < grid.shape[1]
+    return inside and bool(grid.free[row, col])
 
 
 def _agreement(

@@ -39,11 +39,13 @@ class Location:
     """The result of :func:`locate_scan`.
 
     Attributes:
-        pose: (3,) the likeliest pose on the grid of poses: x, y and theta in the world [m, m, rad].
-        score: Mean score of the end points there, from 0 to 1.
-        log_likelihood: log p(z | pose, m) by the model.
-        agreement: Share of the hits that agree with the expected ranges at the pose.
-        modes: The pose and distinct other ones that score nearly as well, by falling score.
+        pose: (3,) the likeliest pose: x, y and theta in the world [m, m, rad]; refined between the poses of the grid,
+            or ``modes[0].pose``.
+        score: Mean score of the end points at ``modes[0].pose``, from 0 to 1.
+        log_likelihood: log p(z | pose, m) there, by the model.
+        agreement: Share of the hits that agree with the expected ranges there.
+        modes: The likeliest pose of the grid of poses and distinct other ones that score nearly as well, by falling
+            score.
         status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
             scan.
         resolution: Distance between neighbouring positions of the grid of poses [m].

@@ -13,6 +13,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.matching.chain import DOUBTFUL, concluded, match_pairs, wrapped
+from gpusense.matching.climb import climb
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
@@ -29,8 +30,8 @@ from gpusense.world.scanner import Reading, Scanner, classes
 
 # Weight of readings that have nothing to do with the map.
 _RANDOM = 0.2
-# Least deviation of a field in cells; iterations of each field; the largest step that ends them [m, rad].
-_LEAST_CELLS, _ITERATIONS, _SMALL = 1.5, 15, 1e-4
+# Least deviation of a field in cells.
+_LEAST_CELLS = 1.5
 # A score below this is a failure. Least hits, and least pairs and share of pairs that observe a direction.
 _POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 8, 2.0, 0.01
 # In maps drawn of end points, readings end this far behind surfaces; most that field and expected scan differ [cells].
@@ -134,7 +135,7 @@ class MapMatcher:
         pose, count = guess.copy(), np.zeros(len(guess))
         calm = np.zeros(len(guess), bool)
         for model in self._models[-1:] if finest else self._models:
-            pose, iterations, calm = _climb(model, ranges, pose)
+            pose, iterations, calm = climb(model, ranges, pose)
             count += iterations
         pose[:, 2] = wrapped(pose[:, 2])
         return pose, count, calm
@@ -205,49 +206,6 @@ class MapMatcher:
         status[hits.sum(axis=1) < _FEW] = "few points"
         other = np.full((len(pose), 3), np.nan)
         return concluded(pose, found, score, iterations, status, lever, other)
-
-
-def _climb(
-    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Maximise the log-likelihoods of (S, K) readings from (S, 3) poses by Levenberg's damped Gauss-Newton steps."""
-    scans = len(pose)
-    damping, count, calm = np.full(scans, 1e-3), np.zeros(scans), np.zeros(scans, bool)
-    value, gradient, information = _evaluated(model, ranges, pose)
-    for _ in range(_ITERATIONS):
-        moving = ~calm
-        if not moving.any():
-            break
-        rows = np.flatnonzero(moving)
-        diagonal = np.einsum("sii->si", information)
-        damped = (
-            information
-            + np.eye(3) * (damping[:, None] * diagonal + 1e-6 * (1 + diagonal.max(axis=1))[:, None])[:, None]
-        )
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        length = np.hypot(step[:, 0], step[:, 1])
-        step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
-        step[~moving] = 0
-        trial = pose + step
-        new_value, new_gradient, new_information = value.copy(), gradient.copy(), information.copy()
-        new_value[rows], new_gradient[rows], new_information[rows] = _evaluated(model, ranges[rows], trial[rows])
-        better = moving & (new_value >= value)
-        pose = np.where(better[:, None], trial, pose)
-        value = np.where(better, new_value, value)
-        gradient = np.where(better[:, None], new_gradient, gradient)
-        information = np.where(better[:, None, None], new_information, information)
-        count += moving
-        damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-6, 1e6)
-        calm |= moving & (np.abs(step).max(axis=1) < (_SMALL if model.precision == "float64" else 3 * _SMALL))
-    return pose, count, calm
-
-
-def _evaluated(
-    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return log p (S,), gradient and information of one pose for each scan."""
-    log_p, gradient, information = model.gradient(pose[:, None], ranges)
-    return log_p[:, 0].astype(np.float64), gradient[:, 0].astype(np.float64), information[:, 0].astype(np.float64)
 
 
 _LOCK = threading.Lock()

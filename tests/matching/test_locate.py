@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.matching.locate import _refined
 
 PARAMETERS = gs.LikelihoodFieldParameters(sigma_hit=0.15, max_distance=1.0)
 
@@ -42,7 +44,7 @@ def test_the_pose_is_that_of_brute_force(backend, positions, outside, beams):
     model = gs.LikelihoodFieldModel(
         grid, SCANNER, PARAMETERS, backend=backend, outside=outside, beams=beams, unknown="free"
     )
-    found = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1, positions=positions)
+    found = gs.locate_scan(model, ranges, resolution=0.2, angle=0.1, positions=positions, refine=False)
     headings = 2 * math.pi / 64 * np.arange(64)
     rows, cols = np.mgrid[0:48:2, 0:68:2]
     centers = grid.cell_centers(rows.ravel(), cols.ravel())
@@ -69,7 +71,41 @@ def test_a_scan_is_found_wherever_the_map_lies(backend, origin):
     assert np.hypot(*(found.pose - pose)[:2]) < 0.15
     assert abs(math.remainder(found.pose[2] - pose[2], 2 * math.pi)) < 0.05
     assert found.score > 0.9 and found.agreement > 0.9
-    assert found.modes[0].pose is found.pose
+
+
+def test_refinement_finds_the_maximum_between_the_poses_of_the_grid(backend):
+    grid = house((2.0, -1.0, 0.4))
+    ranges = scan_at(grid, (4.0, 2.6, 1.3), 0.02)
+    parameters = dataclasses.replace(PARAMETERS, interpolation="bilinear")
+    options = {"backend": backend, "unknown": "free", "precision": "float64"}
+    smooth = gs.LikelihoodFieldModel(grid, SCANNER, parameters, **options)
+    coarse, found = (
+        gs.locate_scan(
+            gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, **options), ranges, resolution=0.2, angle=0.1, refine=on
+        )
+        for on in (False, True)
+    )
+    assert coarse.pose is coarse.modes[0].pose
+    np.testing.assert_array_equal(found.modes[0].pose, coarse.pose)
+    assert np.hypot(*(found.pose - coarse.pose)[:2]) > 0.01
+    # No pose of a fine grid around it is likelier; smooth maxima differ from best poses by less than its steps.
+    steps = np.stack(np.meshgrid(*3 * [np.arange(-2, 3)]), axis=-1).reshape(-1, 3) * (0.005, 0.005, 0.002)
+    around = smooth.log_likelihood(found.pose + steps, ranges)
+    best = found.pose + steps[around.argmax()]
+    assert np.abs(best - found.pose).max() <= 0.005
+    assert smooth.log_likelihood(found.pose[None], ranges) > smooth.log_likelihood(coarse.pose[None], ranges) + 1
+    assert np.hypot(*(found.pose - (4.0, 2.6, 1.3))[:2]) < 0.07
+
+
+def test_refinements_that_lead_away_keep_the_pose():
+    grid, pose = house(), np.array([2.0, 2.5, 1.3])
+    parameters = dataclasses.replace(PARAMETERS, interpolation="bilinear")
+    smooth = gs.LikelihoodFieldModel(grid, SCANNER, parameters, backend="numpy")
+    ranges = scan_at(grid, (2.1, 2.5, 1.3))
+    for farthest, most, moved in [(0.2, 0.1, True), (0.05, 0.1, False), (0.2, 1e-5, False)]:
+        near = _refined(smooth, ranges, pose, farthest, most)
+        assert (np.hypot(*(near - pose)[:2]) > 0.05) == moved
+        assert moved or near is pose
 
 
 def test_a_symmetrical_map_has_two_modes():

@@ -1,0 +1,53 @@
+"""Poses of maximal likelihood near others, by damped Gauss-Newton on a likelihood field."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.models.scan.field import LikelihoodFieldModel
+
+# Most iterations, and the largest step that ends them [m, rad].
+_ITERATIONS, _SMALL = 15, 1e-4
+
+
+def climb(
+    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Maximise the log-likelihoods of (S, K) readings from (S, 3) poses by Levenberg's damped Gauss-Newton steps."""
+    scans = len(pose)
+    damping, count, calm = np.full(scans, 1e-3), np.zeros(scans), np.zeros(scans, bool)
+    value, gradient, information = _evaluated(model, ranges, pose)
+    for _ in range(_ITERATIONS):
+        moving = ~calm
+        if not moving.any():
+            break
+        rows = np.flatnonzero(moving)
+        diagonal = np.einsum("sii->si", information)
+        damped = (
+            information
+            + np.eye(3) * (damping[:, None] * diagonal + 1e-6 * (1 + diagonal.max(axis=1))[:, None])[:, None]
+        )
+        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        length = np.hypot(step[:, 0], step[:, 1])
+        step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
+        step[~moving] = 0
+        trial = pose + step
+        new_value, new_gradient, new_information = value.copy(), gradient.copy(), information.copy()
+        new_value[rows], new_gradient[rows], new_information[rows] = _evaluated(model, ranges[rows], trial[rows])
+        better = moving & (new_value >= value)
+        pose = np.where(better[:, None], trial, pose)
+        value = np.where(better, new_value, value)
+        gradient = np.where(better[:, None], new_gradient, gradient)
+        information = np.where(better[:, None, None], new_information, information)
+        count += moving
+        damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-6, 1e6)
+        calm |= moving & (np.abs(step).max(axis=1) < (_SMALL if model.precision == "float64" else 3 * _SMALL))
+    return pose, count, calm
+
+
+def _evaluated(
+    model: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return log p (S,), gradient and information of one pose for each scan."""
+    log_p, gradient, information = model.gradient(pose[:, None], ranges)
+    return log_p[:, 0].astype(np.float64), gradient[:, 0].astype(np.float64), information[:, 0].astype(np.float64)

@@ -12,6 +12,7 @@ from gpusense.commands.arguments import (
     add_backend,
     add_json,
     add_seed,
+    add_temperature,
     not_negative_number,
     output_path,
     positive_number,
@@ -61,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--parameters", "--params", type=Path, metavar="YAML",
         help="a file with beam_model, such as 'gpusense fit --out' writes (default: a likelihood field)")  # fmt: skip
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
-    add("--temperature", type=_temperature, default=DEFAULTS.temperature, metavar="T",
-        help="factor of log-likelihoods in (0, 1], or auto: learned from the scans (default: %(default)s)")  # fmt: skip
+    add_temperature(parser, "auto: learned from the scans")
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
         help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
         "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
@@ -82,10 +82,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, particles, estimated and logged poses")  # fmt: skip
-
-
-def _temperature(text: str) -> float | str:
-    return text if text == "auto" else positive_number(text)
 
 
 def run(args: argparse.Namespace) -> int:

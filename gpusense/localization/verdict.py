@@ -65,7 +65,7 @@ class Verdict:
         for index, reading in readings.items():
             if self._sensors[index].calibrates:
                 parts = self._sensors[index].parts(np.vstack([pose[None], self._poses]), reading)
-                shares.append(_share(parts[0], parts[1:]))
+                shares.append(explained_share(parts[0], parts[1:]))
         self._judged = self.corrections
         self._last = float(np.mean(shares)) if shares else math.nan
         if not math.isnan(self._last):
@@ -74,7 +74,7 @@ class Verdict:
         return self._last
 
 
-def _share(at: np.ndarray, elsewhere: np.ndarray) -> float:
+def explained_share(at: np.ndarray, elsewhere: np.ndarray) -> float:
     """Return the share of beams that are explained; NaN without beams."""
     used = np.isfinite(at) & (at != 0)
     values = elsewhere[:, used]

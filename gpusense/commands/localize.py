@@ -35,7 +35,8 @@ LOST = 1
 _EPILOG = """\
 The filter begins around the first logged pose, or with --global anywhere in the free space of the map. It moves with
 the log's odometry and weighs each chosen scan. Errors are those of the weighted mean against the logged poses, where
-the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate.
+the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate. A rank is
+the share of particles behind a logged pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence.
 
 The verdict at the end does not need logged poses: it is 'lost' if the estimates of the last tenth of the scans explain
 too few of their beams, as on a wrong map.
@@ -67,6 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
         "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
         "(default: 0.02 each)")  # fmt: skip
+    add("--sideways", type=not_negative_number, metavar="S",
+        help="variance of slips to the side per squared turn [m^2/rad^2] (default: 0.02)")  # fmt: skip
     add("--reverse", type=not_negative_number, metavar="P",
         help="probability that a translation went the other direction (default: 0.02)")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
@@ -146,9 +149,8 @@ def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
         if len(poses) < len(steps):
             raise ValueError("--fit-motion: needs a log with poses, got one without")
         return fit_odometry_motion([step.odometry for step in steps], poses).motion
-    plain = OdometryMotion()
-    alpha = plain.alpha if args.motion_noise is None else tuple(args.motion_noise)
-    return OdometryMotion(alpha, plain.reverse if args.reverse is None else args.reverse)
+    given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
+    return OdometryMotion(**{name: value for name, value in given.items() if value is not None})
 
 
 def _text(track: Track, step: Step) -> str:
@@ -182,7 +184,7 @@ def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
     """Print the summary."""
-    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items()}
+    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name != "rank_histogram"}
     print(f"{pf!r}\n")
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
@@ -195,7 +197,9 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
             f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m\n"
             f"within 1 m, 20 deg    {at}\n"
             f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
-            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)"
+            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)\n"
+            f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad\n"
+            f"ranks of logged poses {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
         )
     print(
         f"effective sample size median {s['effective_sample_size_median']}\n"
@@ -204,6 +208,10 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
         f"verdict: {_verdict(result)}\n\n{machine_line()}",
     )
     sys.stdout.flush()
+
+
+def _ranks(histogram: list[float]) -> str:
+    return " ".join(f"{100 * share:.0f}" for share in histogram)
 
 
 def _verdict(result: dict[str, Any]) -> str:

@@ -37,7 +37,8 @@ def makers(kind, backend, beams):
     def make(grid, scanner):
         chosen = parameters
         if kind == "discrete":
-            chosen = gs.SensorTable.from_parameters(parameters, range_max=scanner.range_max, resolution=0.1)
+            bins = min(int(np.ceil(scanner.range_max / 0.05)), 2000)
+            chosen = gs.DiscreteBeamModel(parameters, range_max=scanner.range_max, bins=bins)
         return gs.BeamModel(grid, scanner, chosen, backend=backend, beams=beams)
 
     return make

@@ -75,6 +75,7 @@ def main() -> None:
     parser.add_argument("--beams", type=int, help="thin each scan evenly to this many beams")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--limit", type=int, help="scans of each log")
+    parser.add_argument("--fit-motion", action="store_true", help="learn the noise of the odometry from the log first")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     results = []
@@ -82,15 +83,22 @@ def main() -> None:
         if name == "wean":
             results += wean(args.backend, args.seeds)
             continue
-        recording = recordings.load(name)
+        recording, motion = recordings.load(name), None
+        if args.fit_motion:
+            odometry, truth = (
+                np.array([getattr(e, which) for e in recording.events]) for which in ("odometry", "truth")
+            )
+            motion = gs.fit_odometry_motion(odometry, truth).motion
         for kind in args.models:
             models = recording.models(makers(kind, args.backend, args.beams))
             for count in args.particles:
                 runs = [
-                    recordings.follow(recording, models, limit=args.limit, particles=count, seed=seed)
+                    recordings.follow(recording, models, limit=args.limit, particles=count, seed=seed, motion=motion)
                     for seed in range(args.seeds)
                 ]
-                row = dict(log=name, model=kind, particles=count, beams=args.beams) | recordings.figures(runs)
+                noise = "fitted" if args.fit_motion else "default"
+                row = dict(log=name, model=kind, particles=count, beams=args.beams, noise=noise)
+                row |= recordings.figures(runs)
                 print(_line(row), flush=True)
                 results.append(row)
     if args.out is not None:

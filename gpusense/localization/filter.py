@@ -127,7 +127,7 @@ class ParticleFilter:
         self._step, self._started, self._pending = 0, False, _STILL
         self._shown, self._wide = self._most, 0
         self._pool_size, self._spread = 0, (0.0, 0.0, 0.0)
-        self._verdict = Verdict(self._sensors, self._random_poses)
+        self._verdict = Verdict(self._sensors, self._random_poses, seed=self.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
 
     def __repr__(self) -> str:
@@ -257,6 +257,8 @@ class ParticleFilter:
         given = self._given(readings)
         if not given:
             return
+        if self._verdict.watches(dict(given)):
+            self._verdict.predicted(self.host_particles(), self.host_weights(), dict(given))
         motion, self._pending = self._pending, _STILL
         drawn = self._cloud.count if self._least == self._most else self._wanted()
         settings = self._settings(motion, [index for index, _ in given])
@@ -448,6 +450,14 @@ class ParticleFilter:
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""
         return tuple(sensor.temperature(self.temperature) for sensor in self._sensors)
+
+    @property
+    def gain(self) -> float:
+        """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
+
+        NaN without a landmark model, and before 20 scans with features.
+        """
+        return self._verdict.gain
 
     @property
     def scoring_seconds(self) -> float:

@@ -1,4 +1,4 @@
-"""Whether a filter is lost: how many beams of recent scans the estimated pose explains.
+"""Whether a filter is lost: how many beams of scans the estimated pose explains, how well features were predicted.
 
 A beam is explained if its log-likelihood at the estimate is nearer to a good one than to a poor one. Poor is the median
 of the beams of the scan at random poses in the free space, good the 99th percentile there: a random pose meets the
@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from gpusense.localization.evidence import Evidence
 from gpusense.localization.sensors import Sensor
+from gpusense.models.landmark.model import LandmarkModel
 
 # Random poses; corrections over which the share is averaged; the least share of a filter that is not lost.
 _RANDOM, _MEMORY, LEAST_EXPLAINED = 64, 5, 0.8
@@ -26,13 +28,14 @@ class Verdict:
     Args:
         sensors: The filter's sensors.
         random_poses: Returns poses anywhere in the free space.
+        seed: Seed of the poses among landmarks.
 
     Attributes:
         corrections: Corrections since the filter began.
     """
 
-    def __init__(self, sensors: Sequence[Sensor], random_poses: Callable[[int], np.ndarray]) -> None:
-        self._sensors, self._random_poses = sensors, random_poses
+    def __init__(self, sensors: Sequence[Sensor], random_poses: Callable[[int], np.ndarray], *, seed: int = 0) -> None:
+        self._sensors, self._random_poses, self._seed = sensors, random_poses, seed
         self._poses: np.ndarray | None = None
         self.reset()
 
@@ -40,6 +43,27 @@ class Verdict:
         """Forget all scans."""
         self.corrections, self._judged, self._share = 0, 0, math.nan
         self._last = math.nan
+        self._evidence = {
+            index: Evidence(sensor.model, seed=self._seed)
+            for index, sensor in enumerate(self._sensors)
+            if isinstance(sensor.model, LandmarkModel)
+        }
+
+    def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
+        """Tell whether readings have features, whose prediction is judged before the correction."""
+        return any(index in self._evidence and _count(reading) for index, reading in readings.items())
+
+    def predicted(self, poses: np.ndarray, weights: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> None:
+        """Add the features of a scan, before the filter is corrected by them."""
+        for index, evidence in self._evidence.items():
+            if index in readings and _count(readings[index]):
+                evidence.predicted(poses, weights, np.asarray(readings[index][0], np.float64))
+
+    @property
+    def gain(self) -> float:
+        """Least mean gain of the predictions of features [nats]; NaN without enough of them."""
+        gains = [evidence.gain for evidence in self._evidence.values() if not math.isnan(evidence.gain)]
+        return min(gains, default=math.nan)
 
     def corrected(self) -> None:
         """Count a correction."""
@@ -52,8 +76,8 @@ class Verdict:
 
     @property
     def lost(self) -> bool:
-        """Tell whether recent scans contradict the pose; False before any was judged."""
-        return self._share < LEAST_EXPLAINED
+        """Tell whether recent scans or features contradict the pose; False before any was judged."""
+        return self._share < LEAST_EXPLAINED or any(evidence.lost for evidence in self._evidence.values())
 
     def explained(self, pose: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
         """Return the share of the beams of the last scans that a pose explains; NaN where no reading has beams."""
@@ -72,6 +96,12 @@ class Verdict:
             rate = 1 / min(self.corrections, _MEMORY) if self.corrections else 1.0
             self._share = self._last if math.isnan(self._share) else self._share + rate * (self._last - self._share)
         return self._last
+
+
+def _count(reading: tuple[Any, ...]) -> int:
+    """Return the number of features of a reading; 0 for one that the model will refuse."""
+    shape = np.shape(reading[0])
+    return int(shape[0]) if shape else 0
 
 
 def explained_share(at: np.ndarray, elsewhere: np.ndarray) -> float:

@@ -4,7 +4,8 @@ Every run begins with a normal density of deviations 0.5 m, 0.5 m and 0.26 rad a
 the filter's defaults. A run is lost if the median error of its last tenth is above 1 m. wean_hall has no reference:
 there, starts anywhere on the map are compared with one another and with the verdict.
 
-    python bench/accuracy/localization_logs.py --logs aces olin --models field --particles 500 5000 --seeds 3
+    python bench/accuracy/localization_logs.py --logs aces olin --models field --particles 500 5000 --seeds 3 \
+        --out bench/results/localization_logs_cpu.json
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 import recordings
 
 import gpusense as gs
-from gpusense.evaluation.machine import machine
+from gpusense.evaluation.machine import machine, machine_line
 from gpusense.evaluation.tracking import read_steps
 from gpusense.localization.defaults import DEFAULTS
 
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--limit", type=int, help="scans of each log")
     parser.add_argument("--fit-motion", action="store_true", help="learn the noise of the odometry from the log first")
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
     args = parser.parse_args()
     results = []
     for name in args.logs:
@@ -104,12 +105,25 @@ def main() -> None:
     if args.out is not None:
         command = " ".join(["bench/accuracy/localization_logs.py", *sys.argv[1:]])
         args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
+        lines = [_line(row) for row in results if "model" in row]
+        if lines:
+            table = "\n".join([*_HEAD, *lines])
+            args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table}\n")
+
+
+_HEAD = (
+    "| log | model | noise | particles | median, 95 % error [cm] | heading [deg] | lost | scans said lost [%] | "
+    "coverage 50, 80, 95 % | temperature | ms a scan |",
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+)
 
 
 def _line(r):
+    coverage = ", ".join(f"{r[f'coverage_{k}']:.2f}" for k in (50, 80, 95))
     return (
-        f"| {r['log']} | {r['model']} | {r['particles']} | {r['median_cm']:.1f}, {r['p95_cm']:.1f} | "
-        f"{r['heading_deg']:.2f} | {r['lost']} of {r['seeds']} | {r['coverage_95']:.2f} | {np.round(r['ms'], 1)} |"
+        f"| {r['log']} | {r['model']} | {r['noise']} | {r['particles']} | {r['median_cm']:.1f}, {r['p95_cm']:.1f} | "
+        f"{r['heading_deg']:.2f} | {r['lost']} of {r['seeds']} | {100 * r['said_lost']:.1f} | {coverage} | "
+        f"{r['temperature']:.3f} | {r['ms']:.1f} |"
     )
 
 

@@ -74,6 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="probability that a translation went the other direction (default: 0.02)")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
     add("--recovery", choices=("augmented", "sensor"), help="inject particles when the filter is lost")
+    add("--beam-skip", type=positive_number, metavar="P",
+        help="leave out beams that less than this share of the particles explains, such as those of people")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")
     add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
     add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
@@ -131,7 +133,7 @@ def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
     particles = DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles
     return ParticleFilter(
         model, motion=_motion(args, steps), particles=particles if args.particles is None else args.particles,
-        seed=args.seed, temperature=args.temperature, recovery=args.recovery,
+        seed=args.seed, temperature=args.temperature, recovery=args.recovery, beam_skip=args.beam_skip,
     )  # fmt: skip
 
 

@@ -17,9 +17,13 @@ import numpy as np
 from gpusense.localization.evidence import Evidence
 from gpusense.localization.sensors import Sensor
 from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.scan.beam import BeamModel
 
-# Random poses; corrections over which the share is averaged; the least share of a filter that is not lost.
-_RANDOM, _MEMORY, LEAST_EXPLAINED = 64, 5, 0.8
+# Random poses; corrections over which the share is averaged.
+_RANDOM, _MEMORY = 64, 5
+# Least share of a filter that is not lost, between those of right and wrong maps (bench/studies/verdict.py).
+# A likelihood field explains an end near any wall; a beam model asks for the wall that the beam meets.
+_LEAST_OF_FIELD, _LEAST_OF_BEAMS = 0.8, 0.55
 
 
 class Verdict:
@@ -43,6 +47,7 @@ class Verdict:
         """Forget all scans."""
         self.corrections, self._judged, self._share = 0, 0, math.nan
         self._last = math.nan
+        self._least = 0.0
         self._evidence = {
             index: Evidence(sensor.model, seed=self._seed)
             for index, sensor in enumerate(self._sensors)
@@ -65,6 +70,12 @@ class Verdict:
         gains = [evidence.gain for evidence in self._evidence.values() if not math.isnan(evidence.gain)]
         return min(gains, default=math.nan)
 
+    def anywhere(self) -> np.ndarray:
+        """Return poses anywhere in the free space, with which a pose is compared."""
+        if self._poses is None:
+            self._poses = self._random_poses(_RANDOM)
+        return self._poses
+
     def corrected(self) -> None:
         """Count a correction."""
         self.corrections += 1
@@ -77,22 +88,24 @@ class Verdict:
     @property
     def lost(self) -> bool:
         """Tell whether recent scans or features contradict the pose; False before any was judged."""
-        return self._share < LEAST_EXPLAINED or any(evidence.lost for evidence in self._evidence.values())
+        return self._share < self._least or any(evidence.lost for evidence in self._evidence.values())
 
     def explained(self, pose: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
         """Return the share of the beams of the last scans that a pose explains; NaN where no reading has beams."""
         if self._judged == self.corrections:
             return self._last
-        if self._poses is None:
-            self._poses = self._random_poses(_RANDOM)
-        shares = []
+        anywhere = self.anywhere()
+        shares, least = [], []
         for index, reading in readings.items():
             if self._sensors[index].calibrates:
-                parts = self._sensors[index].parts(np.vstack([pose[None], self._poses]), reading)
+                parts = self._sensors[index].parts(np.vstack([pose[None], anywhere]), reading)
                 shares.append(explained_share(parts[0], parts[1:]))
+                beams = isinstance(self._sensors[index].model, BeamModel)
+                least.append(_LEAST_OF_BEAMS if beams else _LEAST_OF_FIELD)
         self._judged = self.corrections
         self._last = float(np.mean(shares)) if shares else math.nan
         if not math.isnan(self._last):
+            self._least = float(np.mean(least))
             rate = 1 / min(self.corrections, _MEMORY) if self.corrections else 1.0
             self._share = self._last if math.isnan(self._share) else self._share + rate * (self._last - self._share)
         return self._last
@@ -107,11 +120,23 @@ def _count(reading: tuple[Any, ...]) -> int:
 def explained_share(at: np.ndarray, elsewhere: np.ndarray) -> float:
     """Return the share of beams that are explained; NaN without beams."""
     used = np.isfinite(at) & (at != 0)
-    values = elsewhere[:, used]
-    values = values[np.isfinite(values)]
-    if not used.any() or not values.size:
-        return math.nan
+    least = boundary(elsewhere[:, used])
+    if least is None:
+        return 1.0 if used.any() and np.isfinite(elsewhere[:, used]).any() else math.nan
+    return float(np.mean(at[used] > least))
+
+
+def boundary(elsewhere: np.ndarray) -> float | None:
+    """Return the log-likelihood above which a beam is explained, between a poor and a good one.
+
+    Args:
+        elsewhere: (M, K) log-likelihoods of used beams at poses anywhere in the free space.
+
+    Returns:
+        None where all beams are equally likely everywhere, or none is possible.
+    """
+    values = elsewhere[np.isfinite(elsewhere)]
+    if not values.size:
+        return None
     poor, good = np.percentile(values, (50, 99))
-    if not good > poor:
-        return 1.0
-    return float(np.mean(at[used] > (poor + good) / 2))
+    return float((poor + good) / 2) if good > poor else None

@@ -129,6 +129,22 @@ def test_a_filter_on_a_wrong_map_says_that_it_is_lost():
     assert found.lost and found.explained < 0.8
 
 
+def test_people_in_the_room_are_no_wrong_map():
+    """A third of the beams of a beam model may end at people; of a field, too, where most ends are near a wall."""
+    model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(sigma_hit=0.1), backend="numpy")
+    for share, lost in ((0.3, False), (0.6, True)):
+        pf, rng = gs.ParticleFilter(model, particles=200, seed=2), np.random.default_rng(1)
+        pf.initialize(mean=TRUTH, covariance=np.eye(3) * 1e-4)
+        for _ in range(6):
+            ranges = walls(TRUTH)
+            blocked = rng.permutation(60)[: round(share * 60)]
+            ranges[blocked] *= rng.uniform(0.1, 0.6, len(blocked))
+            pf.correct(ranges)
+            found = pf.estimate()
+        assert found.lost == lost, (share, found.explained)
+        assert np.hypot(*(found.pose - TRUTH)[:2]) < 0.1
+
+
 def test_impossible_readings_change_nothing():
     parameters = gs.LikelihoodFieldParameters(z_hit=1.0, z_rand=0.0, z_max=0.0, sigma_hit=0.01)
     model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(1.0, 0.0, 0.0, 0.0, sigma_hit=1e-8), backend="numpy")

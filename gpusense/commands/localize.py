@@ -61,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
     add("--global", dest="everywhere", action="store_true", help="begin anywhere in the free space of the map")
     add("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model, such as 'gpusense fit --out' writes (default: a likelihood field)")  # fmt: skip
+        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes (default: a likelihood "
+        "field, and the noise below)")  # fmt: skip
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: learned from the scans")
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
@@ -75,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
     add("--recovery", choices=("augmented", "sensor"), help="inject particles when the filter is lost")
     add("--beam-skip", type=positive_number, metavar="P",
-        help="leave out beams that less than this share of the particles explains, such as those of people")  # fmt: skip
+        help="leave out beams, such as of people, that less than this share of the particles explains")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")
     add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
     add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
@@ -115,7 +116,7 @@ def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
     Raises:
         ValueError: an option breaks its rule, a file its format, or the backend is absent.
     """
-    from gpusense.commands.score import read_beam_parameters
+    from gpusense.commands.parameter_files import read_localization
     from gpusense.localization.filter import ParticleFilter
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
@@ -125,20 +126,21 @@ def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
     grid, scanner = read_map(args.map), steps[0].scan.scanner
     beams = DEFAULTS.beams if args.beams is None else args.beams
     model: Any
-    if args.parameters is not None:
-        model = BeamModel(grid, scanner, read_beam_parameters(args.parameters), beams=beams, backend=args.backend)
+    beam, noise = (None, {}) if args.parameters is None else read_localization(args.parameters)
+    if beam is not None:
+        model = BeamModel(grid, scanner, beam, beams=beams, backend=args.backend)
     else:
         field = LikelihoodFieldParameters(**DEFAULTS.field)
         model = LikelihoodFieldModel(grid, scanner, field, beams=beams, backend=args.backend)
     particles = DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles
     return ParticleFilter(
-        model, motion=_motion(args, steps), particles=particles if args.particles is None else args.particles,
+        model, motion=_motion(args, steps, noise), particles=particles if args.particles is None else args.particles,
         seed=args.seed, temperature=args.temperature, recovery=args.recovery, beam_skip=args.beam_skip,
     )  # fmt: skip
 
 
-def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
-    """Return the motion model of the options.
+def _motion(args: argparse.Namespace, steps: list[Step], noise: dict[str, Any]) -> MotionModel:
+    """Return the motion model of the options, and of the file of parameters where an option is not given.
 
     Raises:
         ValueError: there are no logged poses to learn from, or a number breaks its rule.
@@ -152,7 +154,7 @@ def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
             raise ValueError("--fit-motion: needs a log with poses, got one without")
         return fit_odometry_motion([step.odometry for step in steps], poses).motion
     given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
-    return OdometryMotion(**{name: value for name, value in given.items() if value is not None})
+    return OdometryMotion(**noise | {name: value for name, value in given.items() if value is not None})
 
 
 def _text(track: Track, step: Step) -> str:

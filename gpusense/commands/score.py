@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from gpusense.evaluation.scoring import BackendScore, LogScoring, ScanScore
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
-    from gpusense.world.parameters import BeamParameters
 
 NAME = "score"
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
@@ -191,6 +190,8 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple
     if args.parameters is not None:
         if args.model != "beam":
             raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
+        from gpusense.commands.parameter_files import read_beam_parameters
+
         beam = read_beam_parameters(args.parameters)
     scanner, backends = scans[0][1].scanner, args.backend or ["auto"]
 
@@ -208,26 +209,6 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple
         model = make(backend, temperature)
         models.setdefault(model.device.selection, model)
     return list(models.values())
-
-
-def read_beam_parameters(path: Path) -> BeamParameters:
-    """Read the mapping ``beam_model`` of a YAML file.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        ValueError: the file lacks the mapping, or a parameter breaks its rule.
-    """
-    from gpusense._util import checks
-    from gpusense._util.files import read_mapping
-    from gpusense.world.parameters import BeamParameters
-
-    values = read_mapping(checks.existing_file(path)).get("beam_model")
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: must hold a mapping beam_model, got {checks.show(values)}")
-    try:
-        return BeamParameters.from_dict(values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: beam_model: {error}") from None
 
 
 def _option(name: str) -> str:

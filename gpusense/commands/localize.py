@@ -68,11 +68,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
         help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
         "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
-        "(default: 0.02 each)")  # fmt: skip
+        f"(default: {' '.join(map(str, DEFAULTS.alpha))})")  # fmt: skip
     add("--sideways", type=not_negative_number, metavar="S",
-        help="variance of slips to the side per squared turn [m^2/rad^2] (default: 0.02)")  # fmt: skip
+        help="variance of slips to the side per squared turn [m^2/rad^2] "
+        f"(default: {DEFAULTS.sideways})")  # fmt: skip
     add("--reverse", type=not_negative_number, metavar="P",
-        help="probability that a translation went the other direction (default: 0.02)")  # fmt: skip
+        help=f"probability that a translation went the other direction (default: {DEFAULTS.reverse})")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
     add("--recovery", choices=("augmented", "sensor"), help="inject particles when the filter is lost")
     add("--beam-skip", type=positive_number, metavar="P",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.coverage import REGIONS, coverage_report, rank_of
+from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan, read_log
@@ -23,7 +24,7 @@ Floats = NDArray[np.float64]
 # A track has converged where the next scans are within these of the truth [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5
 # Deviations of a tracking start: x, y [m] and heading [rad].
-START = (0.5, 0.5, 0.26)
+START = DEFAULTS.start
 
 
 @dataclass(frozen=True)

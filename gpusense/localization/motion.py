@@ -15,6 +15,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
+from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.pose_algebra import pose_difference
 
 # Below this translation [m] no direction can be read from it.
@@ -112,11 +113,11 @@ class OdometryMotion:
         (0.0, 1.0, 0.0, 0.0)
     """
 
-    alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02)
-    reverse: float = 0.02
-    least: tuple[float, float] = (0.01, 0.005)
+    alpha: tuple[float, ...] = DEFAULTS.alpha
+    reverse: float = DEFAULTS.reverse
+    least: tuple[float, float] = DEFAULTS.least
     systematic: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    sideways: float = 0.02
+    sideways: float = DEFAULTS.sideways
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 4))
@@ -166,7 +167,7 @@ class OmniMotion:
     """
 
     alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02, 0.02)
-    least: tuple[float, float] = (0.01, 0.005)
+    least: tuple[float, float] = DEFAULTS.least
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 5))
@@ -209,7 +210,7 @@ class VelocityMotion:
     """
 
     alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02, 0.01, 0.01)
-    least: tuple[float, float] = (0.01, 0.005)
+    least: tuple[float, float] = DEFAULTS.least
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 6))

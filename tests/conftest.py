@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -33,9 +34,20 @@ QUICK = (
 )  # fmt: skip
 
 
+GOLDEN = (5**0.5 - 1) / 2
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of the subset."""
+    """Mark the tests of the subset, and as slow the settings beyond the sample of a test."""
+    number: Counter[str] = Counter()
     for item in items:
+        sampled = item.get_closest_marker("sampled")
+        if sampled is not None:
+            function = item.nodeid.split("[")[0]
+            # Multiples of the golden ratio spread over every parameter, however its values follow one another.
+            if number[function] * GOLDEN % 1 >= sampled.args[0]:
+                item.add_marker("slow")
+            number[function] += 1
         path = item.path.relative_to(Path(__file__).parent).as_posix()
         slow = item.get_closest_marker("slow") is not None
         if not slow and any(path == part or path.startswith(f"{part}/") for part in QUICK):

@@ -258,6 +258,7 @@ reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize(
     "module, name, broken, quantity",
     [

@@ -51,6 +51,7 @@ def exact_grid(precision: str) -> np.ndarray:
     return np.array(truth)
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_density_grid_against_60_digits(backend, precision):
     grid, same, truth = stiff.density_grid(backend, precision), numpy_grid(precision), exact_grid(precision)

@@ -227,6 +227,7 @@ def field_blocks(
     return parts_at(found["parts"], count, blocks), parts_at(reference["parts"], count, blocks), bound
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     found, expected, bound = field_blocks(device, name, real, names, 1, 77, 150)

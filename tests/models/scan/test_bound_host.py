@@ -14,6 +14,7 @@ from gpusense.evaluation.tolerances import differing
 from gpusense.models.scan import binding
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("case", CASES)
 def test_short_calls_of_the_host_are_one_graph(case, gathering, monkeypatch):
     """Copies there and back and all launches; the bits are those of the ordinary call."""

@@ -158,6 +158,7 @@ def turned_and_mirrored_scores(after: Scene, before: Scene, parameters: Any, on:
     assert_near(found, expected, 2 * per_beam(expected, expected.dtype))
 
 
+@pytest.mark.sampled(0.5)
 @LAWS
 @given(SEEDS, SMOOTH, st.sampled_from([-1, 1, 2]))
 def test_turn(kind, on, seed, name, quarters):
@@ -185,6 +186,7 @@ def test_mirror(kind, on, seed, name):
     turned_and_mirrored_scores(after, before, PARAMETERS[kind][name], on)
 
 
+@pytest.mark.sampled(0.5)
 @LAWS
 @given(SEEDS, NAMES, st.integers(-10, 10), st.floats(-7, 7), st.integers(0, 40))
 def test_shift(kind, on, seed, name, far, yaw, cells):
@@ -288,6 +290,7 @@ def test_permuting_beams_and_particles(kind, on, seed, name):
     plain_sum(other, some)
 
 
+@pytest.mark.sampled(0.5)
 @LAWS
 @given(SEEDS, NAMES, st.integers(0, 24))
 def test_splitting_a_scan(kind, on, seed, name, count):

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Step, Track
     from gpusense.localization.filter import ParticleFilter
     from gpusense.localization.motion import MotionModel
+    from gpusense.plots.viewer import Recording
 
 NAME = "localize"
 HELP = "Localise a robot along a recorded log with a particle filter."
@@ -89,6 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, particles, estimated and logged poses")  # fmt: skip
+    add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -98,17 +100,35 @@ def run(args: argparse.Namespace) -> int:
     steps = read_steps(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
     pf = _filter(args, steps)
     start(pf, steps, everywhere=args.everywhere)
-    track = Track()
+    track, recording = Track(), _recording(args, pf)
     try:
         with progress(len(steps)) as step:
             step("starting")
             for one in follow(pf, steps, track):
                 step(_text(track, one))
+                if recording is not None:
+                    recording.add(pf, track, one)
     except KeyboardInterrupt:
         if track.steps:
-            _report(args, pf, track, len(steps))
+            _report(args, pf, track, len(steps), recording)
         raise
-    return LOST if _report(args, pf, track, len(steps))["lost"] else 0
+    return LOST if _report(args, pf, track, len(steps), recording)["lost"] else 0
+
+
+def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
+    """Begin a recording; None where none is asked for.
+
+    Raises:
+        ValueError: the library is not installed.
+    """
+    if args.record is None:
+        return None
+    from gpusense.plots.viewer import Recording
+
+    try:
+        return Recording(pf.grid)
+    except ImportError as error:
+        raise ValueError(f"--record: {error}") from None
 
 
 def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
@@ -165,7 +185,9 @@ def _text(track: Track, step: Step) -> str:
     return f"scan {step.index}{error}, {track.sizes[-1]:.0f} effective, {rate:.0f} scans/s"
 
 
-def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int) -> dict[str, Any]:
+def _report(
+    args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recording: Recording | None
+) -> dict[str, Any]:
     """Write the files, and print the results; return the summary."""
     from gpusense.evaluation.tracking import summary, write_tum
 
@@ -174,6 +196,8 @@ def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: 
         write_tum(track, args.tum)
     if args.plot is not None:
         _draw(args.plot, pf, track)
+    if recording is not None:
+        recording.write(track, args.record)
     if args.json:
         options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
@@ -181,7 +205,7 @@ def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: 
         print_json(document | {"poses": poses, "machine": machine()})
         return result
     _print(pf, result, chosen)
-    for path in (args.tum, args.plot):
+    for path in (args.tum, args.plot, args.record):
         if path is not None:
             print(f"written: {path}")
     return result

@@ -92,13 +92,14 @@ def parameters_yaml(result: Result) -> str:
         lines.append("# For gpusense: gs.IncidenceParameters.from_dict(...).")
         lines.append(block("incidence_model", result.incidence.parameters.to_dict()))
     if result.motion is not None:
-        lines.append("# For 'gpusense localize --params': OdometryMotion.")
+        lines.append(
+            "# For 'gpusense localize --params': OdometryMotion. nav2_amcl lacks least, sideways and systematic:"
+        )
+        lines.append("# alpha alone is too little noise there.")
         lines.append(block("odometry_motion", _plain(asdict(result.motion.motion))))
     own = ("range_bias", "sigma_growth")
     shared = {name: value for name, value in values.items() if name not in own}
     nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
-    if result.motion is not None:
-        nav2 |= {f"alpha{k + 1}": value for k, value in enumerate(result.motion.motion.alpha)}
     lines += [
         "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
         "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",

@@ -80,7 +80,7 @@ def test_what_the_command_fit_wrote(tmp_path: Path) -> None:
     file.write_text(parameters_yaml(result))
     options = from_nav2(file)
     assert options.model == "beam" and options.parameters == fit.parameters and options.parameters.range_bias > 0
-    assert options.range_limits == (None, 10.0) and options.alpha == (0.1, 0.2, 0.3, 0.4, 0.2)
+    assert options.range_limits == (None, 10.0) and options.alpha == (0.2,) * 5
     assert from_nav2({"beam_model": fit.parameters.to_dict()}).parameters == fit.parameters
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from gpusense.backends import Backend
+from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import RAY_BITS
 from gpusense.interface.launches import launch
 from gpusense.world.frames import ray_vectors
@@ -83,6 +84,7 @@ class RayCounts:
     ) -> None:
         self._backend, self._shape = backend, shape
         self._frame = OccupancyGrid([[0]], resolution, origin)
+        self._space = Workspace(backend)
         self._hits = backend.upload(np.zeros(shape, _INT))
         self._misses = backend.upload(np.zeros(shape, _INT))
         self.rays = 0
@@ -95,15 +97,16 @@ class RayCounts:
             np.rint(self._frame.world_to_cells(xy) * (1 << RAY_BITS)).clip(-(2.0**30), 2.0**30).astype(np.int32)
             for xy in (ends.start, ends.end)
         ]
-        backend = self._backend
-        start, end = map(backend.upload, places)
         rows, cols = self._shape
-        one = launch(
-            "count_rays", (), (len(ends.hit),), start=start, end=end, hit=backend.upload(ends.hit.astype(np.int32)),
-            hits=self._hits, misses=self._misses, rows=rows, cols=cols, rays=len(ends.hit),
-        )  # fmt: skip
-        backend.run((one,))
-        backend.synchronize()
+        with self._space as space:
+            start, end = (space.upload(name, place) for name, place in zip(("start", "end"), places, strict=True))
+            one = launch(
+                "count_rays", (), (len(ends.hit),), start=start, end=end,
+                hit=space.upload("hit", ends.hit.astype(np.int32)), hits=self._hits, misses=self._misses, rows=rows,
+                cols=cols, rays=len(ends.hit),
+            )  # fmt: skip
+            self._backend.run((one,))
+            space.wait()
         self.rays += len(ends.hit)
 
     def counts(self) -> tuple[np.ndarray, np.ndarray]:

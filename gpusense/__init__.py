@@ -68,7 +68,7 @@ _NAMES = {
     "world.sensor_parameters": ("BeaconParameters", "BumperParameters", "HeadingParameters", "PositionParameters"),
 }
 # Public modules.
-_MODULES = ("casters", "compat", "plots", "worlds")
+_MODULES = ("casters", "compat", "plots", "sweep", "worlds")
 
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
 

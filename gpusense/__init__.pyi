@@ -3,6 +3,7 @@
 from gpusense import casters as casters
 from gpusense import compat as compat
 from gpusense import plots as plots
+from gpusense import sweep as sweep
 from gpusense import worlds as worlds
 from gpusense._version import __version__ as __version__
 from gpusense.backends import Device as Device

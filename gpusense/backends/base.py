@@ -174,6 +174,10 @@ class Backend(ABC):
         """Start to copy ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
         raise TypeError(f"{self.info.selection} does not copy between buffers")
 
+    def copies_from(self, other: Backend) -> bool:
+        """Return whether ``copy`` takes buffers of another device, whose work on them has ended, as source."""
+        return other is self
+
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
         """Return a buffer as an array of the library that the backend is made with."""
         raise TypeError(f"{self.info.selection} does not lend buffers")
@@ -288,6 +292,10 @@ class Proxy(Backend):
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
         """See Backend.copy."""
         self._backend.copy(source, target, size, begin=begin, to=to)
+
+    def copies_from(self, other: Backend) -> bool:
+        """See Backend.copies_from."""
+        return self._backend.copies_from(other)
 
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
         """See Backend.lend."""

@@ -48,6 +48,9 @@ def strands_in(terms: int) -> int:
 SEED, STEP, MEAN, DEVIATION, REVERSE, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = 0, 2, 3, 7, 11, 12, 13, 14, 15
 SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED, STRATIFIED = range(19, 27)
 TEMPERATURE = 27
+# Where a filter is split: index of the first particle here, particles of the whole filter now and in the next step; the
+# last two are 0 where all particles are here.
+FIRST, WHOLE, DRAWN = 61, 62, 63
 SETTINGS = 64
 # Streams of random numbers within a step; a stage of a correction has DRAW_STREAMS of its own.
 MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
@@ -61,6 +64,6 @@ LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = range(6)
 STAGE = 8
 EVIDENCE, SLOW, FAST, INJECTED = 48, 49, 50, 51
 STATE = 64
-# Kernel file estimate: sums of a block, and numbers of an estimate: pose, covariance by rows of its upper half, the
-# sum of weights and the best particle.
-ESTIMATE_SUMS, ESTIMATE = 13, 12
+# Kernel file estimate: sums of a block, numbers of an estimate (pose, covariance by rows of its upper half, the sum of
+# weights, the best particle), and lanes of a block.
+ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 12, 8

@@ -13,16 +13,22 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "e_step": (set(),),
     "field_gradient": ({"LINEAR"},),
+    "draw_particles": (set(),),
+    "move_particles": (set(),),
+    "place_poses": (set(),),
     "score_beams": ({"LINEAR"},),
     "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),
+    "set_weights": (set(),),
     "shift_scores": (set(),),
+    "sum_poses": (set(),),
+    "weigh_particles": (set(),),
 }
 
 
 def widened(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
     """Return the flags of a launch, with WIDE where the device asks for lanes and the kernel has a body in vectors."""
     never = (_NEVER | _NEVER_OF.get(kernel, set())) - ({"FLOAT64"} if kernel in _FLOAT64 else set())
-    if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED[kernel]):
+    if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
         return frozenset(flags)
     return frozenset(flags) | {"WIDE"}

@@ -17,20 +17,18 @@ from gpusense.backends.recording import Recording
 from gpusense.interface.constants import (
     DEGENERATE,
     ESTIMATE,
-    ESTIMATE_SUMS,
     LEFT,
     RUNG,
     SAMPLE_SIZE,
     SETTINGS,
     STAGE,
     STATE,
-    WEIGHT_SUMS,
 )
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
+from gpusense.localization.sums import Sums, block_of
 
 _DOUBLE = np.dtype(np.float64)
-_PLAIN = frozenset[str]()
 
 
 class Summary(NamedTuple):
@@ -69,20 +67,18 @@ class Cloud:
     def __init__(self, backend: Backend, capacity: int, sensors: int, precision: np.dtype) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.shown, self.next = capacity, 0, 0
-        self.block = max(math.ceil(math.sqrt(capacity)), 16)
-        most = -(-capacity // 16)
+        self.block = block_of(capacity)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(2)]
         self.weight, self.before = make(capacity, _DOUBLE), make(capacity, _DOUBLE)
         self.log_p = [make(capacity, precision) for _ in range(sensors)]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
-        self.largest = backend.empty(most, _DOUBLE)
-        self.sums = backend.empty(max(WEIGHT_SUMS, ESTIMATE_SUMS) * most, _DOUBLE)
-        self.totals, self.estimated = backend.empty(WEIGHT_SUMS, _DOUBLE), backend.empty(ESTIMATE, _DOUBLE)
+        self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
         self.settings, self.state = backend.empty(SETTINGS, _DOUBLE), backend.upload(np.zeros(STATE))
         self.pool = backend.upload(np.zeros(3))
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
+        self._estimates: dict[Hashable, Recording | None] = {}
         self._uploads: list[np.ndarray] = []
 
     @property
@@ -93,7 +89,7 @@ class Cloud:
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
         self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = max(math.ceil(math.sqrt(self.count)), 16)
+        self.block = block_of(self.count)
         w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
         self.backend.synchronize()
         self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
@@ -122,32 +118,42 @@ class Cloud:
     def motion(self, kind: int) -> Program:
         """Return the launch that moves the particles of the next step."""
         buffer = self.poses[self.next]
-        return (
-            launch("move_particles", _PLAIN, (self.count,), source=buffer, settings=self.settings, target=buffer,
-                   particles=self.count, kind=kind),
+        return self.sums.launch("move_particles", self.count, source=buffer, settings=self.settings, target=buffer,
+                                particles=self.count, kind=kind)  # fmt: skip
+
+    def sizes(self) -> dict[str, int]:
+        """Return numbers of particles by the names of arguments."""
+        return dict(particles=self.count, block=self.block)
+
+    def numbers(self) -> dict[str, Any]:
+        """Return what weights are made of, by the names of arguments."""
+        return dict(score=self.score, before=self.before, settings=self.settings, state=self.state, blocks=self.blocks,
+                    **self.sizes())  # fmt: skip
+
+    def scoring(self, sensors: int) -> Program:
+        """Return the launches that add up the log-likelihoods of sensors."""
+        flags = flags_if(FLOAT64=self.precision == np.float64)
+        return tuple(
+            launch("add_scores", flags, (self.blocks,), log_p=log_p, settings=self.settings, score=self.score,
+                   largest=self.sums.largest, sensor=sensor, **self.sizes())
+            for sensor, log_p in enumerate(self.log_p[:sensors])
         )  # fmt: skip
+
+    def drawing(self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int) -> Program:
+        """Return the launch that draws from poses with cumulative weights, given with their number."""
+        poses, ends, count = source
+        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends,
+                                settings=self.settings, state=self.state, pool=self.pool, target=target,
+                                after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
 
     def weighing(self, source: int, stage: int, stages: int, drawn: int) -> Program:
         """Return the launches of a stage after its scores: weights, and the draw into the other buffer."""
-        n, blocks = self.count, self.blocks
-        sizes = dict(particles=n, block=self.block)
-        scores = tuple(
-            launch("add_scores", flags_if(FLOAT64=self.precision == np.float64), (blocks,), log_p=log_p,
-                   settings=self.settings, score=self.score, largest=self.largest, sensor=sensor, **sizes)
-            for sensor, log_p in enumerate(self.log_p[: self._sensors])
-        )  # fmt: skip
-        shared = dict(largest=self.largest, sums=self.sums, settings=self.settings, state=self.state, stage=stage)
-        return (
-            *scores,
-            launch("weigh_particles", _PLAIN, (blocks,), score=self.score, before=self.before, blocks=blocks, **sizes,
-                   **shared),
-            launch("sum_weights", _PLAIN, (WEIGHT_SUMS,), totals=self.totals, blocks=blocks, **shared),
-            launch("set_weights", _PLAIN, (blocks,), score=self.score, before=self.before, totals=self.totals,
-                   weight=self.weight, ends=self.ends, blocks=blocks, stages=stages, **sizes, **shared),
-            launch("draw_particles", _PLAIN, (drawn,), source=self.poses[source], weight=self.weight, ends=self.ends,
-                   settings=self.settings, state=self.state, pool=self.pool, target=self.poses[1 - source],
-                   after=self.before, particles=n, drawn=drawn, stage=stage),
-        )  # fmt: skip
+        find, *scored = self.sums.highest(self.blocks)
+        found, numbers = (scored[0], scored[1]), self.numbers()
+        weights = self.sums.weigh(numbers, found, stage)
+        weights += self.sums.set_weights(numbers, found, (stage, stages), (self.weight, self.ends))
+        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage)
+        return self.scoring(self._sensors) + find + weights + draw
 
     # ---- steps
 
@@ -232,7 +238,7 @@ class Cloud:
     def resized(self, drawn: int) -> None:
         """Set the number of particles, after a step that has drawn that number."""
         self.count = drawn
-        self.block = max(math.ceil(math.sqrt(drawn)), 16)
+        self.block = block_of(drawn)
 
     # ---- what crosses to the host
 
@@ -251,16 +257,16 @@ class Cloud:
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernel's estimate of the shown particles: mean, covariance, sum of weights, best particle."""
-        blocks, poses = -(-count // self.block), self.poses[self.shown]
-        program: Program = ()
-        for again in (0, 1):
-            program += (
-                launch("sum_poses", _PLAIN, (blocks,), poses=poses, weight=self.weight, estimate=self.estimated,
-                       sums=self.sums, particles=count, block=self.block, again=again),
-                launch("finish_estimate", _PLAIN, (1,), poses=poses, sums=self.sums, estimate=self.estimated,
-                       blocks=blocks, again=again),
-            )  # fmt: skip
-        self.backend.run(program)
+        poses = self.poses[self.shown]
+        key = self.shown, count, self.block
+        if recording := self._estimates.get(key):
+            recording()
+        else:
+            program = self.sums.estimate(poses, self.weight, self.estimated, count, self.block)
+            self.backend.run(program)
+            # Clouds that change their size seldom ask twice for the same.
+            kept = self.backend.record(program) if key in self._estimates else None
+            self._estimates = dict([*self._estimates.items()][-7:]) | {key: kept}
         return self._read(self.estimated, ESTIMATE)
 
     def host_poses(self, index: int, count: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from gpusense.interface.constants import (
     FARTHEST_THETA,
     FARTHEST_X,
     FAST_RATE,
+    FIRST,
     JITTER,
     MEAN,
     MOST_INJECTED,
@@ -44,7 +45,7 @@ from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import Verdict
 from gpusense.world.grid import OccupancyGrid
 
-_MOST_SENSORS = SETTINGS - TEMPERATURE
+_MOST_SENSORS = FIRST - TEMPERATURE
 _STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
 _MOST = 1 << 24
 

@@ -6,6 +6,7 @@ places them.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Hashable
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
@@ -144,6 +146,7 @@ class PlacedPoses(NamedTuple):
         flags: Flags of the kernels that place them.
         source: The poses of the request; None where the host has placed them.
         status: The non-finite flag.
+        lanes: Particles that the device computes at once.
     """
 
     count: int  # type: ignore[assignment]  # hides tuple.count
@@ -155,6 +158,7 @@ class PlacedPoses(NamedTuple):
     flags: frozenset[str] = _PLAIN
     source: Buffer = None
     status: Buffer = None
+    lanes: int = 1
 
     @property
     def headings(self) -> frozenset[str]:
@@ -177,7 +181,9 @@ class PlacedPoses(NamedTuple):
         """Return the launch that places them; none where the host has placed them."""
         if self.source is None:
             return ()
-        return (launch("place_poses", self.flags, (self.count,), **self.arguments()),)
+        return (
+            launch("place_poses", widened(self.lanes, "place_poses", self.flags), (self.count,), **self.arguments()),
+        )
 
 
 def place(
@@ -200,9 +206,14 @@ def place(
     return PlacedPoses(
         count, corners, frame, space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real),
         space.empty("pose_low", 4 * count if careful else 4, real),
-        poses.flags | flags_if(FLOAT64=real == np.float64, CAREFUL=careful),
-        source, pose_status(space),
+        poses.flags | _precision_flags(real == _DOUBLE, careful),
+        source, pose_status(space), backend.info.lanes,
     )  # fmt: skip
+
+
+@functools.cache
+def _precision_flags(double: bool, careful: bool) -> frozenset[str]:
+    return flags_if(FLOAT64=double, CAREFUL=careful)
 
 
 def pose_status(space: Workspace) -> Buffer:

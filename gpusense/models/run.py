@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,8 +43,7 @@ def _rounded(chunk: int) -> int:
     return chunk - chunk % _ROUND if chunk > _ROUND else chunk
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(NamedTuple):
     """Particles scored by one program, among the S N particles of S scans in sequence.
 
     Attributes:
@@ -63,7 +62,7 @@ class Piece:
         return self.begin, self.end
 
     @property
-    def count(self) -> int:
+    def count(self) -> int:  # type: ignore[override]  # hides tuple.count
         """Number of particles."""
         return self.end - self.begin
 

@@ -1,14 +1,15 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to a reference pose, block by block in the order of the particles: the first particle for the mean
-(PASS 0), and the mean for the covariance (PASS 1). Mardia and Jupp, *Directional Statistics* (2000), section 2.2.
+Sums are relative to a reference pose: the first particle for the mean, and the mean for the covariance (again). Mardia
+and Jupp, *Directional Statistics* (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the
+lanes are summed in the order of their particles, and then added one after the other.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import ESTIMATE_SUMS
+from gpusense.interface.constants import ESTIMATE_LANES, ESTIMATE_SUMS
 from gpusense.reference.elementary import angle_of
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.motion import wrap_once
@@ -37,19 +38,28 @@ def sum_poses(
         end = min(begin + block, particles)
         row = sums[b * ESTIMATE_SUMS : (b + 1) * ESTIMATE_SUMS]
         for k, column in enumerate(columns):
+            lanes = np.zeros((-(-(end - begin) // ESTIMATE_LANES), ESTIMATE_LANES))
+            lanes.reshape(-1)[: end - begin] = column[begin:end]
             # One after the other, as on devices.
-            row[k] = np.cumsum(column[begin:end])[-1]
+            row[k] = np.cumsum(np.cumsum(lanes, axis=0)[-1])[-1]
         best = begin + int(np.argmax(w[begin:end]))
         row[11], row[12] = w[best], best
 
 
+def join_poses(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, fan: int) -> None:
+    """Add up each ``fan`` rows of sums, one after the other, and find the heaviest particle."""
+    table = sums[: rows * ESTIMATE_SUMS].reshape(rows, ESTIMATE_SUMS)
+    for group, begin in enumerate(range(0, rows, fan)):
+        part, row = table[begin : begin + fan], joined[group * ESTIMATE_SUMS : (group + 1) * ESTIMATE_SUMS]
+        row[:11] = np.cumsum(part[:, :11], axis=0)[-1]
+        row[11:] = part[int(np.argmax(part[:, 11])), 11:]
+
+
 def finish_estimate(
-    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, blocks: int, again: int
+    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, again: int
 ) -> None:
-    """Add up the blocks; write the mean pose, or the covariance about it."""
-    table = sums[: blocks * ESTIMATE_SUMS].reshape(blocks, ESTIMATE_SUMS)
-    total = np.cumsum(table[:, :11], axis=0)[-1]
-    best = int(table[int(np.argmax(table[:, 11])), 12])
+    """Write the mean pose, or the covariance about it, from the sums of all particles."""
+    total, best = sums[:11], int(sums[12])
     weight = total[0] if total[0] > 0.0 else 1.0
     x, y = total[1] / weight, total[2] / weight
     if not again:

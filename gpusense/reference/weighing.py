@@ -4,8 +4,6 @@ w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over senso
 = b / 2^k a ladder. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of that before
 is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed importance
 sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
-
-Recovery: augmented MCL, *Probabilistic Robotics* table 8.3, with the mean likelihood per beam.
 """
 
 from __future__ import annotations
@@ -13,29 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import (
-    DEGENERATE,
-    EVIDENCE,
-    FAST,
-    FAST_RATE,
-    INJECTED,
-    LEFT,
-    MOST_INJECTED,
-    PER_BEAM_SCALE,
-    RESAMPLED,
-    RUNG,
     RUNGS,
-    SAMPLE_SIZE,
     SCALE,
     SHARE,
-    SLOW,
-    SLOW_RATE,
-    STAGE,
     TEMPERATURE,
-    THRESHOLD,
-    TOTAL,
     WEIGHT_SUMS,
 )
-from gpusense.reference.elementary import exp_of, log_of
+from gpusense.reference.rungs import largest_of, left_of, rung_of, set_stage, tempered
 
 
 def add_scores(
@@ -55,21 +37,10 @@ def add_scores(
     largest[: len(starts)] = np.maximum.reduceat(score[:particles], starts)
 
 
-def largest_of(largest: np.ndarray, blocks: int) -> float:
-    """Return the largest score of all blocks."""
-    return float(largest[:blocks].max())
-
-
-def tempered(score: np.ndarray, largest: float, left: float) -> np.ndarray:
-    """Return the likelihoods of scores relative to the largest; 1 for all where none is possible or nothing is left."""
-    if largest == -np.inf or left == 0.0:
-        return np.ones_like(score)
-    return exp_of(left * (score - largest))
-
-
-def left_of(state: np.ndarray, stage: int) -> float:
-    """Return the part of the temperature that earlier stages have left."""
-    return float(state[(stage - 1) * STAGE + LEFT]) if stage > 0 else 1.0
+def join_scores(flags: frozenset[str], scores: np.ndarray, largest: np.ndarray, blocks: int, fan: int) -> None:
+    """Find the largest score of each ``fan`` blocks."""
+    starts = np.arange(0, blocks, fan)
+    largest[: len(starts)] = np.maximum.reduceat(scores[:blocks], starts)
 
 
 def weigh_particles(
@@ -83,11 +54,12 @@ def weigh_particles(
     particles: int,
     block: int,
     blocks: int,
+    groups: int,
     stage: int,
 ) -> None:
     """Sum the integer weights of each block on each rung, their squares, and the weights before."""
     scale, old = settings[SCALE], before[:particles]
-    likelihood = tempered(score[:particles], largest_of(largest, blocks), left_of(state, stage))
+    likelihood = tempered(score[:particles], largest_of(largest, groups), left_of(state, stage))
     table, starts = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS), np.arange(0, particles, block)
     table[:, 2 * RUNGS] = np.add.reduceat(np.floor(old * scale), starts)
     for rung in range(RUNGS):
@@ -97,42 +69,11 @@ def weigh_particles(
         likelihood = np.sqrt(likelihood)
 
 
-def follow_evidence(total: float, before: float, largest: float, settings: np.ndarray, state: np.ndarray) -> None:
-    """Update the averages of the likelihood per beam, and the share of particles to inject."""
-    if largest == -np.inf or not total > 0.0 or not before > 0.0:
-        return
-    evidence = largest + float(log_of(np.array(total / before)))
-    mean = float(exp_of(np.array(min(settings[PER_BEAM_SCALE] * evidence, 700.0))))
-    first = state[SLOW] == 0.0
-    state[EVIDENCE] = evidence
-    state[SLOW] = mean if first else state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW])
-    state[FAST] = mean if first else state[FAST] + settings[FAST_RATE] * (mean - state[FAST])
-    share = 1.0 - state[FAST] / state[SLOW] if state[SLOW] > 0.0 else 0.0
-    state[INJECTED] = min(max(share, 0.0), settings[MOST_INJECTED])
-
-
-def sum_weights(
-    flags: frozenset[str],
-    sums: np.ndarray,
-    largest: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    totals: np.ndarray,
-    blocks: int,
-    stage: int,
-) -> None:
-    """Add up the sums of all blocks; at stage 0, follow the evidence."""
-    totals[:WEIGHT_SUMS] = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS).sum(axis=0)
-    if stage == 0:
-        follow_evidence(totals[0], totals[2 * RUNGS], largest_of(largest, blocks), settings, state)
-
-
-def rung_of(totals: np.ndarray, settings: np.ndarray, least: float) -> int:
-    """Return the first rung with the effective sample size ``least``, or the last rung."""
-    for rung in range(RUNGS - 1):
-        if totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]:
-            return rung
-    return RUNGS - 1
+def join_weights(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, fan: int) -> None:
+    """Add up each ``fan`` rows of sums."""
+    starts = np.arange(0, rows, fan)
+    table = np.add.reduceat(sums[: rows * WEIGHT_SUMS].reshape(rows, WEIGHT_SUMS), starts)
+    joined[: table.size] = table.reshape(-1)
 
 
 def set_weights(
@@ -141,6 +82,7 @@ def set_weights(
     before: np.ndarray,
     largest: np.ndarray,
     sums: np.ndarray,
+    joined: np.ndarray,
     totals: np.ndarray,
     settings: np.ndarray,
     state: np.ndarray,
@@ -149,23 +91,17 @@ def set_weights(
     particles: int,
     block: int,
     blocks: int,
+    fan: int,
+    groups: int,
     stage: int,
     stages: int,
 ) -> None:
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
-    scale, left, high = settings[SCALE], left_of(state, stage), largest_of(largest, blocks)
+    scale, left, high = settings[SCALE], left_of(state, stage), largest_of(largest, groups)
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0
     likelihood = tempered(score[:particles], high, left)
     for _ in range(rung):
         likelihood = np.sqrt(likelihood)
     weight[:particles] = before[:particles] * likelihood
     ends[:particles] = np.cumsum(np.floor(weight[:particles] * scale))
-    size = totals[rung] * totals[rung] / (scale * totals[RUNGS + rung])
-    rest = left - left * 0.5**rung
-    state[stage * STAGE + LEFT] = rest if stage + 1 < stages else 0.0
-    state[stage * STAGE + TOTAL] = totals[rung]
-    state[stage * STAGE + SAMPLE_SIZE] = size
-    wanted = size < settings[THRESHOLD] * particles or rest > 0.0 or (stage == 0 and state[INJECTED] > 0.0)
-    state[stage * STAGE + RESAMPLED] = 1.0 if wanted else 0.0
-    state[stage * STAGE + DEGENERATE] = 1.0 if high == -np.inf else 0.0
-    state[stage * STAGE + RUNG] = left * 0.5**rung
+    set_stage(totals, settings, state, high, left, rung, particles, stage, stages)

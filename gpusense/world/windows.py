@@ -111,7 +111,8 @@ def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, f
     size, margin = grid.resolution, math.hypot(mount[0], mount[1]) / grid.resolution
     cos, sin = math.cos(yaw), math.sin(yaw)
     cols, rows = [], []
-    for corner in corners:
+    # Two opposite corners bound a box that is not turned.
+    for corner in corners if yaw != 0.0 else corners[::3]:
         x, y = corner[0] - from_x, corner[1] - from_y
         if yaw != 0.0:
             x, y = cos * x + sin * y, cos * y - sin * x

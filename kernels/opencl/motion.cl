@@ -10,6 +10,7 @@
 #define MEAN 3
 #define DEVIATION 7
 #define REVERSE 11
+#define FIRST 61
 #define MOTION_STREAM 0
 #define VELOCITY_MODEL 1
 #define SMALL_ARC 1e-4
@@ -32,7 +33,8 @@ kernel void move_particles(global const double *source, global const double *set
     const int n = get_global_id(0);
     if (n >= particles) return;
     const uint step = (uint)settings[STEP], key_0 = (uint)settings[SEED], key_1 = (uint)settings[SEED + 1];
-    const uint4 words = random_words((uint4)((uint)n, step, MOTION_STREAM, 0), key_0, key_1);
+    const uint index = (uint)settings[FIRST] + (uint)n;
+    const uint4 words = random_words((uint4)(index, step, MOTION_STREAM, 0), key_0, key_1);
     const double2 one = normal_pair(words.x, words.y), two = normal_pair(words.z, words.w);
     const double first = settings[MEAN] + settings[DEVIATION] * one.x;
     double ahead = settings[MEAN + 1] + settings[DEVIATION + 1] * one.y;
@@ -43,7 +45,7 @@ kernel void move_particles(global const double *source, global const double *set
         second = first + second;
     }
     if (settings[REVERSE] > 0.0) {
-        const uint4 more = random_words((uint4)((uint)n, step, MOTION_STREAM + 1, 0), key_0, key_1);
+        const uint4 more = random_words((uint4)(index, step, MOTION_STREAM + 1, 0), key_0, key_1);
         ahead = uniform_of(more.x) < settings[REVERSE] ? -ahead : ahead;
     }
     const long place = 3 * (long)n;

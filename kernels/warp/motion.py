@@ -14,7 +14,7 @@ import warp as wp
 from . import heading, philox
 from .prelude import kernel
 
-SEED, STEP, MEAN, DEVIATION, REVERSE = (wp.constant(place) for place in (0, 2, 3, 7, 11))
+SEED, STEP, MEAN, DEVIATION, REVERSE, FIRST = (wp.constant(place) for place in (0, 2, 3, 7, 11, 61))
 MOTION_STREAM, REVERSE_STREAM = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 VELOCITY_MODEL = wp.constant(1)
 SMALL_ARC, SIX = wp.constant(wp.float64(1e-4)), wp.constant(wp.float64(6.0))
@@ -69,7 +69,8 @@ def make(name, flags):
         step = wp.uint32(settings[STEP])
         key_0 = wp.uint32(settings[SEED])
         key_1 = wp.uint32(settings[SEED + 1])
-        words = random_words(wp.uint32(n), step, MOTION_STREAM, key_0, key_1)
+        index = wp.uint32(settings[FIRST]) + wp.uint32(n)
+        words = random_words(index, step, MOTION_STREAM, key_0, key_1)
         one = normal_pair(words[0], words[1])
         two = normal_pair(words[2], words[3])
         first = settings[MEAN] + settings[DEVIATION] * one.x
@@ -80,7 +81,7 @@ def make(name, flags):
             ahead = chord_of(ahead, first)
             second = first + second
         if settings[REVERSE] > ZERO:
-            more = random_words(wp.uint32(n), step, REVERSE_STREAM, key_0, key_1)
+            more = random_words(index, step, REVERSE_STREAM, key_0, key_1)
             if uniform_of(more[0]) < settings[REVERSE]:
                 ahead = -ahead
         x = source[3 * n]

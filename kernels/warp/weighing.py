@@ -4,8 +4,6 @@ w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over senso
 = b / 2^k a ladder. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of that before
 is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed importance
 sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
-
-Recovery: augmented MCL, *Probabilistic Robotics* table 8.3, with the mean likelihood per beam.
 """
 
 import functools
@@ -13,20 +11,13 @@ import math
 
 import warp as wp
 
-from .elementary import exp_of, log_of
 from .prelude import kernel, precision
+from .rungs import RUNGS, SCALE, SHARE, WEIGHT_SUMS, largest_of, left_of, rung_of, set_stage, tempered
 
-SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE = (wp.constant(place) for place in (19, 20, 21, 22))
-SLOW_RATE, FAST_RATE, MOST_INJECTED, TEMPERATURE = (wp.constant(place) for place in (23, 24, 25, 27))
-RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
-# Places in the state: of a stage, and of what lasts.
-LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
-STAGE = wp.constant(8)
-EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 51))
+TEMPERATURE = wp.constant(27)
 NEVER = wp.constant(wp.float64(-math.inf))
-ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
-LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
-rungs = wp.types.vector(length=8, dtype=wp.float64)
+ZERO = wp.constant(wp.float64(0.0))
+eight = wp.types.vector(length=8, dtype=wp.float64)
 
 
 @functools.cache
@@ -60,29 +51,22 @@ def make(name, flags):
             high = wp.max(high, value)
         largest[b] = high
 
-    # Return the largest score of all blocks.
-    @wp.func
-    def largest_of(largest: wp.array(dtype=wp.float64), blocks: wp.int32):
-        high = largest[0]
-        for b in range(1, blocks):
-            high = wp.max(high, largest[b])
-        return high
-
-    # Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
-    @wp.func
-    def tempered(score: wp.float64, largest: wp.float64, left: wp.float64):
-        value = ONE
-        if not wp.isinf(largest) and left > ZERO:
-            value = exp_of(left * (score - largest))
-        return value
-
-    # Return the part of the temperature that earlier stages have left.
-    @wp.func
-    def left_of(state: wp.array(dtype=wp.float64), stage: wp.int32):
-        left = ONE
-        if stage > 0:
-            left = state[(stage - 1) * STAGE + LEFT]
-        return left
+    # Find the largest score of each fan blocks: one work-item takes a group of blocks.
+    @kernel
+    def join_scores(
+        scores: wp.array(dtype=wp.float64),
+        largest: wp.array(dtype=wp.float64),
+        blocks: wp.int32,
+        fan: wp.int32,
+    ):
+        g = wp.tid()
+        begin = g * fan
+        if begin >= blocks:
+            return
+        high = scores[begin]
+        for b in range(begin + 1, wp.min(begin + fan, blocks)):
+            high = wp.max(high, scores[b])
+        largest[g] = high
 
     # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a
     # block.
@@ -97,17 +81,18 @@ def make(name, flags):
         particles: wp.int32,
         block: wp.int32,
         blocks: wp.int32,
+        groups: wp.int32,
         stage: wp.int32,
     ):
         b = wp.tid()
         begin = b * block
         if begin >= particles:
             return
-        high = largest_of(largest, blocks)
+        high = largest_of(largest, groups)
         left = left_of(state, stage)
         scale = settings[SCALE]
-        weights = rungs()
-        squares = rungs()
+        weights = eight()
+        squares = eight()
         old = ZERO + ZERO
         for n in range(begin, wp.min(begin + block, particles)):
             likelihood = tempered(score[n], high, left)
@@ -123,61 +108,22 @@ def make(name, flags):
             sums[b * WEIGHT_SUMS + RUNGS + k] = squares[k]
         sums[b * WEIGHT_SUMS + 2 * RUNGS] = old
 
-    # Update the averages of the likelihood per beam, and the share of particles to inject.
-    @wp.func
-    def follow_evidence(
-        total: wp.float64,
-        before: wp.float64,
-        largest: wp.float64,
-        settings: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-    ):
-        if not wp.isinf(largest) and total > ZERO and before > ZERO:
-            evidence = largest + log_of(total / before)
-            mean = exp_of(wp.min(settings[PER_BEAM_SCALE] * evidence, LARGEST_EXPONENT))
-            slow = mean
-            fast = mean
-            if state[SLOW] != ZERO:
-                slow = state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW])
-                fast = state[FAST] + settings[FAST_RATE] * (mean - state[FAST])
-            share = ZERO
-            if slow > ZERO:
-                share = ONE - fast / slow
-            state[EVIDENCE] = evidence
-            state[SLOW] = slow
-            state[FAST] = fast
-            state[INJECTED] = wp.min(wp.max(share, ZERO), settings[MOST_INJECTED])
-
-    # Add up the sums of all blocks: one work-item takes a column. At stage 0 the first follows the evidence.
+    # Add up each fan rows of sums: one work-item takes a column of a group of rows.
     @kernel
-    def sum_weights(
+    def join_weights(
         sums: wp.array(dtype=wp.float64),
-        largest: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        totals: wp.array(dtype=wp.float64),
-        blocks: wp.int32,
-        stage: wp.int32,
+        joined: wp.array(dtype=wp.float64),
+        rows: wp.int32,
+        fan: wp.int32,
     ):
-        column = wp.tid()
-        if column >= WEIGHT_SUMS:
+        i = wp.tid()
+        begin = i / WEIGHT_SUMS * fan
+        if begin >= rows:
             return
         total = ZERO + ZERO
-        before = ZERO + ZERO
-        for b in range(blocks):
-            total += sums[b * WEIGHT_SUMS + column]
-            before += sums[b * WEIGHT_SUMS + 2 * RUNGS]
-        totals[column] = total
-        if stage == 0 and column == 0:
-            follow_evidence(total, before, largest_of(largest, blocks), settings, state)
-
-    # Return the first rung with the effective sample size least, or the last rung.
-    @wp.func
-    def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), least: wp.float64):
-        rung = int(0)
-        while rung < RUNGS - 1 and not (totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]):
-            rung += 1
-        return rung
+        for row in range(begin, wp.min(begin + fan, rows)):
+            total += sums[row * WEIGHT_SUMS + i % WEIGHT_SUMS]
+        joined[i] = total
 
     # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
     # writes the stage's state.
@@ -187,6 +133,7 @@ def make(name, flags):
         before: wp.array(dtype=wp.float64),
         largest: wp.array(dtype=wp.float64),
         sums: wp.array(dtype=wp.float64),
+        joined: wp.array(dtype=wp.float64),
         totals: wp.array(dtype=wp.float64),
         settings: wp.array(dtype=wp.float64),
         state: wp.array(dtype=wp.float64),
@@ -195,6 +142,8 @@ def make(name, flags):
         particles: wp.int32,
         block: wp.int32,
         blocks: wp.int32,
+        fan: wp.int32,
+        groups: wp.int32,
         stage: wp.int32,
         stages: wp.int32,
     ):
@@ -204,12 +153,14 @@ def make(name, flags):
             return
         scale = settings[SCALE]
         left = left_of(state, stage)
-        high = largest_of(largest, blocks)
+        high = largest_of(largest, groups)
         rung = int(0)
         if left > ZERO:
             rung = rung_of(totals, settings, settings[SHARE] * wp.float64(particles))
         total = ZERO + ZERO
-        for i in range(b):
+        for g in range(b / fan):
+            total += joined[g * WEIGHT_SUMS + rung]
+        for i in range(b - b % fan, b):
             total += sums[i * WEIGHT_SUMS + rung]
         for n in range(begin, wp.min(begin + block, particles)):
             likelihood = tempered(score[n], high, left)
@@ -220,21 +171,7 @@ def make(name, flags):
             total += wp.floor(chosen * scale)
             ends[n] = total
         if b == 0:
-            size = totals[rung] * totals[rung] / (scale * totals[RUNGS + rung])
-            part = left * ONE
-            for _k in range(rung):
-                part = part * HALF
-            rest = left - part
-            wanted = size < settings[THRESHOLD] * wp.float64(particles) or rest > ZERO
-            if stage == 0 and state[INJECTED] > ZERO:
-                wanted = True
-            first = stage * STAGE
-            state[first + LEFT] = wp.where(stage + 1 < stages, rest, ZERO)
-            state[first + TOTAL] = totals[rung]
-            state[first + SAMPLE_SIZE] = size
-            state[first + RESAMPLED] = wp.where(wanted, ONE, ZERO)
-            state[first + DEGENERATE] = wp.where(wp.isinf(high), ONE, ZERO)
-            state[first + RUNG] = part
+            set_stage(totals, settings, state, high, left, rung, particles, stage, stages)
 
-    kernels = {"add_scores": add_scores, "weigh_particles": weigh_particles}
-    return (kernels | {"sum_weights": sum_weights, "set_weights": set_weights})[name]
+    kernels = {"add_scores": add_scores, "join_scores": join_scores, "weigh_particles": weigh_particles}
+    return (kernels | {"join_weights": join_weights, "set_weights": set_weights})[name]

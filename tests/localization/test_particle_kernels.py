@@ -9,6 +9,7 @@ from scipy import stats
 from gpusense.backends import get_backend
 from gpusense.interface import constants as c
 from gpusense.interface.launches import launch
+from gpusense.localization.sums import Sums
 from gpusense.reference.drawing import draw_particles
 from gpusense.reference.elementary import angle_of, exp_of, log_of
 from gpusense.reference.motion import move_particles
@@ -122,11 +123,10 @@ def test_draws_keep_the_expected_copies(stratified):
     np.testing.assert_allclose(copies / repeats, expected, atol=5 * np.sqrt(expected.max() / repeats))
 
 
-def run_step(selection, count, flags=PLAIN):
+def run_step(selection, count, flags=PLAIN, *, lanes=True):
     """Return all buffers after two motions, a correction of two stages and an estimate."""
     device, rng = get_backend(selection), np.random.default_rng(0)
-    block = int(np.ceil(np.sqrt(count)))
-    blocks = -(-count // block)
+    sums, block = Sums(device, 2 * count + 16), 8
     settings = settings_of_step(
         SEED=[123456789, 4000000000], MEAN=[0.1, 1, 0.02, -0.2], DEVIATION=[0.1, 0.2, 0.05, 0.1], REVERSE=0.1,
         JITTER=0.2, FARTHEST_X=1, FARTHEST_THETA=0.5, POOL=[5, 0.1, 0.1, 3.0], SCALE=2.0**36,
@@ -138,44 +138,43 @@ def run_step(selection, count, flags=PLAIN):
     buffers = dict(
         settings=settings, state=state, a=rng.normal(size=3 * count), b=np.zeros(3 * count), before=np.ones(count),
         first=(rng.normal(size=count) ** 2 * -30).astype(real), second=(rng.normal(size=count) ** 2 * -3).astype(real),
-        score=np.zeros(count), largest=np.zeros(count), sums=np.zeros(c.WEIGHT_SUMS * blocks), weight=np.zeros(count),
-        totals=np.zeros(c.WEIGHT_SUMS), ends=np.zeros(count), pool=rng.normal(size=15), estimate=np.zeros(c.ESTIMATE),
+        score=np.zeros(count), weight=np.zeros(count), ends=np.zeros(count), pool=rng.normal(size=15),
+        estimate=np.zeros(c.ESTIMATE),
     )  # fmt: skip
     buffers["first"][:3] = -np.inf
     on = {name: device.upload(values) for name, values in buffers.items()}
     sizes, step = dict(particles=count, block=block), dict(settings=on["settings"])
-    program = [
-        launch("move_particles", PLAIN, (count,), source=on["a"], target=on["a"], particles=count, kind=kind, **step)
-        for kind in (c.STRAIGHT, c.VELOCITY_MODEL)
-    ]
+    program = []
+    for kind in (c.STRAIGHT, c.VELOCITY_MODEL):
+        program += sums.launch(
+            "move_particles", count, source=on["a"], target=on["a"], particles=count, kind=kind, **step
+        )
     for stage, (source, target) in enumerate((("a", "b"), ("b", "a"))):
         for sensor, name in enumerate(("first", "second")):
-            program.append(launch("add_scores", flags, (blocks,), log_p=on[name], score=on["score"], sensor=sensor,
-                                  largest=on["largest"], **sizes, **step))  # fmt: skip
-        shared = dict(largest=on["largest"], sums=on["sums"], state=on["state"], blocks=blocks, stage=stage, **step)
-        scores = dict(score=on["score"], before=on["before"], **sizes)
-        program += [
-            launch("weigh_particles", PLAIN, (blocks,), **scores, **shared),
-            launch("sum_weights", PLAIN, (c.WEIGHT_SUMS,), totals=on["totals"], **shared),
-            launch("set_weights", PLAIN, (blocks,), totals=on["totals"], weight=on["weight"], ends=on["ends"], stages=2,
-                   **scores, **shared),
-            launch("draw_particles", PLAIN, (count,), source=on[source], target=on[target], weight=on["weight"],
-                   ends=on["ends"], state=on["state"], pool=on["pool"], after=on["before"], particles=count,
-                   drawn=count, stage=stage, **step),
-        ]  # fmt: skip
-    for again in (0, 1):
-        estimate = dict(sums=on["sums"], estimate=on["estimate"], poses=on["a"], again=again)
-        program.append(launch("sum_poses", PLAIN, (blocks,), weight=on["weight"], **sizes, **estimate))
-        program.append(launch("finish_estimate", PLAIN, (1,), blocks=blocks, **estimate))
+            program.append(launch("add_scores", flags, (-(-count // block),), log_p=on[name], score=on["score"],
+                                  sensor=sensor, largest=sums.largest, **sizes, **step))  # fmt: skip
+        numbers = {name: on[name] for name in ("score", "before", "settings", "state")}
+        numbers.update(sizes, blocks=-(-count // block))
+        find, *scored = sums.highest(numbers["blocks"])
+        program += find + sums.weigh(numbers, scored, stage)
+        program += sums.set_weights(numbers, scored, (stage, 2), (on["weight"], on["ends"]))
+        program += sums.launch("draw_particles", count, source=on[source], target=on[target], weight=on["weight"],
+                               ends=on["ends"], state=on["state"], pool=on["pool"], after=on["before"],
+                               particles=count, drawn=count, stage=stage, **step)  # fmt: skip
+    program += sums.estimate(on["a"], on["weight"], on["estimate"], count, block)
+    if not lanes:
+        program = [one._replace(flags=one.flags - {"WIDE"}) for one in program]
     device.run(tuple(program))
     found = {name: device.download(on[name], np.empty_like(values)) for name, values in buffers.items()}
     device.synchronize()
     return found
 
 
+# The largest one has more blocks than a work-item adds up.
 @pytest.mark.parametrize("count", [1, 37, 1500])
 @pytest.mark.parametrize("flags", [PLAIN, frozenset({"FLOAT64"})], ids=["float32", "float64"])
-def test_every_backend_has_the_bits_of_the_reference(backend, count, flags):
-    expected, found = run_step("numpy", count, flags), run_step(backend, count, flags)
+@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+def test_every_backend_has_the_bits_of_the_reference(backend, count, flags, lanes):
+    expected, found = run_step("numpy", count, flags), run_step(backend, count, flags, lanes=lanes)
     for name, values in expected.items():
         assert np.array_equal(values, found[name]), name

@@ -408,3 +408,15 @@ def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
     assert len(report["rows"]) == 6
     assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
+
+
+def test_split_filters_are_measured(tmp_path: Path) -> None:
+    small = ["--device", "numpy", "--device", "numpy", "--size", "200", "15", "--steps", "2", "--stages", "2"]
+    (row,) = run_script("speed/split_filter.py", *small, output=tmp_path / "split")["rows"]
+    assert row["equal"] and row["difference"] == 0 and row["one_ms"] > 0 and row["split_ms"] > 0
+
+
+def test_sweeps_are_measured(tmp_path: Path) -> None:
+    small = ["--workers", "1", "--jobs", "2", "--particles", "20", "--beams", "11", "--scans", "2", "--repeats", "2"]
+    report = run_script("speed/sweeps.py", *small, output=tmp_path / "sweeps")
+    assert report["differing"] == [] and report["rows"][0]["efficiency"] == 1 > report["rows"][0]["busy"] > 0

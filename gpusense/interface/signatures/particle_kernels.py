@@ -6,41 +6,45 @@ from gpusense.interface.signatures.rows import Kernel, kernel
 
 _SETTINGS, _STATE = "double settings [64]", "double state [64]"
 _SCORE, _BEFORE = "double score [particles]", "double before [particles]"
-_LARGEST, _SUMS, _TOTALS = "double largest [blocks]", "double sums [17 * blocks]", "double totals [17]"
+_LARGEST, _SUMS = "double largest [groups]", "double sums [17 * blocks]"
 # Work-items read numbers of others, so launches on a processor must not be cut: no axis is called particle or block.
 KERNELS: dict[str, Kernel] = {
     "move_particles": kernel(
         "motion", "pose", "double source [3 * particles]", _SETTINGS, "out double target [3 * particles]",
-        "int particles", "int kind",
+        "int particles", "int kind", wide=True,
     ),
     "add_scores": kernel(
         "weighing", "group", "real log_p [particles]", _SETTINGS, f"out {_SCORE}", "out double largest [particles]",
         "int particles", "int block", "int sensor", group=16,
     ),
+    "join_scores": kernel(
+        "weighing", "group", "double scores [blocks]", "out double largest [1]", "int blocks", "int fan", group=16,
+    ),
     "weigh_particles": kernel(
         "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SETTINGS, _STATE, f"out {_SUMS}", "int particles",
-        "int block", "int blocks", "int stage", group=16,
+        "int block", "int blocks", "int groups", "int stage", group=16,
     ),
-    "sum_weights": kernel(
-        "weighing", "column", _SUMS, _LARGEST, _SETTINGS, f"out {_STATE}", f"out {_TOTALS}", "int blocks",
-        "int stage", group=1,
+    "join_weights": kernel(
+        "weighing", "column", "double sums [17 * rows]", "out double joined [17]", "int rows", "int fan", group=16,
     ),
     "set_weights": kernel(
-        "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SUMS, _TOTALS, _SETTINGS, f"out {_STATE}",
-        "out double weight [particles]", "out double ends [particles]", "int particles", "int block", "int blocks",
-        "int stage", "int stages", group=16,
+        "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SUMS, "double joined [17]", "double totals [17]", _SETTINGS,
+        f"out {_STATE}", "out double weight [particles]", "out double ends [particles]", "int particles", "int block",
+        "int blocks", "int fan", "int groups", "int stage", "int stages", group=16,
     ),
     "draw_particles": kernel(
         "drawing", "pose", "double source [3 * particles]", "double weight [particles]", "double ends [particles]",
         _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]", "out double after [drawn]",
-        "int particles", "int drawn", "int stage",
+        "int particles", "int drawn", "int stage", wide=True,
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [12]",
         "out double sums [particles]", "int particles", "int block", "int again", group=16,
     ),
+    "join_poses": kernel(
+        "estimate", "column", "double sums [13 * rows]", "out double joined [13]", "int rows", "int fan", group=16,
+    ),
     "finish_estimate": kernel(
-        "estimate", "whole", "double poses [3]", "double sums [13 * blocks]", "out double estimate [12]",
-        "int blocks", "int again", group=1,
+        "estimate", "whole", "double poses [3]", "double sums [13]", "out double estimate [12]", "int again", group=1,
     ),
 }  # fmt: skip

@@ -29,7 +29,7 @@ _SCORE = ("Score score", "ScanBatch batch")
 _FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
 
 KERNELS: dict[str, Kernel] = {
-    "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME),
+    "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME, wide=True),
     "place_inputs": kernel(
         "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
         "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",

@@ -95,12 +95,12 @@ class ClassedScans(NamedTuple):
     @property
     def most_readings(self) -> int:
         """Readings of the scan that has most."""
-        return max(self.counts.tolist())
+        return len(self.readings) if len(self.counts) == 1 else max(self.counts.tolist())
 
     @property
     def most_rays(self) -> int:
         """Rays of the scan that has most."""
-        return max(self.ray_counts.tolist())
+        return len(self.rays) if len(self.counts) == 1 else max(self.ray_counts.tolist())
 
     def part(self, begin: int, end: int) -> ClassedScans:
         """Return scans ``begin`` to ``end`` - 1."""
@@ -157,12 +157,11 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     if rules.max_is_range:
         finite = np.isfinite(ranges)
         hit, far = hit | (far & finite), far & ~finite
-    none = np.zeros(far.shape, bool)
-    used, used_max = rules.choice.among(hit, far if rules.z_max > 0 else none)
+    used, used_max = rules.choice.among(hit, far if rules.z_max > 0 else np.zeros(far.shape, bool))
     if rules.max_is_constant:
         evaluated, constant = used, used_max
     else:
-        evaluated, constant = used | used_max | (not rules.specialize), none
+        evaluated, constant = used | used_max | (not rules.specialize), np.zeros(far.shape, bool)
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
     constants = np.zeros(len(ranges))
     if evaluated.all():
@@ -174,7 +173,7 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     else:
         columns, counts = evaluated.nonzero()[1], np.count_nonzero(evaluated, axis=1)
         values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
-        if constant is not none:
+        if rules.max_is_constant:
             constants += np.count_nonzero(constant, axis=1) * rules.log_max
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,

@@ -29,6 +29,7 @@ from gpusense.world.parameters import LikelihoodFieldParameters
 _GROUP = 64
 # Distance from a cell's edge below which an end point is computed with more digits, in eps times its length + 2 cells.
 _GUARD = 3.25
+_NONE, _SCANS, _INSIDE = flags_if(), flags_if(SCANS=True), flags_if(INSIDE=True)
 
 
 class FieldPipeline(ScanPipeline):
@@ -134,11 +135,11 @@ class FieldPipeline(ScanPipeline):
             begins = np.append(0, np.cumsum(scans.counts))
             start, counts = space.upload_all("scans", [begins.astype(np.int32), blocks.astype(np.int32)])
         return Readings(
-            scans.scans, scans.most_rays, scans.most_readings, flags_if(SCANS=several),
+            scans.scans, scans.most_rays, scans.most_readings, _SCANS if several else _NONE,
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self.terms)),
             float(scans.constants[0]) + self.setting.constant_term,
-            (scans.scans, scans.most_readings, len(scans.readings)), float(longest.max()) + 2,
+            (scans.scans, scans.most_readings, len(scans.readings)), max(longest.ravel().tolist()) + 2,
         )  # fmt: skip
 
     def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:
@@ -171,7 +172,8 @@ class FieldPipeline(ScanPipeline):
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
         """See ScanPipeline.conditions."""
-        return flags_if(INSIDE=tiles is not None and self.quick and all_within(placed, readings.reach, RING))
+        inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
+        return _INSIDE if inside else _NONE
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """See ScanPipeline.flags."""

@@ -60,8 +60,7 @@ class Setting:
     possible: bool
 
 
-@dataclass(frozen=True)
-class Tiles:
+class Tiles(NamedTuple):
     """A launch in tiles of particles and rays.
 
     Attributes:

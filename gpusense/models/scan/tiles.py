@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -104,8 +104,7 @@ def tiles_of(particles: int, rays: int) -> tuple[int, int]:
     return (tiles << spread) * TILE, spread
 
 
-@dataclass(frozen=True)
-class Parts:
+class Parts(NamedTuple):
     """Numbers that a particle's sum adds.
 
     Attributes:
@@ -114,7 +113,7 @@ class Parts:
         buffer: All of them, the numbers of a place ``particles`` apart.
     """
 
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count
     block: int
     buffer: Buffer = None
 

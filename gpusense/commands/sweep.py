@@ -1,0 +1,217 @@
+"""Run ``gpusense sweep``: run the jobs of a plan on processes or a Dask cluster, and write a table."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, whole_number
+from gpusense.commands.output import print_json
+from gpusense.evaluation.machine import machine, machine_line
+
+if TYPE_CHECKING:
+    from gpusense.sweeps.cluster import DaskExecutor
+    from gpusense.sweeps.job import Job
+    from gpusense.sweeps.run import Sweep
+
+NAME = "sweep"
+HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table that survives crashes."
+
+FAILED = 1
+LOCAL = "local"
+
+_EPILOG = """\
+A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
+
+A row is appended to the table as soon as its job ends. A failed job is a row with its error. After a crash or Ctrl-C,
+--resume runs the jobs that have no row yet.
+
+Jobs run in this process; with --processes or several --device in processes, one for each device; with --dask on a Dask
+cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes code
+there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
+
+Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted.
+
+example:
+  gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv --processes 2 --plot sweep.png
+  gpusense sweep plan.yaml --device warp:cuda:0 --device warp:cuda:1
+  gpusense sweep plan.yaml --dask tcp://10.0.0.1:8786 --resume"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add("plan", type=Path, metavar="PLAN", help="the plan, a YAML file")
+    add("--table", type=Path, metavar="FILE",
+        help="the table, .csv or .parquet (default: the plan's name with .csv, in this folder)")  # fmt: skip
+    add("--resume", action="store_true", help="keep the rows of an existing table, and run the other jobs")
+    add("--retry-failed", action="store_true", help="with --resume: run failed jobs again")
+    add("--root", type=Path, metavar="FOLDER", help="folder of maps and logs (default: the plan's)")
+    add("--dask", metavar="ADDRESS", help="a Dask scheduler, such as tcp://10.0.0.1:8786, or 'local' for a new cluster")
+    add("--processes", type=whole_number(low=1), metavar="N",
+        help="processes, or workers of the local cluster (default: one for each --device)")  # fmt: skip
+    add("--device", action="append", metavar="DEVICE", help=f"{BACKEND_HELP}; repeatable: one worker each")
+    add("--no-send", action="store_true", help="with --dask: workers read maps and logs from --root themselves")
+    add("--attempts", type=whole_number(low=1), default=3, metavar="A",
+        help="most starts of a job whose worker ends (default: %(default)s)")  # fmt: skip
+    add("--list", action="store_true", help="print the jobs with their keys, and run none")
+    add_json(parser)
+    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
+        help="draw error against run time, a point a job")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the jobs, and print a summary; after Ctrl-C of those so far."""
+    from gpusense.sweeps.plan import read_plan
+
+    jobs = read_plan(args.plan)
+    if args.list:
+        return _list(jobs, as_json=args.json)
+    if args.retry_failed and not args.resume:
+        raise ValueError("--retry-failed: must come with --resume")
+    args.root = args.plan.parent if args.root is None else args.root
+    args.table = Path(f"{args.plan.stem}.csv") if args.table is None else args.table
+    begin = time.perf_counter()
+    ended = _swept(args, jobs)
+    _report(args, ended, time.perf_counter() - begin)
+    return FAILED if ended.failed else 0
+
+
+def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:
+    if as_json:
+        print_json({"jobs": [{"key": job.key, **_fields(job)} for job in jobs]})
+        return 0
+    for job in jobs:
+        texts = [f"{name}={value}" for name, value in job.labels]
+        print(job.key, job.task, *(texts or (job.log, job.map, job.model)))
+    print(f"\n{len(jobs)} jobs")
+    return 0
+
+
+def _fields(job: Job) -> dict[str, Any]:
+    plain = {name: getattr(job, name) for name in ("task", "map", "log", "model", "seed")}
+    return {**plain, "options": dict(job.options), "labels": dict(job.labels)}
+
+
+def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
+    """Run the jobs on the executor of the options.
+
+    Raises:
+        OSError: the table exists or cannot be written, or the cluster is not reached or ends.
+    """
+    from gpusense.sweeps.run import run as run_jobs
+
+    failures = 0
+    with _executor(args, jobs) as executor, progress(len(jobs)) as step:
+        step("starting")
+
+        def on_row(row: dict[str, str]) -> None:
+            nonlocal failures
+            if row["error"]:
+                failures += 1
+                if failures <= 5:
+                    sys.stderr.write(f"gpusense: job {row['key']} failed: {row['error']}\n")
+            step(f"{row['model']} {Path(row['log']).name}, {failures} failed")
+
+        # The device of workers that have none of their own.
+        backend = args.device[0] if args.device else "auto"
+        try:
+            return run_jobs(
+                jobs, table=args.table, executor=executor, root=args.root, backend=backend, resume=args.resume,
+                retry_failed=args.retry_failed, attempts=args.attempts, on_row=on_row,
+            )  # fmt: skip
+        except ImportError as error:
+            raise ValueError(str(error)) from None
+        except KeyboardInterrupt:
+            sys.stderr.write(f"gpusense: {args.table} has the finished jobs: --resume runs the others\n")
+            raise
+
+
+@contextlib.contextmanager
+def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Executor]:
+    """Make the executor of the options, and end it afterwards.
+
+    Raises:
+        OSError: no cluster at the address.
+        ValueError: options that exclude each other.
+    """
+    from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor
+
+    devices: list[str] = args.device or []
+    count = args.processes or max(len(devices), 1)
+    if args.processes and len(devices) > 1 and len(devices) != count:
+        raise ValueError(f"--processes: must be the number of --device, {len(devices)}, got {count}")
+    names = devices if len(devices) == count else devices[:1] * count or count
+    if args.dask is not None:
+        with _dask(args, names) as cluster:
+            if args.dask != LOCAL and not args.no_send:
+                from gpusense.sweeps.sending import contents_of
+
+                cluster.send(contents_of(jobs, args.root))
+            yield cluster
+    elif args.processes is None and len(devices) < 2:
+        yield SerialExecutor()
+    else:
+        processes = ProcessExecutor(names)
+        try:
+            yield processes
+        except BaseException:
+            processes.terminate()
+            raise
+        finally:
+            processes.shutdown()
+
+
+@contextlib.contextmanager
+def _dask(args: argparse.Namespace, names: list[str] | int) -> Iterator[DaskExecutor]:
+    from gpusense.sweeps.cluster import DaskExecutor
+
+    local = args.dask == LOCAL
+    try:
+        cluster = DaskExecutor(None if local else args.dask, devices=names)
+    except ImportError as error:
+        raise ValueError(str(error)) from None
+    with cluster:
+        shown = f", dashboard {cluster.dashboard}" if cluster.dashboard else ""
+        sys.stderr.write(f"gpusense: Dask at {cluster.address}, {cluster.slots} slots{shown}\n")
+        yield cluster
+
+
+def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
+    """Draw the picture, and print the summary."""
+    if args.plot is not None and not _drawn(ended.table, args.plot):
+        args.plot = None
+    if args.json:
+        figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
+        print_json({"table": args.table, "plot": args.plot, **figures, "seconds": seconds, "machine": machine()})
+        return
+    print(f"{ended.jobs} jobs: {ended.done} done, {ended.failed} failed, {ended.skipped} were in the table already")
+    if ended.repeated:
+        print(f"{ended.repeated} runs ended with their worker and were started again")
+    print(f"{seconds:.1f} s\n\n{machine_line()}")
+    for path in (args.table, args.plot):
+        if path is not None:
+            print(f"written: {path}")
+
+
+def _drawn(table: str, path: Path) -> bool:
+    """Draw the picture; tell whether there was anything to draw."""
+    from gpusense.plots.drawing import save
+    from gpusense.plots.sweeps import sweep_figure
+    from gpusense.sweeps.table import read_table
+
+    try:
+        figure = sweep_figure(read_table(table))
+    except ValueError as error:
+        sys.stderr.write(f"gpusense: no picture: {error}\n")
+        return False
+    save(figure, path)
+    return True

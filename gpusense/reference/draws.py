@@ -1,0 +1,118 @@
+"""Draws from exact cumulative weights: copies of particles, jitter between two stages, and injected poses.
+
+See drawing.py.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface.constants import (
+    DRAW_STREAM,
+    DRAW_STREAMS,
+    FARTHEST_THETA,
+    FARTHEST_X,
+    FIRST,
+    INJECTED,
+    JITTER,
+    LEFT,
+    POOL,
+    RESAMPLED,
+    SCALE,
+    SEED,
+    STAGE,
+    STEP,
+    TOTAL,
+    WHOLE,
+)
+from gpusense.reference.motion import wrap_once
+from gpusense.reference.philox import random_words, uniform_of
+
+LEAST_WEIGHT = 1e-6
+
+
+def found_at(ends: np.ndarray, mark: np.ndarray, particles: int) -> np.ndarray:
+    """Return the first index whose cumulative weight exceeds each mark."""
+    return np.minimum(np.searchsorted(ends[:particles], mark, side="right"), particles - 1)
+
+
+def mark_of(fraction: np.ndarray, total: float) -> np.ndarray:
+    """Return the mark at a fraction of the total, below the total."""
+    return np.minimum(np.floor(fraction * total), total - 1.0)
+
+
+def is_copied(own: np.ndarray, particles: int, drawn: int) -> bool:
+    """Return whether particles are copied, because no resampling is due."""
+    return bool((own[RESAMPLED] == 0.0 and drawn == particles) or not own[TOTAL] > 0.0)
+
+
+def copy_particle(
+    source: np.ndarray,
+    weight: np.ndarray,
+    settings: np.ndarray,
+    own: np.ndarray,
+    target: np.ndarray,
+    after: np.ndarray,
+    particles: int,
+    n: np.ndarray,
+) -> None:
+    """Copy particles with their weights, relative to the mean weight."""
+    total, old = own[TOTAL], weight[n % particles]
+    target.reshape(-1, 3)[n] = source.reshape(-1, 3)[n % particles]
+    mean = total / (settings[SCALE] * (settings[WHOLE] if settings[WHOLE] > 0.0 else particles))
+    after[n] = np.where(old > 0.0, np.maximum(old / mean, LEAST_WEIGHT), 0.0) if total > 0.0 else 1.0
+
+
+def words_of(settings: np.ndarray, stage: int, index: np.ndarray, stream: int) -> tuple[np.ndarray, ...]:
+    """Return the random words of draws in one of the streams of their stage."""
+    zero = np.zeros(np.shape(index), np.uint64)
+    counter = (
+        index,
+        zero + np.uint64(settings[STEP]),
+        zero + np.uint64(DRAW_STREAM + DRAW_STREAMS * stage + stream),
+        zero,
+    )
+    return random_words(counter, int(settings[SEED]), int(settings[SEED + 1]))
+
+
+def start_of(settings: np.ndarray, stage: int, index: np.ndarray) -> np.ndarray:
+    """Return the random numbers of the marks of draws; that of index 0 serves all draws of systematic resampling."""
+    return uniform_of(words_of(settings, stage, index, 0)[0])
+
+
+def draw_particle(
+    source: np.ndarray,
+    ends: np.ndarray,
+    settings: np.ndarray,
+    state: np.ndarray,
+    pool: np.ndarray,
+    target: np.ndarray,
+    after: np.ndarray,
+    particles: int,
+    stage: int,
+    n: np.ndarray,
+    chosen: np.ndarray,
+) -> None:
+    """Draw particles from those with indices ``chosen``: move them by jitter where a stage follows, or inject poses."""
+    poses, index = source[: 3 * particles].reshape(-1, 3), n + int(settings[FIRST])
+    pose, total = poses[chosen], state[stage * STAGE + TOTAL]
+    after[n] = 1.0
+    if state[stage * STAGE + LEFT] > 0.0:
+        words = words_of(settings, stage, index, 1)
+        one = poses[found_at(ends, mark_of(uniform_of(words[0]), total), particles)]
+        other = poses[found_at(ends, mark_of(uniform_of(words[1]), total), particles)]
+        d = one - other
+        d[:, 2] = wrap_once(d[:, 2])
+        far = np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])) / settings[FARTHEST_X]
+        far = np.maximum(np.maximum(far, np.abs(d[:, 2]) / settings[FARTHEST_THETA]), 1.0)
+        pose += (settings[JITTER] / far)[:, None] * d
+        pose[:, 2] = wrap_once(pose[:, 2])
+    if stage == 0 and state[INJECTED] > 0.0 and settings[POOL] > 0.0:
+        words, more = words_of(settings, stage, index, 2), words_of(settings, stage, index, 3)
+        injected = uniform_of(words[0]) < state[INJECTED]
+        row = np.minimum(np.floor(uniform_of(words[1]) * settings[POOL]), settings[POOL] - 1.0).astype(np.int64)
+        for axis in range(3):
+            spread = (2.0 * uniform_of(more[axis]) - 1.0) * settings[POOL + 1 + axis]
+            value = pool[3 * row + axis] + spread
+            pose[injected, axis] = (wrap_once(value) if axis == 2 else value)[injected]
+    target.reshape(-1, 3)[n] = pose

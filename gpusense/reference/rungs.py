@@ -1,0 +1,96 @@
+"""The ladder of temperatures of a correction, and the state of its stages: b_k = b / 2^k, where b is what is left.
+
+See weighing.py.
+
+Recovery: augmented MCL, *Probabilistic Robotics* table 8.3, with the mean likelihood per beam.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface.constants import (
+    DEGENERATE,
+    EVIDENCE,
+    FAST,
+    FAST_RATE,
+    INJECTED,
+    LEFT,
+    MOST_INJECTED,
+    PER_BEAM_SCALE,
+    RESAMPLED,
+    RUNG,
+    RUNGS,
+    SAMPLE_SIZE,
+    SCALE,
+    SLOW,
+    SLOW_RATE,
+    STAGE,
+    THRESHOLD,
+    TOTAL,
+)
+from gpusense.reference.elementary import exp_of, log_of
+
+
+def largest_of(largest: np.ndarray, groups: int) -> float:
+    """Return the largest score of all groups."""
+    return float(largest[:groups].max())
+
+
+def tempered(score: np.ndarray, largest: float, left: float) -> np.ndarray:
+    """Return the likelihoods of scores relative to the largest; 1 for all where none is possible or nothing is left."""
+    if largest == -np.inf or left == 0.0:
+        return np.ones_like(score)
+    return exp_of(left * (score - largest))
+
+
+def left_of(state: np.ndarray, stage: int) -> float:
+    """Return the part of the temperature that earlier stages have left."""
+    return float(state[(stage - 1) * STAGE + LEFT]) if stage > 0 else 1.0
+
+
+def rung_of(totals: np.ndarray, settings: np.ndarray, least: float) -> int:
+    """Return the first rung with the effective sample size ``least``, or the last rung."""
+    for rung in range(RUNGS - 1):
+        if totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]:
+            return rung
+    return RUNGS - 1
+
+
+def follow_evidence(total: float, before: float, largest: float, settings: np.ndarray, state: np.ndarray) -> None:
+    """Update the averages of the likelihood per beam, and the share of particles to inject."""
+    if largest == -np.inf or not total > 0.0 or not before > 0.0:
+        return
+    evidence = largest + float(log_of(np.array(total / before)))
+    mean = float(exp_of(np.array(min(settings[PER_BEAM_SCALE] * evidence, 700.0))))
+    first = state[SLOW] == 0.0
+    state[EVIDENCE] = evidence
+    state[SLOW] = mean if first else state[SLOW] + settings[SLOW_RATE] * (mean - state[SLOW])
+    state[FAST] = mean if first else state[FAST] + settings[FAST_RATE] * (mean - state[FAST])
+    share = 1.0 - state[FAST] / state[SLOW] if state[SLOW] > 0.0 else 0.0
+    state[INJECTED] = min(max(share, 0.0), settings[MOST_INJECTED])
+
+
+def set_stage(
+    totals: np.ndarray,
+    settings: np.ndarray,
+    state: np.ndarray,
+    high: float,
+    left: float,
+    rung: int,
+    particles: int,
+    stage: int,
+    stages: int,
+) -> None:
+    """Write the state of a stage that uses a rung; at stage 0, follow the evidence."""
+    if stage == 0:
+        follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
+    size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
+    rest = left - left * 0.5**rung
+    state[stage * STAGE + LEFT] = rest if stage + 1 < stages else 0.0
+    state[stage * STAGE + TOTAL] = totals[rung]
+    state[stage * STAGE + SAMPLE_SIZE] = size
+    wanted = size < settings[THRESHOLD] * particles or rest > 0.0 or (stage == 0 and state[INJECTED] > 0.0)
+    state[stage * STAGE + RESAMPLED] = 1.0 if wanted else 0.0
+    state[stage * STAGE + DEGENERATE] = 1.0 if high == -np.inf else 0.0
+    state[stage * STAGE + RUNG] = left * 0.5**rung

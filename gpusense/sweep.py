@@ -1,0 +1,25 @@
+"""Sweeps: jobs as plain data, run on processes or a Dask cluster, with a table that survives crashes."""
+
+from gpusense.sweeps.cluster import DaskExecutor
+from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor, WorkerDied
+from gpusense.sweeps.job import Job
+from gpusense.sweeps.plan import read_plan
+from gpusense.sweeps.run import Sweep, SweepLost, run
+from gpusense.sweeps.split_filter import SplitParticleFilter
+from gpusense.sweeps.store import Store
+from gpusense.sweeps.table import read_table
+
+__all__ = [
+    "DaskExecutor",
+    "Job",
+    "ProcessExecutor",
+    "SerialExecutor",
+    "SplitParticleFilter",
+    "Store",
+    "Sweep",
+    "SweepLost",
+    "WorkerDied",
+    "read_plan",
+    "read_table",
+    "run",
+]

@@ -1,0 +1,44 @@
+"""Shards that live in a worker's process for filters elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from gpusense.sweeps.parts import finished
+from gpusense.sweeps.shard import Shard
+from gpusense.sweeps.worker import device_of
+
+_HELD: dict[str, Shard] = {}
+
+
+def hold(name: str, make: Callable[[str], Any], device: str, capacity: int) -> str:
+    """Make a shard in this process, and return the name of its device.
+
+    Args:
+        name: Name of the shard.
+        make: Returns the models of a device.
+        device: Selection string, where the worker has no device of its own.
+        capacity: Most particles.
+    """
+    models = models_of(make, device_of(device))
+    _HELD[name] = Shard(models, capacity)
+    return str(models[0].device.selection)
+
+
+def call(name: str, method: str, *arguments: Any) -> Any:
+    """Run a method of a shard of this process to its end, and return its result."""
+    steps = getattr(_HELD[name], method)(*arguments)
+    next(steps)
+    return finished(steps)
+
+
+def release(name: str) -> None:
+    """Forget a shard of this process."""
+    _HELD.pop(name, None)
+
+
+def models_of(make: Callable[[str], Any], device: str) -> list[Any]:
+    """Return the models of a device as a list."""
+    made = make(device)
+    return list(made) if isinstance(made, Sequence) else [made]

@@ -1,0 +1,41 @@
+"""Maps and logs that a sweep sends to workers on other machines, each once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from gpusense._util import checks
+from gpusense.sweeps.job import Job
+
+# A log larger than this is for a shared file system [bytes].
+LARGEST = 1 << 30
+
+
+def contents_of(jobs: Iterable[Job], root: str | Path) -> dict[str, Any]:
+    """Return the maps of jobs, read, and the bytes of their logs, by the paths that the jobs name.
+
+    Args:
+        jobs: The jobs.
+        root: Folder of their files.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a map breaks its format, or a log is a folder or too large.
+    """
+    from gpusense.world.map_files import read_map
+
+    folder, contents = Path(root), dict[str, Any]()
+    for job in jobs:
+        if job.map and job.map not in contents:
+            contents[job.map] = read_map(folder / job.map)
+        if job.log and job.log not in contents:
+            file = folder / job.log
+            if file.is_dir():
+                raise ValueError(f"log: must be a file to be sent, got the folder {file}: share it, and use --no-send")
+            size = checks.existing_file(file).stat().st_size
+            if size > LARGEST:
+                raise ValueError(f"log: must have at most {LARGEST} bytes to be sent, got {size} of {file}")
+            contents[job.log] = file.read_bytes()
+    return contents

@@ -1,0 +1,312 @@
+"""A part of a filter's particles on one device: it moves, scores, weighs and draws them.
+
+Methods are generators that start work on the device before they yield and read its results after, so that one thread
+keeps several devices busy. They take and return plain data, which crosses to other processes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends.recording import Recording
+from gpusense.interface.constants import (
+    DRAWN,
+    ESTIMATE,
+    ESTIMATE_SUMS,
+    FIRST,
+    LEFT,
+    SETTINGS,
+    SHARE,
+    STAGE,
+    TEMPERATURE,
+    WEIGHT_SUMS,
+    WHOLE,
+)
+from gpusense.interface.flags import flags_if
+from gpusense.interface.launches import Program, launch
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.sensors import Sensor
+from gpusense.reference.rungs import rung_of
+from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
+
+# Units in the last place within which the product of two numbers reaches a neighbour of another product.
+_UNITS = 16
+_DOUBLE = np.dtype(np.float64)
+
+
+class Shard:
+    """Particles on one device.
+
+    Args:
+        models: The filter's models on this device.
+        capacity: Most particles of the shard.
+    """
+
+    def __init__(self, models: Sequence[Any], capacity: int) -> None:
+        self._sensors = [Sensor(model) for model in models]
+        self._backend = self._sensors[0].backend
+        self._cloud = Cloud(self._backend, max(capacity, 16), len(self._sensors), self._sensors[0].precision)
+        self._part = Part(0, 0, 0, 16)
+        self._settings = np.zeros(0)
+        # Capacity and buffers of particles that came from other shards.
+        self._gathered: tuple[int, Any, Any] = (0, None, None)
+        # Ones, and numbers of a step whose only temperature is a sum of weights.
+        self._ones: tuple[Any, Any] | None = None
+        self._recordings: dict[Hashable, tuple[Recording, object]] = {}
+
+    @property
+    def _gpu(self) -> bool:
+        return self._backend.info.kind == "gpu"
+
+    # ---- beginnings
+
+    def place(self, part: Part, poses: np.ndarray, state: np.ndarray) -> Step:
+        """Replace the particles."""
+        self._part = part
+        if part.size:
+            self._cloud.place(poses)
+        self._cloud.count, self._cloud.block = part.size, part.block
+        self._backend.upload(state, self._cloud.state)
+        yield
+
+    def set_pool(self, poses: np.ndarray) -> Step:
+        """Take over the poses from which recovery injects particles."""
+        self._cloud.set_pool(poses)
+        yield
+
+    def set_state(self, state: np.ndarray) -> Step:
+        """Take over the state of the filter."""
+        self._backend.upload(state, self._cloud.state)
+        yield
+
+    # ---- a step
+
+    def begin(self, settings: np.ndarray, kind: int | None, sensors: int) -> Step:
+        """Begin a step: the numbers of the whole filter, a move, and the number of sensors that are used."""
+        self._settings = settings.copy()
+        self._upload_settings(self._part)
+        if kind is not None and self._part.size:
+            if sensors:
+                self._cloud.use(sensors)
+                self._backend.run(self._cloud.motion(kind))
+            else:
+                self._cloud.move(kind)
+        yield
+
+    def _upload_settings(self, drawn: Part, **changes: float) -> None:
+        settings = self._settings.copy()
+        settings[FIRST], settings[WHOLE], settings[DRAWN] = drawn.first, self._part.whole, drawn.whole
+        if "share" in changes:
+            settings[SHARE] = changes["share"]
+        self._backend.upload(settings, self._cloud.settings)
+
+    def score(self, source: int, given: Sequence[Given]) -> Step:
+        """Score the poses of a buffer by readings, and return the largest score."""
+        cloud, part = self._cloud, self._part
+        if not part.size:
+            yield
+            return -math.inf
+        if self._gpu and all(self._sensors[index].records(reading) for index, reading in given):
+            for index, reading in given:
+                self._sensors[index].upload(reading)
+            self._recorded(source, given)()
+        else:
+            poses: Any = self._lent_poses(source) if self._gpu else cloud.host_poses(source, part.size)
+            for place, (index, reading) in enumerate(given):
+                if self._gpu:
+                    self._sensors[index].log_likelihood(poses, reading, self._lent_scores(place))
+                else:
+                    self._backend.upload(self._sensors[index].log_likelihood(poses, reading), cloud.log_p[place])
+            self._backend.run(cloud.scoring(len(given)))
+        yield
+        return float(self._read(cloud.sums.largest, cloud.blocks).max())
+
+    def _recorded(self, source: int, given: Sequence[Given]) -> Recording:
+        """Return the recorded program that scores a buffer; its start does not wait, so that devices work together."""
+        sensors = tuple((index, self._sensors[index].version) for index, _ in given)
+        key = (source, self._part.size, self._part.block, sensors)
+        if key not in self._recordings:
+            if len(self._recordings) > 8:
+                self._recordings.clear()
+            program: Program = ()
+            poses, owners = self._lent_poses(source), []
+            for place, (index, _) in enumerate(given):
+                out = self._lent_scores(place)
+                launches, owner = self._sensors[index].program(poses, out)
+                program += launches
+                owners.append((out, owner))
+            program += self._cloud.scoring(len(given))
+            self._recordings[key] = self._backend.record(program), (poses, owners)
+        return self._recordings[key][0]
+
+    def _lent_poses(self, source: int) -> Any:
+        return self._cloud.lent(self._cloud.poses[source], (self._part.size, 3))
+
+    def _lent_scores(self, place: int) -> Any:
+        cloud, shape = self._cloud, (self._part.size,)
+        part = self._backend.part(cloud.log_p[place], 0, self._part.size, cloud.precision)
+        return self._backend.lend(part, shape, cloud.precision)
+
+    def weigh(self, high: float, stage: int) -> Step:
+        """Return the sums of integer weights, given the largest score of the whole filter."""
+        cloud, part = self._cloud, self._part
+        if not part.size:
+            yield
+            return np.zeros(WEIGHT_SUMS)
+        self._backend.upload(np.array([high]), cloud.sums.largest)
+        self._backend.run(cloud.sums.weigh(cloud.numbers(), (cloud.sums.largest, 1), stage))
+        yield
+        return self._read(cloud.sums.totals, WEIGHT_SUMS)
+
+    def set_weights(
+        self, source: int, totals: np.ndarray, state: np.ndarray, place: tuple[int, int], offset: float, marks: Marks
+    ) -> Step:
+        """Set the weights by the sums and the state of the whole filter; return the particles that draws need.
+
+        Args:
+            source: Buffer of the poses.
+            totals: Sums of the whole filter.
+            state: Its state after this stage.
+            place: The stage, and the most stages.
+            offset: Sum of the weights of the shards before.
+            marks: The lowest and the highest mark that each shard draws at; None where nothing is drawn.
+
+        Returns:
+            For each pair of marks, poses and cumulative weights of the particles from the one to the other.
+        """
+        cloud, part, stage = self._cloud, self._part, place[0]
+        cloud.shown, cloud.next = source, 1 - source
+        if part.size:
+            self._choose_rung(totals, float(state[(stage - 1) * STAGE + LEFT]) if stage else 1.0)
+            self._backend.upload(totals, cloud.sums.totals)
+            out = cloud.weight, cloud.ends
+            self._backend.run(cloud.sums.set_weights(cloud.numbers(), (cloud.sums.largest, 1), place, out))
+        yield
+        # The kernel knows the number of particles of the shard only: the state is that of the filter.
+        self._backend.upload(state, cloud.state)
+        if marks is None or not part.size:
+            return [(np.empty((0, 3)), np.empty(0))] * len(marks or ())
+        ends, poses = self._read(cloud.ends, part.size) + offset, cloud.host_poses(source, part.size)
+        begins, finals = (np.searchsorted(ends, side, side="right") for side in np.array(marks).T)
+        return [(poses[a : b + 1], ends[a : b + 1]) for a, b in zip(begins, finals, strict=True)]
+
+    def _choose_rung(self, totals: np.ndarray, left: float) -> None:
+        """Set the share at which the kernel, which counts the shard's particles, takes the rung of the whole filter."""
+        if not left > 0.0:
+            return
+        count, least = float(self._part.size), self._settings[SHARE] * self._part.whole
+        wanted, share = rung_of(totals, self._settings, least), least / count
+        for _ in range(_UNITS):
+            found = rung_of(totals, self._settings, share * count)
+            if found == wanted:
+                break
+            # A unit in the last place off.
+            share = float(np.nextafter(share, math.inf if found < wanted else 0.0))
+        else:
+            raise RuntimeError(f"weights: must have a share for rung {wanted} of {count:g} particles, got none")
+        self._upload_settings(self._part, share=share)
+
+    def shift_ends(self, offset: float) -> Step:
+        """Add the weights of the shards before to the cumulative weights on the device, and wait."""
+        cloud, part = self._cloud, self._part
+        if part.size and offset:
+            if self._ones is None:
+                self._ones = self._backend.upload(np.ones(cloud.capacity)), self._backend.empty(SETTINGS, _DOUBLE)
+            (ones, factor), settings = self._ones, np.zeros(SETTINGS)
+            settings[TEMPERATURE + 1] = offset
+            self._backend.upload(settings, factor)
+            # The kernel adds a multiple of an array to another: these integers are exact.
+            self._backend.run((
+                launch("add_scores", flags_if(FLOAT64=True), (cloud.blocks,), log_p=ones,
+                       settings=factor, score=cloud.ends, largest=cloud.sums.largest, sensor=1,
+                       particles=part.size, block=part.block),
+            ))  # fmt: skip
+        yield
+        self._backend.synchronize()
+
+    def take(self, source: int, shards: Sequence[Shard]) -> Step:
+        """Copy the particles of all shards from device to device."""
+        poses, ends = self._room(self._part.whole)
+        for one in shards:
+            first, count = one._part.first * _DOUBLE.itemsize, one._part.size * _DOUBLE.itemsize
+            self._backend.copy(one._cloud.poses[source], poses, 3 * count, to=3 * first)
+            self._backend.copy(one._cloud.ends, ends, count, to=first)
+        yield
+
+    def reaches(self, other: Shard) -> bool:
+        """Tell whether the device copies from the device of another shard."""
+        return self._gpu and self._backend.copies_from(other._backend)
+
+    def draw(self, source: int, stage: int, drawn: Part, pieces: Sequence[Piece] | bool) -> Step:
+        """Draw the particles of the next stage or step.
+
+        Args:
+            source: Buffer of the poses.
+            stage: The stage.
+            drawn: Particles to draw.
+            pieces: Poses and cumulative weights of shards in their order; True for those that the device has taken, and
+                False to copy the own ones.
+        """
+        cloud, poses, ends, count = self._cloud, self._cloud.poses[source], self._cloud.ends, self._part.size
+        if pieces is True:
+            poses, ends = self._room(self._part.whole)
+            count = self._part.whole
+        elif pieces is not False:
+            gathered, sums = (np.ascontiguousarray(np.concatenate(one)) for one in zip(*pieces, strict=True))
+            poses, ends, count = self._gather(gathered, sums)
+        if drawn.size:
+            self._upload_settings(drawn)
+            self._backend.run(cloud.drawing((poses, ends, count), cloud.poses[1 - source], drawn.size, stage))
+        self._part, cloud.count, cloud.block = drawn, drawn.size, drawn.block
+        yield
+
+    def _gather(self, poses: np.ndarray, ends: np.ndarray) -> tuple[Any, Any, int]:
+        """Return buffers with particles of all shards, and their number."""
+        buffers = self._room(len(ends))
+        for values, buffer in zip((poses, ends), buffers, strict=True):
+            self._backend.upload(values, buffer)
+        return *buffers, len(ends)
+
+    def _room(self, count: int) -> tuple[Any, Any]:
+        """Return buffers for poses and cumulative weights of particles of all shards."""
+        capacity, *buffers = self._gathered
+        if count > capacity:
+            capacity = count if count == self._part.whole else 2 * count
+            buffers = [self._backend.empty(size, _DOUBLE) for size in (3 * capacity, capacity)]
+            self._gathered = (capacity, *buffers)
+        return buffers[0], buffers[1]
+
+    # ---- results
+
+    def poses(self, index: int, count: int) -> Step:
+        """Return poses of a buffer."""
+        yield
+        return self._cloud.host_poses(index, count)
+
+    def weights(self, count: int) -> Step:
+        """Return the weights of the shown particles."""
+        yield
+        return self._cloud.host_weights(count)
+
+    def sum_poses(self, index: int, count: int, block: int, reference: np.ndarray) -> Step:
+        """Return (blocks, 13) sums of weighted poses relative to a reference pose."""
+        cloud, blocks = self._cloud, -(-count // block)
+        if not count:
+            yield
+            return np.empty((0, ESTIMATE_SUMS))
+        estimate = np.zeros(ESTIMATE)
+        estimate[:3] = reference
+        self._backend.upload(estimate, cloud.estimated)
+        self._backend.run(
+            cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[index], weight=cloud.weight,
+                              estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block, again=1),
+        )  # fmt: skip
+        yield
+        return self._read(cloud.sums.rows, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)
+
+    def _read(self, buffer: Any, count: int) -> np.ndarray:
+        return self._backend.download(buffer, np.empty(count))

@@ -1,0 +1,317 @@
+"""The particles of one filter on several devices, as the cloud of a particle filter."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends.base import Backend
+from gpusense.interface.constants import (
+    ESTIMATE,
+    ESTIMATE_SUMS,
+    LEFT,
+    RESAMPLED,
+    SETTINGS,
+    SHARE,
+    STAGE,
+    STATE,
+    TOTAL,
+    WEIGHT_SUMS,
+)
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.sums import fans_of
+from gpusense.reference.draws import mark_of
+from gpusense.reference.estimate import finish_estimate, join_poses
+from gpusense.reference.rungs import rung_of
+from gpusense.reference.weighing import join_weights, set_weights
+from gpusense.sweeps import held
+from gpusense.sweeps.parts import Part, finished, parts_of
+from gpusense.sweeps.shard import Shard
+
+_PLAIN = frozenset[str]()
+_NONE = np.empty(0)
+# Bytes of a pose and a cumulative weight.
+_PARTICLE = 32
+
+
+class Here:
+    """Shards in this process: one thread starts the work of all before it waits for the first.
+
+    Args:
+        models: Models of each shard.
+        capacity: Most particles of a shard.
+
+    Attributes:
+        devices: Selection strings of the devices.
+        direct: Whether particles go from device to device, and not through the host.
+    """
+
+    def __init__(self, models: Sequence[Sequence[Any]], capacity: int) -> None:
+        self._shards = [Shard(each, capacity) for each in models]
+        self.devices = [str(each[0].device.selection) for each in models]
+        self.direct = all(one.reaches(other) for one in self._shards for other in self._shards)
+
+    def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Run a method of all shards, each with its own arguments, and return the results."""
+        steps = [getattr(one, method)(*own) for one, own in zip(self._shards, arguments, strict=True)]
+        for one in steps:
+            next(one)
+        return [finished(one) for one in steps]
+
+    def hand_on(self, source: int) -> None:
+        """Copy the particles of all shards to each, from device to device."""
+        self.each("take", [(source, self._shards)] * len(self._shards))
+
+    def close(self) -> None:
+        """Forget the shards."""
+        self._shards = []
+
+
+class There:
+    """Shards in other processes, each behind an executor of one worker.
+
+    Args:
+        executors: One for each shard; each must run all functions in the same process.
+        make: Function of a module that returns the models of a device.
+        devices: Selection strings, for workers that have no device of their own.
+        capacity: Most particles of a shard.
+
+    Attributes:
+        devices: Selection strings of the devices.
+        direct: False: particles go through this process.
+    """
+
+    direct = False
+
+    def __init__(
+        self, executors: Sequence[Executor], make: Callable[[str], Any], devices: Sequence[str], capacity: int
+    ) -> None:
+        self._executors = list(executors)
+        self._names = [secrets.token_hex(8) for _ in executors]
+        made = [
+            executor.submit(held.hold, name, make, device, capacity)
+            for executor, name, device in zip(executors, self._names, devices, strict=True)
+        ]
+        self.devices = [future.result() for future in made]
+
+    def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Run a method of all shards, each with its own arguments, and return the results."""
+        running = [
+            executor.submit(held.call, name, method, *own)
+            for executor, name, own in zip(self._executors, self._names, arguments, strict=True)
+        ]
+        return [future.result() for future in running]
+
+    def hand_on(self, source: int) -> None:
+        """Refuse: the shards do not see one another."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Forget the shards."""
+        for executor, name in zip(self._executors, self._names, strict=True):
+            executor.submit(held.release, name).result()
+
+
+class SplitCloud(Cloud):
+    """Particles over several shards, with the interface of the cloud of one device.
+
+    A stage of a correction has two exchanges, of the largest score and of the sums of integer weights, and a third one
+    of particles where it draws: without jitter each shard gets the parents of its own particles, with jitter all.
+
+    Args:
+        team: The shards.
+        backend: Device of the estimates.
+        capacity: Most particles of the filter.
+        precision: Of log-likelihoods.
+        early: Whether a correction ends with the stage that leaves nothing, as on processors.
+
+    Attributes:
+        exchanged: Bytes of particles that were handed to shards.
+    """
+
+    def __init__(
+        self, team: Here | There, backend: Backend, capacity: int, precision: np.dtype, *, early: bool
+    ) -> None:
+        self.backend, self.capacity, self.precision, self._team, self._early = backend, capacity, precision, team, early
+        self.shown, self.next, self.exchanged = 0, 0, 0
+        # The filter sets it to zero when it begins; the state itself is on the host.
+        self.state = backend.upload(np.zeros(STATE))
+        self._numbers, self._settings = np.zeros(STATE), np.zeros(SETTINGS)
+        self.resized(capacity)
+
+    @property
+    def _size(self) -> int:
+        return len(self._team.devices)
+
+    def resized(self, drawn: int) -> None:
+        """Set the number of particles."""
+        self._parts = parts_of(drawn, self._size)
+        self.count, self.block = drawn, self._parts[0].block
+
+    def _all(self, method: str, *arguments: Any) -> list[Any]:
+        return self._team.each(method, [arguments] * self._size)
+
+    # ---- beginnings
+
+    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
+        """Replace all particles."""
+        if weights is not None:
+            raise NotImplementedError("particles with weights cannot be split")
+        self.resized(len(poses))
+        self.shown, self.next, self._numbers = 0, 0, np.zeros(STATE)
+        own = [(part, poses[part.first : part.first + part.size], self._numbers) for part in self._parts]
+        self._team.each("place", own)
+
+    def set_pool(self, poses: np.ndarray) -> None:
+        """Send the poses from which recovery injects particles."""
+        self._all("set_pool", poses)
+
+    def upload_settings(self, settings: np.ndarray) -> None:
+        """Keep the numbers of the next step."""
+        self._settings = settings
+
+    # ---- steps
+
+    def move(self, kind: int) -> None:
+        """Move the particles now."""
+        self._all("begin", self._settings, kind, 0)
+        self.shown = self.next
+
+    def step(self, kind: int, stages: int, drawn: int, given: Sequence[tuple[int, tuple[Any, ...]]]) -> int:
+        """Run a correction, and return the number of particles drawn.
+
+        Args:
+            kind: Kind of the motion that begins the step.
+            stages: Most stages.
+            drawn: Particles of the next step.
+            given: Indices of sensors with their readings.
+        """
+        self._all("begin", self._settings, kind, len(given))
+        source, stage = self.next, 0
+        while True:
+            last = stage + 1 == stages
+            self._stage(source, (stage, stages), parts_of(drawn, self._size) if last else self._parts, given)
+            self.shown, self.next = source, 1 - source
+            done = self._numbers[stage * STAGE + LEFT] == 0.0
+            if last or (done and self._early):
+                return drawn if last else self.count
+            source = 1 - source
+            if done:
+                # Stages that have nothing left only copy: one is enough, and it is the last.
+                rows = self._numbers[: stages * STAGE].reshape(stages, STAGE)
+                rows[stage + 1 :] = rows[stage]
+                self._all("set_state", self._numbers)
+                stage = stages - 2
+            stage += 1
+
+    def _stage(self, source: int, place: tuple[int, int], drawn: list[Part], given: Any) -> None:
+        """Score and weigh the particles of a buffer, and draw into the other one."""
+        stage, state = place[0], self._numbers
+        high = max(self._all("score", source, given))
+        each = self._all("weigh", high, stage)
+        totals, largest = np.zeros(WEIGHT_SUMS), np.array([high])
+        join_weights(_PLAIN, np.concatenate(each), totals, self._size, self._size)
+        left = state[(stage - 1) * STAGE + LEFT] if stage else 1.0
+        rung = rung_of(totals, self._settings, self._settings[SHARE] * self.count) if left > 0.0 else 0
+        set_weights(
+            _PLAIN,
+            _NONE,
+            _NONE,
+            largest,
+            _NONE,
+            _NONE,
+            totals,
+            self._settings,
+            state,
+            _NONE,
+            _NONE,
+            self.count,
+            1,
+            1,
+            1,
+            1,
+            *place,
+        )
+        marks = self._marks(stage, drawn)
+        offsets = np.cumsum([0.0, *(one[rung] for one in each[:-1])])
+        shown = state.copy()
+        if marks is not None:
+            # A filter that changes its size draws, whatever its weights.
+            shown[stage * STAGE + RESAMPLED] = 1.0
+        asked = None if self._team.direct else marks
+        own = [(source, totals, shown, place, float(offset), asked) for offset in offsets]
+        found = self._team.each("set_weights", own)
+        pieces: list[Any] = [False] * self._size
+        if marks is not None and self._team.direct:
+            self._team.each("shift_ends", [(float(offset),) for offset in offsets])
+            self._team.hand_on(source)
+            pieces = [True] * self._size
+            self.exchanged += (self._size - 1) * self.count * _PARTICLE
+        elif marks is not None:
+            pieces = [[one[target] for one in found] for target in range(self._size)]
+            self.exchanged += sum(
+                one.nbytes for target, each in enumerate(pieces) for origin, piece in enumerate(each)
+                for one in piece if origin != target
+            )  # fmt: skip
+        self._team.each("draw", [(source, stage, *pair) for pair in zip(drawn, pieces, strict=True)])
+
+    def _marks(self, stage: int, drawn: list[Part]) -> list[tuple[float, float]] | None:
+        """Return the lowest and the highest mark that each shard draws at; None where each copies its own particles."""
+        own = self._numbers[stage * STAGE : (stage + 1) * STAGE]
+        total, whole = float(own[TOTAL]), drawn[0].whole
+        if not total > 0.0 and whole != self.count:
+            raise RuntimeError("the weights of all particles are 0, so their number cannot change")
+        if (own[RESAMPLED] == 0.0 and whole == self.count) or not total > 0.0:
+            return None
+        if own[LEFT] > 0.0:
+            # Jitter takes differences of any two particles.
+            return [(0.0, total)] * self._size
+        ends = [(part.first / whole, (part.first + part.size) / whole) for part in drawn]
+        return [(float(mark_of(np.array(low), total)), float(mark_of(np.array(high), total))) for low, high in ends]
+
+    def explain(self) -> str:
+        """Return how the particles are split."""
+        counts = ", ".join(f"{part.size} on {name}" for part, name in zip(self._parts, self._team.devices, strict=True))
+        return f"split: {counts}"
+
+    # ---- what crosses to the host
+
+    def estimate(self, count: int) -> np.ndarray:
+        """Return the estimate of the shown particles: mean, covariance, sum of weights, best particle."""
+        parts, result = parts_of(count, self._size), np.zeros(ESTIMATE)
+        holder = next(index for index, part in enumerate(parts) if part.size)
+        asked = [(self.shown, 1 if index == holder else 0) for index in range(self._size)]
+        first = self._team.each("poses", asked)[holder][0]
+        reference = first
+        for again in (0, 1):
+            own = [(self.shown, part.size, part.block, reference) for part in parts]
+            rows = self._team.each("sum_poses", own)
+            for part, sums in zip(parts, rows, strict=True):
+                sums[:, 12] += part.first
+            table = np.concatenate(rows)
+            for fan in fans_of(len(table)):
+                sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
+                join_poses(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, fan)
+            finish_estimate(_PLAIN, first, table.reshape(-1), result, again)
+            reference = result[:3].copy()
+        return result
+
+    def host_poses(self, index: int, count: int) -> np.ndarray:
+        """Return a copy of the poses of a buffer."""
+        return np.concatenate(self._team.each("poses", [(index, one.size) for one in parts_of(count, self._size)]))
+
+    def host_weights(self, count: int) -> np.ndarray:
+        """Return a copy of the weights of the shown particles, before they are normalised."""
+        return np.concatenate(self._team.each("weights", [(one.size,) for one in parts_of(count, self._size)]))
+
+    def _read(self, buffer: Any, count: int) -> np.ndarray:
+        # The state, for the summary.
+        return self._numbers[:count].copy()
+
+    def close(self) -> None:
+        """Forget the shards."""
+        self._team.close()

@@ -1,0 +1,101 @@
+"""A particle filter whose particles are split over several devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from typing import Any
+
+from gpusense._util import checks
+from gpusense.localization.filter import ParticleFilter
+from gpusense.sweeps.held import models_of
+from gpusense.sweeps.parts import parts_of
+from gpusense.sweeps.split import Here, SplitCloud, There
+
+
+class SplitParticleFilter(ParticleFilter):
+    """A particle filter over several devices, with the particles of a filter on one of them.
+
+    Each device moves, scores, weighs and draws its share of the particles. Per stage of a correction the devices
+    exchange the largest score, sums of weights, and the parents of particles that others draw. Random numbers depend
+    on the index of a particle in the whole filter, and sums of weights are exact: particles and weights are those of
+    :class:`ParticleFilter` on one device of the same kind, to the bit where log-likelihoods are.
+
+    Args:
+        make: Returns the models of a device, given its selection string. With ``executors`` it must be a function of a
+            module, or a ``functools.partial`` of one.
+        devices: Selection strings, one for each share of the particles; a device may occur twice.
+        executors: One for each device, with one worker that stays the same process: ``ProcessExecutor([device])``, or
+            those of ``DaskExecutor.on_each()``; None keeps all shares in this process.
+        **options: Options of :class:`ParticleFilter`.
+
+    Raises:
+        TypeError, ValueError: an argument breaks its rule; see :class:`ParticleFilter`.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> def make(device):
+        ...     return gs.PositionModel(gs.PositionParameters(sigma=0.1), backend=device)
+        >>> pf = gs.sweep.SplitParticleFilter(make, devices=["numpy", "numpy"], particles=500, seed=1)
+        >>> pf.initialize(mean=(0.5, 0.0, 0.0), covariance=np.diag([0.04, 0.04, 1e-6]))
+        >>> pf.correct(np.array([0.6, 0.0]))
+        >>> one = gs.ParticleFilter(make("numpy"), particles=500, seed=1)
+        >>> one.initialize(mean=(0.5, 0.0, 0.0), covariance=np.diag([0.04, 0.04, 1e-6]))
+        >>> one.correct(np.array([0.6, 0.0]))
+        >>> np.array_equal(pf.host_particles(), one.host_particles())
+        True
+    """
+
+    _cloud: SplitCloud
+
+    def __init__(
+        self,
+        make: Callable[[str], Any],
+        *,
+        devices: Sequence[str],
+        executors: Sequence[Executor] | None = None,
+        **options: Any,
+    ) -> None:
+        if not callable(make):
+            raise TypeError(f"make: must be a function of a device, got {checks.show(make)}")
+        if isinstance(devices, str) or not devices or not all(isinstance(one, str) for one in devices):
+            raise TypeError(f"devices: must be a list of selection strings, got {checks.show(devices)}")
+        if executors is not None and len(executors) != len(devices):
+            raise ValueError(f"executors: must be one for each of {len(devices)} devices, got {len(executors)}")
+        models = models_of(make, devices[0])
+        super().__init__(models, **options)
+        most, count = self._most, len(devices)
+        # Parts are whole blocks, whose number does not always divide by that of the shards.
+        share = min(most, most // count + 3 * parts_of(most, count)[0].block)
+        team: Here | There
+        if executors is None:
+            team = Here([models, *(models_of(make, device) for device in devices[1:])], share)
+        else:
+            team = There(executors, make, devices, share)
+        early = self._backend.info.kind != "gpu"
+        self._cloud = SplitCloud(team, self._backend, most, self._sensors[0].precision, early=early)
+
+    def __repr__(self) -> str:
+        return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
+
+    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> int:
+        return self._cloud.step(kind, self.stages, drawn, given)
+
+    @property
+    def particles(self) -> Any:
+        """(N, 3) poses after the last step, in host memory."""
+        return self.host_particles()
+
+    @property
+    def weights(self) -> Any:
+        """(N,) weights of the particles, whose sum is 1, in host memory."""
+        return self.host_weights()
+
+    @property
+    def exchanged(self) -> int:
+        """Bytes of particles that devices have handed to one another."""
+        return self._cloud.exchanged
+
+    def close(self) -> None:
+        """Release the particles and models of other processes."""
+        self._cloud.close()

@@ -1,0 +1,114 @@
+"""Maps, logs, and models with their compiled kernels, which a worker of a sweep keeps between jobs."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpusense.sweeps.job import Job
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.tracking import Step
+    from gpusense.logs import Scan
+    from gpusense.world.grid import OccupancyGrid
+
+# Objects of a kind that are kept: maps, logs, models.
+_KEPT = 4
+
+
+class Store:
+    """Maps, logs and models of a worker; the least recently used ones are evicted.
+
+    Args:
+        root: Folder of the maps and logs.
+        device: Selection string of the worker's device.
+
+    Attributes:
+        device: It.
+        reads: How often a map or a log was read or a model was made.
+    """
+
+    def __init__(self, root: str | Path, device: str = "auto") -> None:
+        self._root, self.device, self.reads = Path(root), device, 0
+        self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
+        self._sent: dict[str, Any] = {}
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{len(kept)} {kind}" for kind, kept in self._kept.items())
+        return f"Store({str(self._root)!r}, device={self.device!r}, {counts or 'empty'})"
+
+    def receive(self, sent: Mapping[str, Any]) -> None:
+        """Take over maps and the bytes of logs that were sent, by their paths; other paths are read from the root."""
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="gpusense-sweep-")
+        folder = Path(self._folder.name)
+        for index, (path, content) in enumerate(sent.items(), len(self._sent)):
+            if isinstance(content, bytes):
+                # Only the endings are the sender's: they select the format.
+                file = folder / f"{index}{''.join(Path(path).suffixes[-2:])}"
+                file.write_bytes(content)
+                self._sent[path] = file
+            else:
+                self._sent[path] = content
+
+    def path(self, name: str) -> Path:
+        """Return the path of a log or another file.
+
+        Raises:
+            ValueError: the name is empty.
+        """
+        if not name:
+            raise ValueError("job: must name a map and a log, got an empty name")
+        sent = self._sent.get(name)
+        return sent if isinstance(sent, Path) else self._root / name
+
+    def grid(self, name: str) -> OccupancyGrid:
+        """Return a map."""
+        from gpusense.world.grid import OccupancyGrid
+        from gpusense.world.map_files import read_map
+
+        sent = self._sent.get(name)
+        return sent if isinstance(sent, OccupancyGrid) else self.keep("maps", name, lambda: read_map(self.path(name)))
+
+    def steps(self, job: Job) -> list[Step]:
+        """Return the scans of a job with their odometry."""
+        from gpusense.evaluation.tracking import read_steps
+
+        chosen = _chosen(job)
+        key = (job.log, *chosen.items())
+        return self.keep("logs", key, lambda: read_steps(self.path(job.log), **chosen))
+
+    def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
+        """Return the scans of a job that have logged poses; those of the options below a dotted name, if given."""
+        from gpusense.evaluation.scoring import logged_scans
+
+        chosen = _chosen(job, group)
+        key = ("poses", job.log, *chosen.items())
+        return self.keep("logs", key, lambda: logged_scans(self.path(job.log), **chosen))
+
+    def keep(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
+        """Return an object of a kind; make it where it is not kept."""
+        kept = self._kept.setdefault(kind, OrderedDict())
+        if key not in kept:
+            kept[key] = make()
+            self.reads += 1
+            if len(kept) > _KEPT:
+                kept.popitem(last=False)
+        kept.move_to_end(key)
+        return kept[key]
+
+
+# Scans from which parameters are learned: every 20th.
+TRAINING = {"every": 20, "offset": 0, "limit": None}
+_ALL = {"every": 1, "offset": 0, "limit": None}
+
+
+def _chosen(job: Job, group: str = "") -> dict[str, Any]:
+    """Return the options that choose scans of a log."""
+    values = job.group(group) if group else job.by_name
+    defaults = TRAINING if group else _ALL
+    return {"range_max": job.option("range_max"), **{name: values.get(name, one) for name, one in defaults.items()}}

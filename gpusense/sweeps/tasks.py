@@ -1,0 +1,145 @@
+"""Tasks of the jobs of a sweep: localise along a log, score its scans, fit parameters to it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.sweeps.job import Job
+from gpusense.sweeps.models import MODEL_OPTIONS, MODELS, model_of
+from gpusense.sweeps.store import Store
+
+Values = Mapping[str, Any]
+
+
+class Task(NamedTuple):
+    """A task.
+
+    Attributes:
+        run: Runs a job with what the worker keeps, and returns the columns of its row.
+        options: Names of its options, without those of the model.
+        error: Column that a plot shows against run time.
+    """
+
+    run: Callable[[Job, Store], Values]
+    options: tuple[str, ...]
+    error: str
+
+
+def localize(job: Job, store: Store) -> Values:
+    """Track the log with a particle filter; return the figures of ``gpusense localize``."""
+    from gpusense.evaluation.tracking import Track, follow, start, summary
+    from gpusense.localization.filter import ParticleFilter
+    from gpusense.localization.motion import OdometryMotion
+
+    steps = store.steps(job)
+    names = ("particles", "temperature", "resampling", "threshold", "stages", "recovery")
+    options = {name: job.option(name) for name in names if job.option(name) is not None}
+    plain = OdometryMotion()
+    motion = OdometryMotion(job.option("motion_noise", plain.alpha), job.option("reverse", plain.reverse))
+    if isinstance(options.get("particles"), list):
+        options["particles"] = tuple(options["particles"])
+    pf = ParticleFilter(model_of(job, store, steps[0].scan.scanner), motion=motion, seed=job.seed, **options)
+    start(pf, steps, everywhere=job.option("everywhere", False))
+    track = Track()
+    for _ in follow(pf, steps, track):
+        pass
+    # The median step leaves out the first, which compiles.
+    return {**summary(track), "ms_step": float(1000 * np.median(np.sum(track.seconds, axis=1)))}
+
+
+def score(job: Job, store: Store) -> Values:
+    """Rank the logged poses among particles; return the figures of ``gpusense score``."""
+    from gpusense.evaluation.scoring import ParticleSampler, score_log, summary
+
+    scans = store.scans(job)
+    model = model_of(job, store, scans[0][1].scanner, temperature=job.option("temperature", 1.0))
+    names = ("particles", "sigma_position", "sigma_heading")
+    options = {name: job.option(name) for name in names if job.option(name) is not None}
+    scores, _ = score_log([model], scans, ParticleSampler(seed=job.seed, **options))
+    return summary(scores[0])
+
+
+def fit(job: Job, store: Store) -> Values:
+    """Fit the parameters of the beam model to the log; seeds above 0 draw its blocks anew (bootstrap)."""
+    from gpusense.evaluation.range_data import data_of_log
+    from gpusense.learning.beam.fit import fit_beam_parameters
+
+    scans, block = store.scans(job), job.option("block", 10)
+    chosen = [job.option(name) for name in ("range_max", "every", "offset", "limit")]
+
+    def cast() -> Any:
+        return data_of_log(store.grid(job.map), scans, backend=store.device, block=block)
+
+    data = store.keep("data", (job.map, job.log, block, *chosen), cast)
+    ranges, expected = data.ranges, data.expected
+    if job.seed > 0:
+        # Blocks of neighbouring scans, with replacement: errors within a block are dependent (Kuensch 1989).
+        count = int(data.block[-1]) + 1
+        drawn = np.random.default_rng(job.seed).integers(0, count, count)
+        ends = np.searchsorted(data.block, np.arange(count + 1))
+        rows = np.concatenate([np.arange(ends[one], ends[one + 1]) for one in drawn])
+        ranges, expected = ranges[rows], expected[rows]
+    found = fit_beam_parameters(
+        ranges, expected, data.range_max, method=job.option("method", "em"), backend=store.device
+    )
+    figures = {"per_reading": found.log_likelihood / max(found.hits + found.max_readings, 1)}
+    return {**found.parameters.to_dict(), **figures, "converged": found.converged, "readings": len(ranges)}
+
+
+_SCANS = ("every", "offset", "limit")
+TASKS: dict[str, Task] = {
+    "localize": Task(
+        localize,
+        (*_SCANS, "particles", "temperature", "resampling", "threshold", "stages", "recovery", "everywhere",
+         "motion_noise", "reverse"),
+        "error_median",
+    ),
+    "score": Task(
+        score, (*_SCANS, "particles", "temperature", "sigma_position", "sigma_heading"), "error_position_median"
+    ),
+    "fit": Task(fit, (*_SCANS, "block", "method"), "per_reading"),
+}  # fmt: skip
+
+
+def task_of(job: Job) -> Callable[[Job, Store], Values]:
+    """Return the function of a job's task.
+
+    Raises:
+        ValueError: no such task or function.
+    """
+    if ":" not in job.task:
+        return TASKS[checks.choice("task", job.task, tuple(TASKS))].run
+    module, _, name = job.task.partition(":")
+    function = getattr(importlib.import_module(module), name, None)
+    if not callable(function):
+        raise ValueError(f"task: must name a function, got {job.task!r}")
+    return function
+
+
+def check_options(job: Job) -> None:
+    """Check the names of a job's model and options.
+
+    Raises:
+        ValueError: the task has no such model or option.
+    """
+    checks.choice("model", job.model, MODELS)
+    known = (*TASKS[job.task].options, *MODEL_OPTIONS)
+    for name, _ in job.options:
+        group, dot, rest = name.partition(".")
+        training = group == "training" and rest in _SCANS
+        if name not in known and not training and not (dot and group == "parameters"):
+            rule = f"options: of the task {job.task} are {', '.join(sorted(known))}, parameters.* and training.*"
+            raise ValueError(f"{rule}, got {name!r}")
+
+
+_TIMINGS = ("seconds", "cpu_seconds", "worker", "device", "attempts", "particle_beams_per_second")
+
+
+def is_timing(column: str) -> bool:
+    """Tell whether a column depends on time or place, and so differs between two runs of a job."""
+    return column.startswith("ms_") or column in _TIMINGS

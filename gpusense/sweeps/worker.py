@@ -1,0 +1,94 @@
+"""The function that runs a job on a worker, whatever started the worker."""
+
+from __future__ import annotations
+
+import os
+import platform
+import threading
+import time
+import traceback
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from gpusense.sweeps.job import Job
+from gpusense.sweeps.store import Store
+from gpusense.sweeps.tasks import task_of
+
+# Environment variable with the selection string of a worker's device.
+DEVICE = "GPUSENSE_SWEEP_DEVICE"
+# Longest text of an error.
+_LONGEST = 400
+
+
+class Outcome(NamedTuple):
+    """The result of a job.
+
+    Attributes:
+        values: Columns of its row by name; empty after a failure.
+        error: The error in one line; empty after success.
+        trace: Where the error was raised, for a log.
+        seconds: Time of the job.
+        cpu_seconds: Processor time of the worker's process meanwhile.
+        worker: Host and process.
+        device: Selection string of the device.
+    """
+
+    values: dict[str, Any]
+    error: str
+    trace: str
+    seconds: float
+    cpu_seconds: float
+    worker: str
+    device: str
+
+
+# A worker runs one job at a time, as its device and its store serve one.
+_LOCK = threading.Lock()
+# Stores by root, device and sweep: files may have changed since another sweep.
+_STORES: dict[tuple[str, str, str], Store] = {}
+_SENT: dict[str, Any] = {}
+
+
+def receive(sent: Mapping[str, Any]) -> None:
+    """Keep maps and logs that were sent, for all jobs of this process."""
+    with _LOCK:
+        _SENT.update(sent)
+        _STORES.clear()
+
+
+def device_of(device: str) -> str:
+    """Return the worker's own device, if the one that started it has given it one, else the sweep's."""
+    return os.environ.get(DEVICE) or device
+
+
+def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
+    """Run a job in this process; errors are part of the result.
+
+    Args:
+        job: The job.
+        root: Folder of its files.
+        device: Selection string of the device, where the worker has none of its own.
+        sweep: Name of the sweep: what a worker has read for another one is read again.
+    """
+    chosen = device_of(device)
+    with _LOCK:
+        begin, begin_cpu = time.perf_counter(), time.process_time()
+        key = (root, chosen, sweep)
+        if key not in _STORES:
+            _STORES.clear()
+            _STORES[key] = Store(root, chosen)
+            _STORES[key].receive(_SENT)
+        values: dict[str, Any] = {}
+        error = trace = ""
+        try:
+            values = {name: _plain(value) for name, value in task_of(job)(job, _STORES[key]).items()}
+        except Exception as problem:
+            text = " ".join(f"{type(problem).__name__}: {problem}".split())
+            error, trace = text[:_LONGEST], traceback.format_exc()
+        seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
+
+
+def _plain(value: Any) -> Any:
+    """Return NumPy's numbers as Python's."""
+    return value.item() if hasattr(value, "item") else value

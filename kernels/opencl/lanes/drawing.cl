@@ -1,0 +1,28 @@
+// Draws of LANES neighbours, whose marks ascend: the first is searched, and the others are found by walking on from there.
+// See drawing.cl.
+// requires: lanes/types draws
+
+// A work-item takes LANES particles.
+kernel void draw_particles(global const double *source, global const double *weight, global const double *ends,
+                           global const double *settings, global const double *state, global const double *pool,
+                           global double *target, global double *after, const int particles, const int drawn,
+                           const int stage) {
+    const int first = LANES * get_global_id(0), last = min(first + LANES, drawn);
+    global const double *own = state + stage * STAGE;
+    const int copied = is_copied(own, particles, drawn), stratified = settings[STRATIFIED] > 0.0;
+    const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
+    double start = start_of(settings, stage, 0);
+    int chosen = 0;
+    for (int n = first; n < last; n++) {
+        if (copied) {
+            copy_particle(source, weight, settings, own, target, after, particles, n);
+            continue;
+        }
+        const uint index = (uint)settings[FIRST] + (uint)n;
+        if (stratified) start = start_of(settings, stage, index);
+        const double mark = mark_of(((double)index + start) / whole, own[TOTAL]);
+        if (n == first) chosen = found_at(ends, mark, particles);
+        while (chosen < particles - 1 && !(ends[chosen] > mark)) chosen++;
+        draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen);
+    }
+}

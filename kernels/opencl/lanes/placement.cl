@@ -1,0 +1,116 @@
+// Placement of 8 poses at once: placement.cl, for float32. Coordinates are clamped, so that vectors round them down.
+// requires: lanes/heading
+
+#if POSES_FLOAT32
+typedef float coordinate;
+#else
+typedef double coordinate;
+#endif
+
+#define FARTHEST 1073741824.0
+#define BELOW_ONE 0x1.fffffep-1f
+
+// Load an axis of poses; a lane beyond the last of count repeats it.
+doubles load_axis(global const coordinate *poses, const long place, const int count) {
+    doubles found;
+    for (int i = 0; i < DOUBLES; i++) ((double *)&found)[i] = poses[place + 3 * (i < count ? i : count - 1)];
+    return found;
+}
+
+// Clamp coordinates to +-FARTHEST cells; NaN becomes -FARTHEST.
+doubles within_reach_lanes(const doubles position) {
+    const doubles above = position > -FARTHEST ? position : (doubles)-FARTHEST;
+    return above < FARTHEST ? above : (doubles)FARTHEST;
+}
+
+// Return the floors of coordinates within reach.
+doubles floor_cells_lanes(const doubles position) {
+    const doubles nearest = (position + ROUNDER) - ROUNDER;
+    return nearest > position ? nearest - 1.0 : nearest;
+}
+
+// Return whether a comparison holds in any lane of doubles.
+int any_double(const choices holds) {
+    const long4 four = holds.lo | holds.hi;
+    const long2 two = four.lo | four.hi;
+    return (two.x | two.y) != 0;
+}
+
+// Compute the cosines and sines of headings of any size.
+void cos_sin_any(const doubles theta, doubles *cosines, doubles *sines) {
+    cos_sin_lanes(theta, cosines, sines);
+#if HUGE_HEADINGS
+    const choices huge = ~((theta <= LARGEST_HEADING) & (theta >= -LARGEST_HEADING));
+    if (!any_double(huge)) return;
+    for (int i = 0; i < DOUBLES; i++) {
+        const double2 heading = cos_sin(((const double *)&theta)[i]);
+        ((double *)cosines)[i] = heading.x, ((double *)sines)[i] = heading.y;
+    }
+#endif
+}
+
+// Place the poses from begin on, at most DOUBLES of them.
+void place_lanes(global const coordinate *poses, global int2 *pose_cell, global real4 *pose, global real4 *pose_low,
+                 global int *pose_status, const Frame frame, const Window window, const int begin, const int count) {
+    const long first = 3 * (long)begin;
+    doubles x = load_axis(poses, first, count), y = load_axis(poses, first + 1, count);
+    const doubles theta = load_axis(poses, first + 2, count);
+    const choices finite = (x - x) + (y - y) + (theta - theta) == 0.0;
+    doubles cosine, sine;
+    cos_sin_any(theta, &cosine, &sine);
+    x -= frame.origin_x;
+    y -= frame.origin_y;
+    if (frame.mount_x != 0 || frame.mount_y != 0) {
+        x += cosine * frame.mount_x - sine * frame.mount_y;
+        y += sine * frame.mount_x + cosine * frame.mount_y;
+    }
+    if (frame.yaw_sin != 0) {
+        const doubles x_before = x, cosine_before = cosine;
+        x = frame.yaw_cos * x + frame.yaw_sin * y;
+        y = frame.yaw_cos * y - frame.yaw_sin * x_before;
+        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin;
+        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin;
+    }
+    x = within_reach_lanes(x / frame.resolution);
+    y = within_reach_lanes(y / frame.resolution);
+    if (any_double(~finite)) {
+        atomic_or(&pose_status[0], 1);
+        x = finite ? x : (doubles)-FARTHEST, y = finite ? y : (doubles)-FARTHEST;
+        cosine = finite ? cosine : (doubles)1.0, sine = finite ? sine : (doubles)0.0;
+    }
+    const doubles whole_x = floor_cells_lanes(x), whole_y = floor_cells_lanes(y);
+    const int8 col = convert_int8_rtz(whole_x) - window.col, row = convert_int8_rtz(whole_y) - window.row;
+    const int8 off = (col < 0) | (row < 0) | (col >= window.cols) | (row >= window.rows);
+    const int4 four = off.lo | off.hi;
+    const int2 two = four.lo | four.hi;
+    if ((two.x | two.y) != 0) atomic_or(&pose_status[1], 1);
+    // Adding 0 turns -0 into 0.
+    x = (x - whole_x) + 0.0;
+    y = (y - whole_y) + 0.0;
+    // A fraction just below 1 may round to 1, which would be the next cell.
+    float8 rounded_x = convert_float8(x), rounded_y = convert_float8(y);
+    rounded_x = rounded_x < BELOW_ONE ? rounded_x : (float8)BELOW_ONE;
+    rounded_y = rounded_y < BELOW_ONE ? rounded_y : (float8)BELOW_ONE;
+    const float8 rounded_cosine = convert_float8(cosine), rounded_sine = convert_float8(sine);
+#define LANE(type, of, i) ((const type *)&of)[i]
+    for (int i = 0; i < count; i++) {
+        pose_cell[begin + i] = (int2)(LANE(int, col, i), LANE(int, row, i));
+        const real4 rounded = (real4)(LANE(float, rounded_x, i), LANE(float, rounded_y, i),
+                                      LANE(float, rounded_cosine, i), LANE(float, rounded_sine, i));
+        pose[begin + i] = rounded;
+#if CAREFUL
+        pose_low[begin + i] = (real4)((real)(LANE(double, x, i) - rounded.x), (real)(LANE(double, y, i) - rounded.y),
+                                      (real)(LANE(double, cosine, i) - rounded.z),
+                                      (real)(LANE(double, sine, i) - rounded.w));
+#endif
+    }
+}
+
+// A work-item takes LANES particles.
+kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
+                        global real4 *pose_low, global int *pose_status, const Frame frame, const Window window,
+                        const int particles) {
+    const int first = LANES * get_global_id(0), last = min(first + LANES, particles);
+    for (int begin = first; begin < last; begin += DOUBLES)
+        place_lanes(poses, pose_cell, pose, pose_low, pose_status, frame, window, begin, min(DOUBLES, last - begin));
+}

@@ -1,0 +1,65 @@
+// Weights of 8 particles at once: weighing.cl. Sums of integer weights are exact in any order.
+// requires: rungs lanes/elementary
+
+// Return the likelihoods of scores relative to the largest; 1 where none is possible or nothing is left.
+doubles tempered_lanes(const doubles score, const double largest, const double left) {
+    return largest == -INFINITY || left == 0.0 ? (doubles)1.0 : exp_of_lanes(left * (score - largest));
+}
+
+// A work-item takes a block.
+kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
+                            global const double *settings, global const double *state, global double *sums,
+                            const int particles, const int block, const int blocks, const int groups,
+                            const int stage) {
+    const int b = get_global_id(0), begin = b * block;
+    if (begin >= particles) return;
+    const double high = largest_of(largest, groups), left = left_of(state, stage), scale = settings[SCALE];
+    const int end = min(begin + block, particles);
+    doubles weights[RUNGS], squares[RUNGS], old = 0.0;
+    for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
+    for (int n = begin; n < end; n += DOUBLES) {
+        const int count = min(DOUBLES, end - n);
+        doubles likelihood = tempered_lanes(load_doubles(score, n, 1, count), high, left);
+        // Lanes without a particle have no weight.
+        const choices there = (choices)(0, 1, 2, 3, 4, 5, 6, 7) < (long)count;
+        const doubles prior = there ? load_doubles(before, n, 1, count) : (doubles)0.0;
+        old += floor_lanes(prior * scale);
+        for (int k = 0; k < RUNGS; k++) {
+            const doubles weight = prior * likelihood;
+            weights[k] += floor_lanes(weight * scale);
+            squares[k] += floor_lanes(weight * weight * scale);
+            likelihood = sqrt(likelihood);
+        }
+    }
+    global double *row = sums + (long)b * WEIGHT_SUMS;
+    for (int k = 0; k < RUNGS; k++) row[k] = sum_doubles(weights[k]), row[RUNGS + k] = sum_doubles(squares[k]);
+    row[2 * RUNGS] = sum_doubles(old);
+}
+
+// A work-item takes a block, and adds up its weights in the order of the particles.
+kernel void set_weights(global const double *score, global const double *before, global const double *largest,
+                        global const double *sums, global const double *joined, global const double *totals,
+                        global const double *settings, global double *state, global double *weight,
+                        global double *ends, const int particles, const int block, const int blocks, const int fan,
+                        const int groups, const int stage, const int stages) {
+    const int b = get_global_id(0), begin = b * block;
+    if (begin >= particles) return;
+    const double scale = settings[SCALE], left = left_of(state, stage), high = largest_of(largest, groups);
+    const int rung = left > 0.0 ? rung_of(totals, settings, settings[SHARE] * (double)particles) : 0;
+    const int end = min(begin + block, particles);
+    double sum = 0.0;
+    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + rung];
+    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
+    for (int n = begin; n < end; n += DOUBLES) {
+        const int count = min(DOUBLES, end - n);
+        doubles likelihood = tempered_lanes(load_doubles(score, n, 1, count), high, left);
+        for (int k = 0; k < rung; k++) likelihood = sqrt(likelihood);
+        const doubles chosen = load_doubles(before, n, 1, count) * likelihood, whole = floor_lanes(chosen * scale);
+        for (int i = 0; i < count; i++) {
+            weight[n + i] = ((const double *)&chosen)[i];
+            sum += ((const double *)&whole)[i];
+            ends[n + i] = sum;
+        }
+    }
+    if (b == 0) set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
+}

@@ -1,0 +1,137 @@
+"""Draws from exact cumulative weights: copies of particles, jitter between two stages, and injected poses.
+
+See drawing.py.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import motion, philox
+
+SEED, STEP, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = (wp.constant(place) for place in (0, 2, 12, 13, 14, 15))
+SCALE, STRATIFIED, FIRST, WHOLE, DRAWN = (wp.constant(place) for place in (21, 26, 61, 62, 63))
+LEFT, TOTAL, RESAMPLED, STAGE, INJECTED = (wp.constant(place) for place in (0, 1, 3, 8, 51))
+DRAW_STREAM, DRAW_STREAMS = wp.constant(16), wp.constant(4)
+LEAST_WEIGHT = wp.constant(wp.float64(1e-6))
+ZERO, ONE, TWO = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(2.0))
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file."""
+    wrap_once = motion.functions(frozenset()).wrap_once
+    numbers = philox.functions(frozenset())
+    random_words, uniform_of = numbers.random_words, numbers.uniform_of
+
+    # Return the first index whose cumulative weight exceeds a mark.
+    @wp.func
+    def found_at(ends: wp.array(dtype=wp.float64), mark: wp.float64, particles: wp.int32):
+        low = int(0)
+        high = particles - 1
+        while low < high:
+            middle = low + (high - low) // 2
+            if ends[middle] > mark:
+                high = middle
+            else:
+                low = middle + 1
+        return low
+
+    # Return the mark at a fraction of the total, below the total.
+    @wp.func
+    def mark_of(fraction: wp.float64, total: wp.float64):
+        return wp.min(wp.floor(fraction * total), total - ONE)
+
+    # Return whether particles are copied, because no resampling is due.
+    @wp.func
+    def is_copied(state: wp.array(dtype=wp.float64), stage: wp.int32, particles: wp.int32, drawn: wp.int32):
+        due = state[stage * STAGE + RESAMPLED] != ZERO or drawn != particles
+        return not due or not (state[stage * STAGE + TOTAL] > ZERO)
+
+    # Copy particle n with its weight, relative to the mean weight.
+    @wp.func
+    def copy_particle(
+        source: wp.array(dtype=wp.float64),
+        weight: wp.array(dtype=wp.float64),
+        settings: wp.array(dtype=wp.float64),
+        total: wp.float64,
+        target: wp.array(dtype=wp.float64),
+        after: wp.array(dtype=wp.float64),
+        particles: wp.int32,
+        n: wp.int32,
+    ):
+        copied = n % particles
+        for axis in range(3):
+            target[3 * n + axis] = source[3 * copied + axis]
+        kept = ONE
+        if total > ZERO:
+            whole = wp.where(settings[WHOLE] > ZERO, settings[WHOLE], wp.float64(particles))
+            kept = wp.max(weight[copied] / (total / (settings[SCALE] * whole)), LEAST_WEIGHT)
+            if weight[copied] == ZERO:
+                kept = weight[copied]
+        after[n] = kept
+
+    # Return the random words of a draw in one of the streams of its stage.
+    @wp.func
+    def words_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32, stream: wp.int32):
+        of_stage = wp.uint32(DRAW_STREAM + DRAW_STREAMS * stage + stream)
+        step = wp.uint32(settings[STEP])
+        return random_words(index, step, of_stage, wp.uint32(settings[SEED]), wp.uint32(settings[SEED + 1]))
+
+    # Return the random number of a draw's mark; that of index 0 serves all draws of systematic resampling.
+    @wp.func
+    def start_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32):
+        words = words_of(settings, stage, index, 0)
+        return uniform_of(words[0])
+
+    # Draw particle n from the one with index chosen: move it by jitter where a stage follows, or inject a pose.
+    @wp.func
+    def draw_particle(
+        source: wp.array(dtype=wp.float64),
+        ends: wp.array(dtype=wp.float64),
+        settings: wp.array(dtype=wp.float64),
+        state: wp.array(dtype=wp.float64),
+        pool: wp.array(dtype=wp.float64),
+        target: wp.array(dtype=wp.float64),
+        after: wp.array(dtype=wp.float64),
+        particles: wp.int32,
+        stage: wp.int32,
+        n: wp.int32,
+        chosen: wp.int32,
+    ):
+        index = wp.uint32(settings[FIRST]) + wp.uint32(n)
+        x = source[3 * chosen]
+        y = source[3 * chosen + 1]
+        theta = source[3 * chosen + 2]
+        after[n] = ONE
+        if state[stage * STAGE + LEFT] > ZERO:
+            total = state[stage * STAGE + TOTAL]
+            words = words_of(settings, stage, index, 1)
+            one = 3 * found_at(ends, mark_of(uniform_of(words[0]), total), particles)
+            other = 3 * found_at(ends, mark_of(uniform_of(words[1]), total), particles)
+            dx = source[one] - source[other]
+            dy = source[one + 1] - source[other + 1]
+            turn = wrap_once(source[one + 2] - source[other + 2])
+            far_x = wp.max(wp.abs(dx), wp.abs(dy)) / settings[FARTHEST_X]
+            far = wp.max(wp.max(far_x, wp.abs(turn) / settings[FARTHEST_THETA]), ONE)
+            part = settings[JITTER] / far
+            x += part * dx
+            y += part * dy
+            theta = wrap_once(theta + part * turn)
+        if stage == 0 and state[INJECTED] > ZERO and settings[POOL] > ZERO:
+            some = words_of(settings, stage, index, 2)
+            more = words_of(settings, stage, index, 3)
+            if uniform_of(some[0]) < state[INJECTED]:
+                row = 3 * int(wp.min(wp.floor(uniform_of(some[1]) * settings[POOL]), settings[POOL] - ONE))
+                x = pool[row] + (TWO * uniform_of(more[0]) - ONE) * settings[POOL + 1]
+                y = pool[row + 1] + (TWO * uniform_of(more[1]) - ONE) * settings[POOL + 2]
+                theta = wrap_once(pool[row + 2] + (TWO * uniform_of(more[2]) - ONE) * settings[POOL + 3])
+        target[3 * n] = x
+        target[3 * n + 1] = y
+        target[3 * n + 2] = theta
+
+    return SimpleNamespace(
+        found_at=found_at, mark_of=mark_of, is_copied=is_copied, copy_particle=copy_particle, start_of=start_of,
+        draw_particle=draw_particle,
+    )  # fmt: skip

@@ -1,0 +1,39 @@
+"""Tasks of sweeps that take no time, fail, or end their worker."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+
+def plain(job, store):
+    """Return a number of the seed, and whether a model was made for this job."""
+    reads = store.reads
+    store.keep("numbers", job.map, lambda: job.map)
+    return {"value": (job.seed + 1) / 3, "made": store.reads > reads, "process": os.getpid()}
+
+
+def failing(job, store):
+    """Fail for odd seeds."""
+    if job.seed % 2:
+        raise ValueError(f"a bad\nseed, {job.seed}")
+    return plain(job, store)
+
+
+def deadly(job, store):
+    """Kill the worker at seed 3, once: a file says that it was done; at seed 4 always, if the option asks for it."""
+    done = Path(job.option("folder")) / "killed"
+    if (job.seed == 3 and not done.exists()) or (job.seed == 4 and job.option("always")):
+        done.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return plain(job, store)
+
+
+def slow(job, store):
+    """Append the seed to a file, and wait a little."""
+    with open(Path(job.option("folder")) / "runs", "a") as file:
+        file.write(f"{job.seed}\n")
+    time.sleep(job.option("seconds"))
+    return {"value": job.seed * 0.1}

@@ -1,0 +1,123 @@
+"""Jobs, plans and tables of sweeps: what they accept, what they keep, and how they survive a crash."""
+
+from __future__ import annotations
+
+import csv
+import pickle
+
+import pytest
+
+import gpusense as gs
+from gpusense.sweeps.table import Table
+from gpusense.sweeps.worker import Outcome
+
+PLAN = """
+options: {every: 2, parameters: {sigma_hit: 0.1}}
+axes:
+  log:
+    one: {log: one.log, map: a.yaml}
+    two: {log: two.log, map: b.yaml, range_max: 20}
+  model: [field, discrete]
+  weights:
+    plain: {temperature: 1.0}
+    tempered: {temperature: auto, stages: 4}
+  seed: 3
+"""
+
+
+def plan(tmp_path, text):
+    path = tmp_path / "plan.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_plan_is_the_product_of_its_axes(tmp_path):
+    jobs = gs.sweep.read_plan(plan(tmp_path, PLAN))
+    assert len(jobs) == 2 * 2 * 2 * 3 == len({job.key for job in jobs})
+    first, last = jobs[0], jobs[-1]
+    assert (first.task, first.log, first.map, first.model, first.seed) == ("localize", "one.log", "a.yaml", "field", 0)
+    assert dict(first.options) == {"every": 2, "parameters.sigma_hit": 0.1, "temperature": 1.0}
+    assert dict(last.labels) == {"log": "two", "model": "discrete", "weights": "tempered", "seed": 2}
+    assert last.option("range_max") == 20 and last.group("parameters") == {"sigma_hit": 0.1}
+    assert pickle.loads(pickle.dumps(last)) == last and hash(last) == hash(pickle.loads(pickle.dumps(last)))
+
+
+def test_a_key_is_that_of_all_but_the_labels():
+    job = gs.sweep.Job(map="m", log="l", options={"b": 1, "a": [1.5, None]}, labels={"x": "y"})
+    assert job.key == gs.sweep.Job(map="m", log="l", options=(("a", (1.5, None)), ("b", 1))).key == "341f277fc019e3b3"
+    others = dict(task="fit", map="n", log="k", model="beam", seed=1, options={"b": 1})
+    assert len({gs.sweep.Job(**{"map": "m", "log": "l", name: value}).key for name, value in others.items()}) == 6
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("task: 'os:system'", "task: must be one of 'localize', 'score', 'fit', got 'os:system'"),
+        ("axes: {model: [laser]}", "model: must be one of"),
+        ("axes: {particle: [500]}", "options: of the task localize are"),
+        ("axes: {log: {one: run.log}}", "axes.log.one: must be a list, or a mapping"),
+        ("axes: {seed: 100000, particles: [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]}", "must make 1 to 1000000 jobs"),
+        ("axes: {particles: [500, 500]}", "axes: must make different jobs, got 1 twice"),
+        ("options: {particles: .nan}", "options.particles: must be finite"),
+        ("axes: {particles: []}", "must make 1 to 1000000 jobs, got 0"),
+        ("jobs: 3", "plan: must have task, options, axes only, got 'jobs'"),
+        ("options: !!python/object/apply:os.getpid []", "must be plain YAML"),
+    ],
+)
+def test_a_bad_plan_is_refused(tmp_path, text, message):
+    with pytest.raises(ValueError, match=r"plan\.yaml: .*") as error:
+        gs.sweep.read_plan(plan(tmp_path, text))
+    assert message in str(error.value)
+
+
+def outcome(value, error=""):
+    return Outcome({} if error else {"value": value}, error, "", 0.5, 0.4, "host:1", "numpy")
+
+
+def test_a_table_keeps_all_bits_and_survives_a_torn_line(tmp_path):
+    path = tmp_path / "t.csv"
+    jobs = [
+        gs.sweep.Job(task="fit", seed=seed, options={"block": 3}, labels={"log": 'one, "two"'}) for seed in range(4)
+    ]
+    with Table(path) as table:
+        table.add(jobs[1], outcome(0.1 + 0.2), 1)
+        table.add(jobs[0], outcome(0, 'ValueError: a,\n "b"'), 2)
+        with pytest.raises(OSError, match="one sweep at a time"):
+            Table(path, resume=True)
+    whole = path.read_bytes()
+    assert whole.count(b"\n") == 3 and len(list(csv.reader(whole.decode().splitlines()))) == 3
+    path.write_bytes(whole + b"0123456789abcdef,done,fi")
+    columns = gs.sweep.read_table(path)
+    assert columns["key"] == [jobs[1].key, jobs[0].key] and columns["value"] == [0.1 + 0.2, None]
+    assert columns["error"] == [None, 'ValueError: a, "b"'] and columns["axis.log"] == ['one, "two"'] * 2
+    with Table(path, resume=True) as table:
+        assert list(table.rows) == [jobs[1].key, jobs[0].key] and path.read_bytes() == whole
+        more = outcome(2.0)
+        more.values["other"] = True
+        table.add(jobs[2], more, 1)
+        table.finish([job.key for job in jobs])
+    columns = gs.sweep.read_table(path)
+    assert columns["seed"] == [0, 1, 2] and columns["other"] == [None, None, True]
+    with pytest.raises(FileExistsError, match="exists: resume it"):
+        Table(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("a,b\n1,2\n", "must be the table of a sweep"), ("\x00\xff\n", "must be")]
+)
+def test_another_file_is_no_table(tmp_path, text, message):
+    path = tmp_path / "t.csv"
+    path.write_bytes(text.encode("latin1"))
+    with pytest.raises(ValueError, match=message):
+        Table(path, resume=True)
+    assert path.read_bytes() == text.encode("latin1")
+
+
+def test_a_parquet_file_has_the_columns_of_the_csv_file(tmp_path):
+    pytest.importorskip("pyarrow")
+    jobs = [gs.sweep.Job(task="fit", seed=seed) for seed in range(3)]
+    with Table(tmp_path / "t.parquet") as table:
+        for job in jobs:
+            table.add(job, outcome(job.seed / 3, "no" if job.seed == 1 else ""), 1)
+        table.finish([job.key for job in jobs])
+    assert gs.sweep.read_table(tmp_path / "t.parquet") == gs.sweep.read_table(tmp_path / "t.csv")

@@ -1,0 +1,140 @@
+"""A filter over several devices has the bits of one on a single device."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from support.split_scene import field, field_and_compass, states
+
+import gpusense as gs
+from gpusense.interface import constants as c
+from gpusense.reference.drawing import draw_particles
+from gpusense.reference.motion import move_particles
+from gpusense.sweep import ProcessExecutor, SplitParticleFilter
+from gpusense.sweeps.parts import parts_of
+
+OPTIONS = [
+    {},
+    dict(stages=1),
+    dict(stages=1, resampling="stratified", threshold=1.0),
+    dict(particles=(200, 600), stages=2),
+    dict(recovery="augmented", particles=401),
+]
+
+
+def equal(one, two):
+    return all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_particles_weights_and_estimates_have_the_bits_of_one_device(backend, options):
+    options = {"particles": 400, "seed": 5, **options}
+    expected = states(gs.ParticleFilter(field(backend), **options))
+    for count in (1, 2, 3):
+        pf = SplitParticleFilter(field, devices=[backend] * count, **options)
+        assert equal(states(pf), expected)
+        assert (pf.exchanged > 0) == (count > 1) and "split: " in repr(pf)
+
+
+def test_several_sensors_and_a_start_anywhere(needs):
+    device = needs("opencl")
+    options = dict(particles=3000, seed=2, recovery="sensor")
+    one = gs.ParticleFilter(field_and_compass(device), **options)
+    expected = states(one, everywhere=True)
+    pf = SplitParticleFilter(field_and_compass, devices=[device] * 2, **options)
+    assert equal(states(pf, everywhere=True), expected)
+    assert np.array_equal(pf.particles, pf.host_particles()) and abs(pf.weights.sum() - 1) < 1e-12
+    # A filter that begins again forgets its state.
+    assert equal(states(pf), states(one))
+
+
+def test_few_particles_leave_a_device_idle():
+    expected = states(gs.ParticleFilter(field("numpy"), particles=20, seed=1))
+    pf = SplitParticleFilter(field, devices=["numpy"] * 4, particles=20, seed=1)
+    assert equal(states(pf), expected) and pf.explain() == "split: 0 on numpy, 16 on numpy, 0 on numpy, 4 on numpy"
+
+
+@pytest.mark.parametrize("stages", [1, 3])
+def test_gpus_have_the_particles_of_one(warp_as_gpu, stages):
+    expected = states(gs.ParticleFilter(field("warp:cpu"), particles=400, seed=5, stages=stages))
+    pf = SplitParticleFilter(field, devices=["warp:cpu"] * 2, particles=400, seed=5, stages=stages)
+    found = states(pf)
+    # Particles went from device to device, and none through the host.
+    assert pf._cloud._team.direct and pf.exchanged % (400 * 32) == 0 < pf.exchanged
+    # A GPU runs stages that have nothing left, which divides weights by their mean again.
+    for one, two in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
+
+
+def test_gpus_weigh_by_several_sensors(warp_as_gpu):
+    """Readings that cannot be recorded are scored by calls."""
+    expected = states(gs.ParticleFilter(field_and_compass("warp:cpu"), particles=300, seed=5, stages=2), 2)
+    pf = SplitParticleFilter(field_and_compass, devices=["warp:cpu"] * 2, particles=300, seed=5, stages=2)
+    for one, two in zip(states(pf, 2), expected, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12)
+
+
+def test_shares_are_whole_blocks():
+    for count in (1, 16, 17, 1000, 12345):
+        for shards in (1, 2, 3, 8):
+            parts = parts_of(count, shards)
+            assert sum(part.size for part in parts) == count and parts[0].first == 0
+            assert all(one.first + one.size == two.first for one, two in itertools.pairwise(parts))
+            assert all(part.first % part.block == 0 or not part.size for part in parts)
+
+
+def test_kernels_count_particles_from_the_first(device):
+    """Each half of the particles moves and is drawn as in the whole, on every backend."""
+    from gpusense.interface.launches import launch
+
+    settings = np.zeros(c.SETTINGS)
+    settings[c.SEED], settings[c.STEP], settings[c.SCALE], settings[c.JITTER] = 5, 3, 2.0**30, 0.2
+    settings[c.FARTHEST_X : c.FARTHEST_THETA + 1] = 1.0
+    settings[c.DEVIATION : c.DEVIATION + 4], settings[c.REVERSE], settings[c.STRATIFIED] = 0.1, 0.3, 1.0
+    rng, plain = np.random.default_rng(0), frozenset[str]()
+    source, ends = rng.normal(size=600), np.cumsum(np.floor(rng.exponential(size=200) * 2.0**30))
+    state = np.zeros(c.STATE)
+    state[c.TOTAL], state[c.RESAMPLED], state[c.LEFT] = ends[-1], 1.0, 0.5
+    moved, drawn, after = np.zeros(600), np.zeros(600), np.zeros(200)
+    move_particles(plain, source, settings, moved, 200, c.STRAIGHT)
+    draw_particles(plain, source, ends, ends, settings, state, np.zeros(3), drawn, after, 200, 200, 0)
+    for first in (0, 100):
+        settings[c.FIRST], settings[c.WHOLE], settings[c.DRAWN] = first, 200, 200
+        up, target = device.upload, device.empty(300, np.dtype(float))
+        half = source[3 * first : 3 * first + 300].copy()
+        device.run((launch("move_particles", plain, (100,), source=up(half), settings=up(settings), target=target,
+                           particles=100, kind=c.STRAIGHT),))  # fmt: skip
+        assert np.array_equal(device.download(target, np.empty(300)), moved[3 * first : 3 * first + 300])
+        device.run((launch("draw_particles", plain, (100,), source=up(source), weight=up(ends), ends=up(ends),
+                           settings=up(settings), state=up(state), pool=up(np.zeros(3)), target=target,
+                           after=up(np.zeros(100)), particles=200, drawn=100, stage=0),))  # fmt: skip
+        assert np.array_equal(device.download(target, np.empty(300)), drawn[3 * first : 3 * first + 300])
+
+
+def test_other_processes_have_the_same_particles():
+    expected = states(gs.ParticleFilter(field("numpy"), particles=300, seed=3), 3)
+    executors = [ProcessExecutor(["numpy"]) for _ in range(2)]
+    try:
+        pf = SplitParticleFilter(field, devices=["numpy", "numpy"], executors=executors, particles=300, seed=3)
+        assert equal(states(pf, 3), expected)
+        pf.close()
+    finally:
+        for one in executors:
+            one.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(devices="numpy"), "devices: must be a list of selection strings"),
+        (dict(devices=[]), "devices: must be a list of selection strings"),
+        (dict(devices=["numpy"], make=3), "make: must be a function"),
+        (dict(devices=["numpy"], executors=[]), "executors: must be one for each of 1 devices, got 0"),
+        (dict(devices=["numpy"], stages=9), "stages: must be"),
+    ],
+)
+def test_bad_input(options, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        SplitParticleFilter(options.pop("make", field), **options)

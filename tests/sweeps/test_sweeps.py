@@ -1,0 +1,275 @@
+"""Sweeps: equal tables on every executor, failures, workers and schedulers that are killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.room_log import write_room
+from support.split_scene import field, states
+
+import gpusense as gs
+from gpusense.commands import cli
+from gpusense.evaluation.tracking import Track, follow, read_steps, start, summary
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
+from gpusense.sweeps.plan import jobs_of
+from gpusense.sweeps.sending import contents_of
+from gpusense.sweeps.tasks import is_timing
+from gpusense.sweeps.worker import work
+
+SMALL = {"limit": 4, "particles": 100, "beams": 20, "range_max": 20}
+PLAN = {
+    "options": {"map": "map.yaml", "log": "run.log", **SMALL},
+    "axes": {"model": ["field", "beam"], "weights": {"plain": {"temperature": 1.0}, "auto": {}}, "seed": 2},
+}
+dask = pytest.mark.skipif(find_spec("distributed") is None, reason="needs gpusense[sweep]")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("room")
+    write_room(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def processes():
+    with ProcessExecutor(2) as executor:
+        yield executor
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    pytest.importorskip("distributed")
+    with gs.sweep.DaskExecutor(devices=["numpy", "numpy"]) as executor:
+        yield executor
+
+
+def swept(jobs, path, executor=None, **options):
+    ended = gs.sweep.run(jobs, table=path, executor=executor, backend="numpy", **options)
+    return ended, gs.sweep.read_table(path)
+
+
+def made(name, count, **options):
+    return [Job(task=f"support.sweep_tasks:{name}", seed=seed, options=options) for seed in range(count)]
+
+
+@pytest.fixture(scope="module")
+def serial(folder):
+    """Return the jobs of the plan and the table of a serial run."""
+    jobs = jobs_of(PLAN)
+    ended, table = swept(jobs, folder / "serial.csv", root=folder)
+    assert (ended.jobs, ended.done, ended.failed, ended.skipped) == (8, 8, 0, 0)
+    return jobs, table
+
+
+def test_a_serial_sweep_is_that_of_the_parts(serial, folder):
+    jobs, table = serial
+    assert table["key"] == [job.key for job in jobs] and table["axis.weights"][1:3] == ["plain", "auto"]
+    steps = read_steps(folder / "run.log", range_max=20, limit=4)
+    parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
+    model = gs.LikelihoodFieldModel(
+        gs.read_map(folder / "map.yaml"), steps[0].scan.scanner, parameters, beams=20, backend="numpy"
+    )
+    pf = gs.ParticleFilter(model, particles=100, seed=1)
+    start(pf, steps, everywhere=False)
+    track = Track()
+    assert len(list(follow(pf, steps, track))) == 4
+    assert table["error_median"][3] == summary(track)["error_median"] and table["seed"][3] == 1
+    assert max(table["error_median"]) < 1 and len(set(table["error_median"])) == 8
+
+
+def test_tables_of_all_executors_are_equal(serial, folder, processes, request):
+    jobs, expected = serial
+    executors = {"processes": processes}
+    if find_spec("distributed") is not None:
+        executors["cluster"] = request.getfixturevalue("cluster")
+    for name, executor in executors.items():
+        ended, table = swept(jobs, folder / f"{name}.csv", executor, root=folder)
+        assert ended.done == 8 and len(set(table["worker"])) == 2
+        assert {column: table[column] for column in table if not is_timing(column)} == {
+            column: expected[column] for column in expected if not is_timing(column)
+        }
+
+
+def test_score_and_fit_are_tasks(folder):
+    common = dict(map="map.yaml", log="run.log")
+    jobs = [
+        Job(task="score", **common, model="beam", options={"particles": 50, "beams": 10, "range_max": 20}),
+        Job(**common, model="discrete", options={**SMALL, "training": {"every": 1}, "bins": 50}),
+        *(Job(task="fit", **common, seed=seed, options={"block": 1, "range_max": 20}) for seed in (0, 1, 2)),
+        Job(task="fit", map="map.yaml", log="absent.log"),
+    ]
+    _, table = swept(jobs, folder / "tasks.csv", root=folder)
+    assert table["status"] == ["done"] * 5 + ["failed"] and "absent.log" in table["error"][-1]
+    assert table["rank_median"][0] >= 1 and table["error_median"][1] < 0.5 and 0.01 < table["sigma_hit"][2] < 0.1
+    # A bootstrap draws scans anew: close to the fit of all, and never equal.
+    assert len(set(table["sigma_hit"][2:5])) == 3
+
+
+def test_failures_are_rows_and_resuming_repeats_none_of_the_finished(tmp_path):
+    path, jobs = tmp_path / "t.csv", made("failing", 4)
+    ended, table = swept(jobs[:3], path)
+    assert (ended.done, ended.failed) == (2, 1) and table["error"] == [None, "ValueError: a bad seed, 1", None]
+    ended, table = swept(jobs, path, resume=True)
+    assert (ended.done, ended.failed, ended.skipped) == (0, 1, 3) and table["seed"] == [0, 1, 2, 3]
+    ended, table = swept(jobs, path, resume=True, retry_failed=True)
+    assert (ended.done, ended.failed, ended.skipped) == (0, 2, 2) and len(table["seed"]) == 4
+    with pytest.raises(FileExistsError, match="exists: resume it"):
+        swept(jobs, path)
+
+
+def test_what_a_worker_keeps_is_made_once(tmp_path):
+    jobs = [Job(task="support.sweep_tasks:plain", map=name, seed=seed) for name in "ab" for seed in range(3)]
+    assert swept(jobs, tmp_path / "t.csv")[1]["made"] == [True, False, False] * 2
+    # The least recently used one is evicted, and nothing is kept for another sweep, whose files may have changed.
+    more = [Job(task="support.sweep_tasks:plain", map=name, seed=9) for name in "bcdea"]
+    more += [Job(task="support.sweep_tasks:plain", map=name, seed=8) for name in "eb"]
+    assert swept(more, tmp_path / "more.csv")[1]["made"] == [True] * 5 + [False, True]
+
+
+@pytest.mark.parametrize("name", ["processes", pytest.param("cluster", marks=dask)])
+def test_a_killed_worker_loses_nothing(tmp_path, name, request):
+    jobs = made("deadly", 6, folder=str(tmp_path))
+    ended, table = swept(jobs, tmp_path / "t.csv", request.getfixturevalue(name))
+    assert (tmp_path / "killed").exists() and ended.done == 6, table["error"]
+    assert table["seed"] == list(range(6))
+    assert table["value"] == [(seed + 1) / 3 for seed in range(6)]
+
+
+def test_a_job_that_kills_its_workers_fails_alone(tmp_path, processes):
+    jobs = made("deadly", 6, folder=str(tmp_path), always=True)
+    ended, table = swept(jobs, tmp_path / "t.csv", processes, attempts=2)
+    assert (ended.done, ended.failed, ended.repeated) == (5, 1, 2)
+    assert table["error"][4] == "WorkerDied: the worker ended, 2 times" and table["attempts"] == [1, 1, 1, 2, 2, 1]
+
+
+def alive(process):
+    """Tell whether a process runs: one that nothing has waited for is none."""
+    try:
+        os.kill(process, 0)
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except ProcessLookupError:
+        return False
+    except FileNotFoundError:
+        return Path("/proc/self").exists() is False
+
+
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    code = "\n".join([
+        "import gpusense as gs, os, sys, time", "if __name__ == '__main__':",
+        "    ex = gs.sweep.ProcessExecutor(1)", "    print(ex.submit(os.getpid).result(), flush=True)",
+        "    time.sleep(60)",
+    ])  # fmt: skip
+    (tmp_path / "main.py").write_text(code)
+    path = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, str(tmp_path / "main.py")], stdout=subprocess.PIPE, env=path) as parent:
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    end = time.monotonic() + 20
+    while alive(worker):
+        if time.monotonic() > end:
+            os.kill(worker, 9)
+            pytest.fail("the worker outlived its parent")
+        time.sleep(0.05)
+
+
+@dask
+def test_a_killed_scheduler_leaves_finished_jobs(tmp_path):
+    quiet = dict(
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    )
+    program = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    file = tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen(
+        [*program, "--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file)], **quiet
+    )
+    worker = None
+    try:
+        while not file.exists() or not file.read_text().endswith("}"):
+            assert scheduler.poll() is None
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        program = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+        worker = subprocess.Popen([*program, "--resources", "gpusense=1", "--no-nanny"], **quiet)
+        jobs = made("slow", 8, folder=str(tmp_path), seconds=0.02)
+
+        def kill(row):
+            if row["seed"] == "2":
+                scheduler.kill()
+
+        with gs.sweep.DaskExecutor(address) as executor:
+            assert executor.slots == 1 and executor.address == address
+            with pytest.raises(SweepLost, match="has ended before the sweep"):
+                swept(jobs, tmp_path / "t.csv", executor, on_row=kill, window=2)
+            assert not executor.alive
+    finally:
+        for process in (scheduler, worker):
+            if process is not None:
+                process.kill()
+                process.wait()
+    finished = gs.sweep.read_table(tmp_path / "t.csv")["seed"]
+    assert {0, 1, 2} <= set(finished) and len(finished) < 8
+    (tmp_path / "runs").unlink()
+    ended, table = swept(jobs, tmp_path / "t.csv", resume=True)
+    again = [int(line) for line in (tmp_path / "runs").read_text().split()]
+    assert sorted([*again, *finished]) == list(range(8)) == table["seed"] and ended.skipped == len(finished)
+
+
+@dask
+def test_a_cluster_listens_on_the_loopback_only(cluster):
+    assert cluster.address.startswith("tcp://127.0.0.1:") and cluster.slots == 2
+    assert not cluster.dashboard or cluster.dashboard.startswith("http://127.0.0.1:")
+    workers = cluster._workers().values()
+    assert all(one["nanny"].startswith("tcp://127.0.0.1:") for one in workers)
+    assert {one["host"] for one in workers} == {"127.0.0.1"} and {one["nthreads"] for one in workers} == {1}
+
+
+@dask
+def test_a_filter_is_split_over_the_workers_of_a_cluster(cluster):
+    pf = gs.sweep.SplitParticleFilter(field, devices=["numpy"] * 2, executors=cluster.on_each(), particles=300, seed=3)
+    found, expected = states(pf, 2), states(gs.ParticleFilter(field("numpy"), particles=300, seed=3), 2)
+    assert all(np.array_equal(one, other) for one, other in zip(found, expected, strict=True)) and pf.exchanged > 0
+    pf.close()
+
+
+@dask
+def test_maps_and_logs_are_sent_to_workers_once(folder, cluster, tmp_path):
+    jobs = [Job(map="map.yaml", log="run.log", seed=seed, options={**SMALL, "limit": 2}) for seed in (0, 1)]
+    contents = contents_of(jobs, folder)
+    assert set(contents) == {"map.yaml", "run.log"} and isinstance(contents["run.log"], bytes)
+    cluster.send(contents)
+    # There is nothing at the root.
+    ended, table = swept(jobs, tmp_path / "t.csv", cluster, root=tmp_path / "elsewhere")
+    assert ended.done == 2, table["error"]
+
+
+@dask
+def test_the_command_sends_maps_and_logs_to_a_cluster(folder, cluster, tmp_path, capsys):
+    plan = {"options": {**SMALL, "map": "map.yaml", "log": "run.log"}, "axes": {"seed": [7, 8]}}
+    (folder / "plan.yaml").write_text(json.dumps(plan))
+    table = tmp_path / "t.csv"
+    assert cli.main(["sweep", str(folder / "plan.yaml"), "--table", str(table), "--dask", cluster.address]) == 0
+    out, err = capsys.readouterr()
+    assert "2 jobs: 2 done" in out and f"Dask at {cluster.address}, 2 slots" in err
+    assert set(gs.sweep.read_table(table)["device"]) == {"numpy"}
+
+
+def test_an_executor_that_is_shut_down_is_lost(tmp_path):
+    executor = ProcessExecutor(1)
+    executor.shutdown()
+    with pytest.raises(SweepLost, match="must take jobs"):
+        swept(made("plain", 1), tmp_path / "t.csv", executor)
+    assert work(made("failing", 2)[1], str(tmp_path), "numpy").trace.startswith("Traceback")
+    assert isinstance(SerialExecutor().submit(int, "x").exception(), ValueError)
+    for devices in (0, [], "numpy", None):
+        with pytest.raises((TypeError, ValueError), match="devices: must be"):
+            ProcessExecutor(devices)

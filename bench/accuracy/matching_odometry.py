@@ -6,8 +6,10 @@ Rows "scan to scan": each scan of a log is matched to the one before, from the w
 map": odd scans in the map of the even ones; the guess is the last pose with the wheels' motion since, and where a
 match fails, it stays the pose. Errors are those of relative poses between successive scans; corrected poses have
 errors of their own of about a centimetre. "wrong" poses are off by more than 0.2 m or 5 degrees. "confident" matches
-are wrong by more than ten of their deviations. "wheels" are the errors of the odometry itself. "off" is the median
-distance from the corrected pose in the map, "lost" the number of scans more than 0.5 m off it.
+are wrong by more than ten of their deviations. A corrected pose is "contradicted" where the matches to both
+neighbours are wrong, and the match between these, past the scan, is right. "wheels" are the errors of the odometry
+itself. "off" is the median distance from the corrected pose in the map, "lost" the number of scans more than 0.5 m
+off it.
 """
 
 from __future__ import annotations
@@ -31,6 +33,12 @@ from common import make_parser, note, odd_scans, parse, publish, table
 LOGS = ("intel", "freiburg-079", "csail", "aces")
 
 
+def wrong(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return whether poses are off by more than 0.2 m or 5 degrees."""
+    distance, turn = differences(poses, truth)
+    return (distance > WRONG) | (turn > WRONG_TURN)
+
+
 def row(
     kind: str, log: str, found: np.ndarray, truth: np.ndarray, odometry: np.ndarray, failed: int, seconds: float
 ) -> dict[str, Any]:
@@ -41,7 +49,7 @@ def row(
         "what": kind, "log": log, "scans": len(truth) + 1, "median_mm": 1e3 * np.median(distance),
         "p95_mm": 1e3 * np.percentile(distance, 95), "median_deg": np.degrees(np.median(turn)),
         "p95_deg": np.degrees(np.percentile(turn, 95)),
-        "wrong_percent": 100 * np.mean((distance > WRONG) | (turn > WRONG_TURN)), "failed": failed,
+        "wrong_percent": 100 * np.mean(wrong(found, truth)), "failed": failed,
         "wheels_median_mm": 1e3 * np.median(wheels), "wheels_p95_mm": 1e3 * np.percentile(wheels, 95),
         "wheels_median_deg": np.degrees(np.median(wheels_turn)),
         "wheels_p95_deg": np.degrees(np.percentile(wheels_turn, 95)),
@@ -55,7 +63,7 @@ def confident(match: gs.ScanMatch, truth: np.ndarray) -> int:
     variances = np.einsum("sii->si", match.covariance)
     denied = distance > 10 * np.sqrt(variances[:, :2].max(axis=1))
     denied |= turn > 10 * np.sqrt(variances[:, 2])
-    return int((match.converged & ((distance > WRONG) | (turn > WRONG_TURN)) & denied).sum())
+    return int((match.converged & wrong(match.pose, truth) & denied).sum())
 
 
 def recorded(data: Path, log: str) -> tuple[list[gs.Scan], np.ndarray]:
@@ -92,7 +100,13 @@ def scan_to_scan(data: Path, log: str, backend: str, limit: int) -> dict[str, An
     found = np.where(match.converged[:, None], match.pose, guess)
     truth = relative_poses(poses[:-1], poses[1:])
     result = row("scan to scan", log, found, truth, guess, int((~match.converged).sum()), seconds)
-    return result | {"confident": confident(match, truth)}
+    past = gs.match_scan(
+        ranges[:-2], ranges[2:], scans[0].scanner,
+        np.array([gs.compose_poses(*guess[k : k + 2]) for k in range(len(guess) - 1)]), backend=backend,
+    )  # fmt: skip
+    off, agree = wrong(match.pose, truth), ~wrong(past.pose, relative_poses(poses[:-2], poses[2:]))
+    contradicted = int((off[:-1] & off[1:] & agree).sum())
+    return result | {"confident": confident(match, truth), "contradicted": contradicted}
 
 
 def scan_to_map(data: Path, log: str, backend: str, limit: int) -> dict[str, Any]:
@@ -134,12 +148,13 @@ def main(argv: list[str] | None = None) -> None:
             rows.append(follow(arguments.recorded, log, arguments.backend, arguments.scans))
             note(f"{rows[-1]['what']}, {log}")
     columns = ["what", "log", "scans", "median / p95 mm", "median / p95 deg", "wrong %", "confident", "failed",
-               "wheels: median / p95 mm", "deg", "off mm", "lost", "ms"]  # fmt: skip
+               "contradicted", "wheels: median / p95 mm", "deg", "off mm", "lost", "ms"]  # fmt: skip
     lines = [
         [
             r["what"], r["log"], str(r["scans"]), f"{r['median_mm']:.1f} / {r['p95_mm']:.0f}",
             f"{r['median_deg']:.3f} / {r['p95_deg']:.2f}", f"{r['wrong_percent']:.1f}", str(r["confident"]),
-            str(r["failed"]), f"{r['wheels_median_mm']:.0f} / {r['wheels_p95_mm']:.0f}",
+            str(r["failed"]), str(r.get("contradicted", "-")),
+            f"{r['wheels_median_mm']:.0f} / {r['wheels_p95_mm']:.0f}",
             f"{r['wheels_median_deg']:.2f} / {r['wheels_p95_deg']:.1f}", f"{r['off_mm']:.0f}" if "off_mm" in r else "-",
             str(r.get("lost", "-")), f"{r['ms']:.1f}",
         ]

@@ -141,9 +141,10 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--recorded", type=Path, required=True, help="folder of recorded data")
     parser.add_argument("--scans", type=int, default=100_000, help="most scans of a log (default: all)")
+    parser.add_argument("--log", action="append", choices=LOGS, help="default: all")
     arguments: argparse.Namespace = parse(parser, argv)
     rows = []
-    for log in LOGS:
+    for log in arguments.log or LOGS:
         for follow in (scan_to_scan, scan_to_map):
             rows.append(follow(arguments.recorded, log, arguments.backend, arguments.scans))
             note(f"{rows[-1]['what']}, {log}")

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 
 import gpusense as gs
+from gpusense.evaluation.coverage import REGIONS
 from gpusense.evaluation.machine import machine
-from gpusense.evaluation.tracking import REGIONS, START
+from gpusense.evaluation.tracking import START
 from gpusense.localization.defaults import DEFAULTS
 
 LOGS = {"intel": "intel", "csail": "csail", "fr079": "freiburg-079"}

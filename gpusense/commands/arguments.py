@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpusense._util.files import check_writable
+from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.backends import Backend
@@ -22,6 +23,18 @@ BACKEND_HELP = (
 def add_backend(parser: argparse.ArgumentParser, *, default: str = "auto") -> None:
     """Add ``--backend``, one selection string; the library checks it on use."""
     parser.add_argument("--backend", default=default, metavar="DEVICE", help=f"{BACKEND_HELP} (default: %(default)s)")
+
+
+def add_temperature(parser: argparse.ArgumentParser, automatic: str) -> None:
+    """Add ``--temperature``: a number, or ``DEFAULTS.temperature``, which ``automatic`` explains."""
+    parser.add_argument(
+        "--temperature", type=_temperature, default=DEFAULTS.temperature, metavar="T",
+        help=f"factor of log-likelihoods in (0, 1], or {automatic} (default: %(default)s)",
+    )  # fmt: skip
+
+
+def _temperature(text: str) -> float | str:
+    return text if text == "auto" else positive_number(text)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.range_data import RangeData
     from gpusense.learning.beam.incidence import IncidenceFit
     from gpusense.learning.beam.result import BeamFit
+    from gpusense.localization.motion_fit import MotionFit
 
 NAME = "fit"
 HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
@@ -43,15 +44,15 @@ the fit by angles of incidence is scored too.
 A map made from the same scans hides their errors. Fit with other scans than the map's: for a map of the even scans,
 use --every 2 --offset 1.
 
---out writes parameters.yaml (for gpusense and for nav2's amcl) and pictures: readings.png, density.png, trace.png,
-surface.png, and incidence.png where angles of incidence are fitted.
+--out writes parameters.yaml (for 'gpusense localize --params' and for nav2's amcl) and pictures: readings.png,
+density.png, trace.png, surface.png, and incidence.png where angles of incidence are fitted.
 
 Ctrl-C ends the fit and prints the best parameters so far.
 
 Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted.
 
 example:
-  gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --out fitted
+  gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --fit-motion --out fitted
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 
 UNFINISHED = 1
@@ -79,6 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--method", choices=("em", "em-book", "gradient", "hill_climb", "genetic"), default="em",
         help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
     add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
+    add("--sigma-growth", action="store_true", help="also fit a deviation of correct ranges that grows with range")
+    add("--fit-motion", action="store_true", help="also learn the noise of the log's odometry from its poses")
     add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
         help="also fit parameters for BINS bins of the angle of incidence")  # fmt: skip
     add("--restarts", type=whole_number(low=0), default=0, metavar="N", help="further random starts (default: 0)")
@@ -101,6 +104,7 @@ class Result:
         incidence: The fit by angles of incidence, or None.
         held_out: The comparison on held-out readings; empty without ``--holdout``.
         held_out_readings: Number of held-out readings.
+        motion: The noise of the odometry, or None.
     """
 
     data: RangeData
@@ -108,6 +112,7 @@ class Result:
     incidence: IncidenceFit | None
     held_out: list[HeldOut]
     held_out_readings: int
+    motion: MotionFit | None = None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -132,6 +137,8 @@ def _check_sources(args: argparse.Namespace) -> None:
         for name in ("map", "log"):
             if getattr(args, name) is not None:
                 raise ValueError(f"--{name}: must be left out with --pairs, got {getattr(args, name)}")
+        if args.fit_motion:
+            raise ValueError("--fit-motion: must have a --log with odometry, got --pairs")
         if args.range_max is None:
             raise ValueError("--range-max: must be given with --pairs, got none")
     for name in ("map", "log"):
@@ -179,7 +186,7 @@ def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
     blocks = data.block if len(set(known.tolist())) > 1 else None
     fit = fit_beam_parameters(
         data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
-        range_bias=args.range_bias, progress=True, callback=so_far.see, blocks=blocks,
+        range_bias=args.range_bias, sigma_growth=args.sigma_growth, progress=True, callback=so_far.see, blocks=blocks,
     )  # fmt: skip
     so_far.fit = fit
     incidence = None
@@ -191,7 +198,20 @@ def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
     compared = []
     if rest is not None:
         compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, incidence=incidence)
-    return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges))
+    return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges), _motion(args))
+
+
+def _motion(args: argparse.Namespace) -> MotionFit | None:
+    """Learn the noise of the odometry from the chosen scans; None where it is not asked for."""
+    import numpy as np
+
+    from gpusense.evaluation.tracking import read_steps
+    from gpusense.localization.motion_fit import fit_odometry_motion
+
+    if not args.fit_motion:
+        return None
+    steps = read_steps(args.log, every=args.every, offset=args.offset, limit=args.limit)
+    return fit_odometry_motion([step.odometry for step in steps], np.array([step.scan.pose for step in steps]))
 
 
 def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> dict[str, Any]:
@@ -204,6 +224,7 @@ def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> di
         "blocks": len(set(result.data.block.tolist())),
         "fit": result.fit.to_dict(),
         "incidence": None if result.incidence is None else result.incidence.to_dict(),
+        "motion": None if result.motion is None else asdict(result.motion),
         "held_out_readings": result.held_out_readings,
         "held_out": held_out,
         "files": files,
@@ -215,6 +236,8 @@ def _print(result: Result, files: list[Path]) -> None:
     print(f"{result.fit}\nrange_max {result.data.range_max} m, of {len(result.data.ranges)} readings")
     if result.incidence is not None:
         print(f"\n{result.incidence}")
+    if result.motion is not None:
+        print(f"\nodometry: {result.motion.motion}, of {result.motion.steps} steps")
     if result.held_out:
         print(f"\nheld out: {result.held_out_readings} readings, mean log-likelihood of one [nats]")
         columns = ("parameters", "log-likelihood", "std. error", "fitted ones gain", "std. error of it")
@@ -236,36 +259,9 @@ def _error(value: float) -> str:
     return f"{value:.4f}" if math.isfinite(value) else "-"
 
 
-def parameters_yaml(result: Result) -> str:
-    """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
-    import yaml
-
-    values = {name: float(value) for name, value in result.fit.parameters.to_dict().items()}
-    lines = [
-        f"# gpusense fit: {result.fit.hits} ranges and {result.fit.max_readings} readings without return; "
-        f"{result.fit.status}",
-        "# For gpusense: gs.BeamParameters.from_dict(...) takes the mapping beam_model.",
-        yaml.safe_dump({"beam_model": values}, sort_keys=False).rstrip(),
-    ]
-    if result.incidence is not None:
-        lines.append("# For gpusense: gs.IncidenceParameters.from_dict(...).")
-        lines.append(
-            yaml.safe_dump({"incidence_model": result.incidence.parameters.to_dict()}, sort_keys=False).rstrip()
-        )
-    own = ("range_bias", "sigma_growth")
-    shared = {name: value for name, value in values.items() if name not in own}
-    nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
-    lines += [
-        "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
-        "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
-        "# to its likelihood field, which this fit does not cover. It has no range_bias.",
-        yaml.safe_dump({"amcl": {"ros__parameters": nav2}}, sort_keys=False).rstrip(),
-    ]
-    return "\n".join(lines) + "\n"
-
-
 def _write(folder: Path, result: Result) -> list[Path]:
     """Write the files of a fit, each atomically, and return their paths."""
+    from gpusense.commands.parameter_files import parameters_yaml
     from gpusense.plots import fits as fit_plots
     from gpusense.plots.drawing import save
 

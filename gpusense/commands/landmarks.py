@@ -20,6 +20,7 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.output import print_json, print_table
 from gpusense.evaluation.machine import machine, machine_line
+from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.evaluation.landmark_motion import DriftingOdometry
@@ -65,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kind.add_argument("--known", dest="known", action="store_true", default=True,
         help="the landmark of each reading is known by its barcode (default)")  # fmt: skip
     kind.add_argument("--unknown", dest="known", action="store_false", help="the landmark of each reading is unknown")
-    add("--particles", type=whole_number(low=2), default=2000, metavar="N",
+    add("--particles", type=whole_number(low=2), default=DEFAULTS.particles, metavar="N",
         help="number of the filter's particles (default: %(default)s)")  # fmt: skip
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
         help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "

@@ -12,6 +12,7 @@ from gpusense.commands.arguments import (
     add_backend,
     add_json,
     add_seed,
+    add_temperature,
     not_negative_number,
     output_path,
     positive_number,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Step, Track
     from gpusense.localization.filter import ParticleFilter
     from gpusense.localization.motion import MotionModel
+    from gpusense.plots.viewer import Recording
 
 NAME = "localize"
 HELP = "Localise a robot along a recorded log with a particle filter."
@@ -34,7 +36,8 @@ LOST = 1
 _EPILOG = """\
 The filter begins around the first logged pose, or with --global anywhere in the free space of the map. It moves with
 the log's odometry and weighs each chosen scan. Errors are those of the weighted mean against the logged poses, where
-the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate.
+the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate. A rank is
+the share of particles behind a logged pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence.
 
 The verdict at the end does not need logged poses: it is 'lost' if the estimates of the last tenth of the scans explain
 too few of their beams, as on a wrong map.
@@ -59,18 +62,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
     add("--global", dest="everywhere", action="store_true", help="begin anywhere in the free space of the map")
     add("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model, such as 'gpusense fit --out' writes (default: a likelihood field)")  # fmt: skip
+        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes (default: a likelihood "
+        "field, and the noise below)")  # fmt: skip
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
-    add("--temperature", type=_temperature, default=DEFAULTS.temperature, metavar="T",
-        help="factor of log-likelihoods in (0, 1], or auto: learned from the scans (default: %(default)s)")  # fmt: skip
+    add_temperature(parser, "auto: learned from the scans")
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
         help="variances of the odometry per squared motion, Probabilistic Robotics table 5.6: of turns by turns "
         "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
-        "(default: 0.02 each)")  # fmt: skip
+        f"(default: {' '.join(map(str, DEFAULTS.alpha))})")  # fmt: skip
+    add("--sideways", type=not_negative_number, metavar="S",
+        help="variance of slips to the side per squared turn [m^2/rad^2] "
+        f"(default: {DEFAULTS.sideways})")  # fmt: skip
     add("--reverse", type=not_negative_number, metavar="P",
-        help="probability that a translation went the other direction (default: 0.02)")  # fmt: skip
+        help=f"probability that a translation went the other direction (default: {DEFAULTS.reverse})")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
     add("--recovery", choices=("augmented", "sensor"), help="inject particles when the filter is lost")
+    add("--beam-skip", type=positive_number, metavar="P",
+        help="leave out beams, such as of people, that less than this share of the particles explains")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")
     add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
     add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
@@ -82,10 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, particles, estimated and logged poses")  # fmt: skip
-
-
-def _temperature(text: str) -> float | str:
-    return text if text == "auto" else positive_number(text)
+    add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,17 +100,35 @@ def run(args: argparse.Namespace) -> int:
     steps = read_steps(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
     pf = _filter(args, steps)
     start(pf, steps, everywhere=args.everywhere)
-    track = Track()
+    track, recording = Track(), _recording(args, pf)
     try:
         with progress(len(steps)) as step:
             step("starting")
             for one in follow(pf, steps, track):
                 step(_text(track, one))
+                if recording is not None:
+                    recording.add(pf, track, one)
     except KeyboardInterrupt:
         if track.steps:
-            _report(args, pf, track, len(steps))
+            _report(args, pf, track, len(steps), recording)
         raise
-    return LOST if _report(args, pf, track, len(steps))["lost"] else 0
+    return LOST if _report(args, pf, track, len(steps), recording)["lost"] else 0
+
+
+def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
+    """Begin a recording; None where none is asked for.
+
+    Raises:
+        ValueError: the library is not installed.
+    """
+    if args.record is None:
+        return None
+    from gpusense.plots.viewer import Recording
+
+    try:
+        return Recording(pf.grid)
+    except ImportError as error:
+        raise ValueError(f"--record: {error}") from None
 
 
 def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
@@ -114,7 +137,7 @@ def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
     Raises:
         ValueError: an option breaks its rule, a file its format, or the backend is absent.
     """
-    from gpusense.commands.score import read_beam_parameters
+    from gpusense.commands.parameter_files import read_localization
     from gpusense.localization.filter import ParticleFilter
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
@@ -124,20 +147,21 @@ def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
     grid, scanner = read_map(args.map), steps[0].scan.scanner
     beams = DEFAULTS.beams if args.beams is None else args.beams
     model: Any
-    if args.parameters is not None:
-        model = BeamModel(grid, scanner, read_beam_parameters(args.parameters), beams=beams, backend=args.backend)
+    beam, noise = (None, {}) if args.parameters is None else read_localization(args.parameters)
+    if beam is not None:
+        model = BeamModel(grid, scanner, beam, beams=beams, backend=args.backend)
     else:
         field = LikelihoodFieldParameters(**DEFAULTS.field)
         model = LikelihoodFieldModel(grid, scanner, field, beams=beams, backend=args.backend)
     particles = DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles
     return ParticleFilter(
-        model, motion=_motion(args, steps), particles=particles if args.particles is None else args.particles,
-        seed=args.seed, temperature=args.temperature, recovery=args.recovery,
+        model, motion=_motion(args, steps, noise), particles=particles if args.particles is None else args.particles,
+        seed=args.seed, temperature=args.temperature, recovery=args.recovery, beam_skip=args.beam_skip,
     )  # fmt: skip
 
 
-def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
-    """Return the motion model of the options.
+def _motion(args: argparse.Namespace, steps: list[Step], noise: dict[str, Any]) -> MotionModel:
+    """Return the motion model of the options, and of the file of parameters where an option is not given.
 
     Raises:
         ValueError: there are no logged poses to learn from, or a number breaks its rule.
@@ -150,9 +174,8 @@ def _motion(args: argparse.Namespace, steps: list[Step]) -> MotionModel:
         if len(poses) < len(steps):
             raise ValueError("--fit-motion: needs a log with poses, got one without")
         return fit_odometry_motion([step.odometry for step in steps], poses).motion
-    plain = OdometryMotion()
-    alpha = plain.alpha if args.motion_noise is None else tuple(args.motion_noise)
-    return OdometryMotion(alpha, plain.reverse if args.reverse is None else args.reverse)
+    given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
+    return OdometryMotion(**noise | {name: value for name, value in given.items() if value is not None})
 
 
 def _text(track: Track, step: Step) -> str:
@@ -162,7 +185,9 @@ def _text(track: Track, step: Step) -> str:
     return f"scan {step.index}{error}, {track.sizes[-1]:.0f} effective, {rate:.0f} scans/s"
 
 
-def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int) -> dict[str, Any]:
+def _report(
+    args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recording: Recording | None
+) -> dict[str, Any]:
     """Write the files, and print the results; return the summary."""
     from gpusense.evaluation.tracking import summary, write_tum
 
@@ -171,6 +196,8 @@ def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: 
         write_tum(track, args.tum)
     if args.plot is not None:
         _draw(args.plot, pf, track)
+    if recording is not None:
+        recording.write(track, args.record)
     if args.json:
         options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
@@ -178,7 +205,7 @@ def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: 
         print_json(document | {"poses": poses, "machine": machine()})
         return result
     _print(pf, result, chosen)
-    for path in (args.tum, args.plot):
+    for path in (args.tum, args.plot, args.record):
         if path is not None:
             print(f"written: {path}")
     return result
@@ -186,7 +213,7 @@ def _report(args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
     """Print the summary."""
-    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items()}
+    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name != "rank_histogram"}
     print(f"{pf!r}\n")
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
@@ -199,7 +226,9 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
             f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m\n"
             f"within 1 m, 20 deg    {at}\n"
             f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
-            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)"
+            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)\n"
+            f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad\n"
+            f"ranks of logged poses {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
         )
     print(
         f"effective sample size median {s['effective_sample_size_median']}\n"
@@ -208,6 +237,10 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
         f"verdict: {_verdict(result)}\n\n{machine_line()}",
     )
     sys.stdout.flush()
+
+
+def _ranks(histogram: list[float]) -> str:
+    return " ".join(f"{100 * share:.0f}" for share in histogram)
 
 
 def _verdict(result: dict[str, Any]) -> str:

@@ -5,31 +5,30 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gpusense._util.progress import is_terminal, progress
 from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
     add_seed,
+    add_temperature,
     not_negative_number,
     number,
     output_path,
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import TableStream, print_json
-from gpusense.evaluation.machine import machine, machine_line
+from gpusense.commands.output import TableStream
+from gpusense.commands.score_report import number_text, print_report
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.agreement import Agreement, Model
+    from gpusense.evaluation.agreement import Model
+    from gpusense.evaluation.fitness import FitnessOfLog
     from gpusense.evaluation.scoring import BackendScore, LogScoring, ScanScore
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
-    from gpusense.world.parameters import BeamParameters
-    from gpusense.world.scanner import Scanner
 
 NAME = "score"
 HELP = "Score particles with the scans of a recorded log, and rank the logged poses among them."
@@ -40,12 +39,15 @@ _EPILOG = """\
 Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
 The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
 weighted mean excludes the logged pose. Default parameters are those of BeamParameters and LikelihoodFieldParameters.
-A temperature of 0.1 compensates for beams that are not independent: more particles then share the weight.
+Beams of a scan are not independent, so the temperature multiplies their sum. By default it is calibrated: from the
+correlation of beams at the logged poses of the first 100 chosen scans. --temperature 1 is the plain product.
+
+The verdict tells whether the logged poses explain the beams of their scans, which they do not on another map.
 
 A row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
 
-Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, 2 bad input,
-130 interrupted.
+Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, or the logged poses
+do not fit the map, 2 bad input, 130 interrupted.
 
 example:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
@@ -92,8 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--range-max", type=positive_number, metavar="M",
         help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
-    add("--temperature", type=positive_number, default=1.0, metavar="T",
-        help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
+    add_temperature(parser, "auto: calibrated from the chosen scans")
     group = parser.add_argument_group("parameters of the model")
     group.add_argument("--parameters", type=Path, metavar="YAML",
         help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
@@ -108,31 +109,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print the results; after Ctrl-C those so far."""
+    from gpusense.evaluation.fitness import FitnessOfLog
     from gpusense.evaluation.scoring import LogScoring, ParticleSampler, logged_scans
     from gpusense.world.map_files import read_map
 
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
     scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
-    models = make_models(args, grid, scans[0][1].scanner)
-    scoring = LogScoring(models, sampler)
+    models = make_models(args, grid, scans)
+    scoring, fitness = LogScoring(models, sampler), FitnessOfLog(models[0], seed=args.seed)
     try:
-        _score(args, models, scans, scoring)
+        _score(args, models, scans, scoring, fitness)
     except KeyboardInterrupt:
         scores, agreements = scoring.results()
         if scores:
-            _report(args, models, scores, agreements, len(scans))
+            print_report(args, models, scores, agreements, fitness.result(), len(scans))
         raise
-    scores, agreements = scoring.results()
-    _report(args, models, scores, agreements, len(scans))
+    (scores, agreements), fit = scoring.results(), fitness.result()
+    print_report(args, models, scores, agreements, fit, len(scans))
     if args.plot is not None:
         _draw(args.plot, grid, scores[0])
         if not args.json:
             print(f"drawn: {args.plot}")
-    return 0 if all(agreement.same for agreement in agreements) else DIFFERENT
+    return 0 if fit.fits and all(agreement.same for agreement in agreements) else DIFFERENT
 
 
-def _score(args: argparse.Namespace, models: list[Model], scans: list[tuple[int, Scan]], scoring: LogScoring) -> None:
+def _score(
+    args: argparse.Namespace,
+    models: list[Model],
+    scans: list[tuple[int, Scan]],
+    scoring: LogScoring,
+    fitness: FitnessOfLog,
+) -> None:
     """Score the scans, and print a row for each as it comes."""
     # Rows on a terminal show the progress.
     shown = not args.json and is_terminal(sys.stdout)
@@ -142,32 +150,17 @@ def _score(args: argparse.Namespace, models: list[Model], scans: list[tuple[int,
         for index, scan in scans:
             step(f"scan {index}")
             scores = scoring.add(index, scan)
+            fitness.add(index, scan)
             if not args.json:
                 for model, score in zip(models, scores, strict=True):
                     table.add(_row(model.device.selection, score))
 
 
 def _row(backend: str, scan: ScanScore) -> dict[str, str]:
-    position, heading = (_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading))
+    position, heading = (number_text(value, "none: all -inf") for value in (scan.error_position, scan.error_heading))
     values = (str(scan.index), backend, f"{scan.rank:g}", f"{scan.percentile:.3f}", position, heading,
-              _text(scan.effective), str(scan.beams))  # fmt: skip
+              number_text(scan.effective), str(scan.beams))  # fmt: skip
     return dict(zip(_COLUMNS, values, strict=True))
-
-
-def _report(
-    args: argparse.Namespace,
-    models: list[Model],
-    scores: list[BackendScore],
-    agreements: list[Agreement],
-    chosen: int,
-) -> None:
-    """Print the results of all scans, or of those before an interrupt."""
-    if args.json:
-        print_json(_document(args, models, scores, agreements) | {"scans_chosen": chosen})
-        return
-    _print(args, models, scores, agreements)
-    if len(scores[0].scans) < chosen:
-        print(f"\ninterrupted: results of {len(scores[0].scans)} of {chosen} scans")
 
 
 def _draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
@@ -177,12 +170,13 @@ def _draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
     save(scores_figure(grid, score), path)
 
 
-def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner) -> list[Model]:
-    """Make the model on each backend, each device once.
+def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> list[Model]:
+    """Make the model on each backend, each device once, with one temperature.
 
     Raises:
         ValueError: a backend is absent, or a parameter breaks its rule or belongs to the other model.
     """
+    from gpusense.evaluation.fitness import temperature_of_log
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
@@ -196,97 +190,26 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner)
     if args.parameters is not None:
         if args.model != "beam":
             raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
+        from gpusense.commands.parameter_files import read_beam_parameters
+
         beam = read_beam_parameters(args.parameters)
-    models: dict[str, Model] = {}
-    for backend in args.backend or ["auto"]:
-        common = {
-            "backend": backend, "precision": args.precision, "temperature": args.temperature, "beams": args.beams,
-        }  # fmt: skip
-        model: Model
+    scanner, backends = scans[0][1].scanner, args.backend or ["auto"]
+
+    def make(backend: str, temperature: float) -> Model:
+        common = {"backend": backend, "precision": args.precision, "temperature": temperature, "beams": args.beams}
         if args.model == "beam":
-            model = BeamModel(grid, scanner, beam.replace(**changes), **common)
-        else:
-            model = LikelihoodFieldModel(grid, scanner, LikelihoodFieldParameters().replace(**changes), **common)
+            return BeamModel(grid, scanner, beam.replace(**changes), **common)
+        return LikelihoodFieldModel(grid, scanner, LikelihoodFieldParameters().replace(**changes), **common)
+
+    temperature = args.temperature
+    if temperature == "auto":
+        temperature = temperature_of_log(make(backends[0], 1.0), scans)
+    models: dict[str, Model] = {}
+    for backend in backends:
+        model = make(backend, temperature)
         models.setdefault(model.device.selection, model)
     return list(models.values())
 
 
-def read_beam_parameters(path: Path) -> BeamParameters:
-    """Read the mapping ``beam_model`` of a YAML file.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        ValueError: the file lacks the mapping, or a parameter breaks its rule.
-    """
-    from gpusense._util import checks
-    from gpusense._util.files import read_mapping
-    from gpusense.world.parameters import BeamParameters
-
-    values = read_mapping(checks.existing_file(path)).get("beam_model")
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: must hold a mapping beam_model, got {checks.show(values)}")
-    try:
-        return BeamParameters.from_dict(values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: beam_model: {error}") from None
-
-
-def _document(
-    args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
-) -> dict[str, Any]:
-    from gpusense.evaluation.scoring import summary
-
-    options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
-    return {
-        "options": options,
-        "parameters": models[0].parameters.to_dict(),
-        "range_max": models[0].scanner.range_max,
-        "backends": [asdict(score) | {"summary": summary(score)} for score in scores],
-        "agreement": [asdict(agreement) | {"same_ranking": agreement.same} for agreement in agreements],
-        "machine": machine(),
-    }
-
-
-def _print(
-    args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
-) -> None:
-    from gpusense.evaluation.scoring import summary
-
-    values = ", ".join(f"{name} {value}" for name, value in models[0].parameters.to_dict().items())
-    print(f"\n{args.model} model, {args.precision}: {values}, range_max {models[0].scanner.range_max} m")
-    for score in scores:
-        s = {name: _text(value) for name, value in summary(score).items()}
-        print(
-            f"\n{score.device.selection} ({score.device.name}): {s['scans']} scans, {score.particles} particles each\n"
-            f"  rank of the logged pose: median {s['rank_median']}\n"
-            f"  percentile of the logged pose: median {s['percentile_median']}, least {s['percentile_min']}\n"
-            f"  error of the weighted mean: median {s['error_position_median']} m and {s['error_heading_median']} rad, "
-            f"90 % below {s['error_position_90']} m and {s['error_heading_90']} rad\n"
-            f"  effective sample size: median {s['effective_median']}; scans with every particle at -inf: "
-            f"{s['degenerate']}\n  {s['particle_beams_per_second']} particle-beams/s"
-        )
-    for agreement in agreements:
-        print(f"\n{_verdict(agreement)}")
-    print(f"\n{machine_line()}")
-
-
-def _verdict(a: Agreement) -> str:
-    if a.same:
-        verdict = "the same ranking" if a.same_order == a.scans else "the same ranking to within rounding"
-    else:
-        verdict = "ANOTHER RANKING"
-    return (
-        f"{a.left} and {a.right}: {verdict}\n"
-        f"  the logged pose has the same rank in {a.same_rank} of {a.scans} scans, no two particles change places "
-        f"in {a.same_order}; least rank correlation {a.spearman:.9f}\n"
-        f"  largest difference {a.difference:.3g} nats; particles that change places are at most {a.gap:.3g} nats "
-        f"apart; rounding explains {a.allowed:.3g}"
-    )
-
-
 def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
-
-
-def _text(value: float | None, absent: str = "-") -> str:
-    return absent if value is None else f"{value:.4g}"

@@ -57,7 +57,7 @@ class DriftingOdometry:
         root = math.sqrt(checks.real("seconds", arguments[2], low=0))
         # Two turns of a step share the heading's walk.
         least = (self.drift * root, self.drift_heading * root / math.sqrt(2))
-        return OdometryMotion(self.alpha, self.reverse, least).sampled(*arguments[:2])
+        return OdometryMotion(self.alpha, self.reverse, least, sideways=0.0).sampled(*arguments[:2])
 
 
 def heading_drift(run: LandmarkRun) -> float:
@@ -94,7 +94,7 @@ def run_motion(
         fit: Learn ``alpha`` and ``reverse`` by :func:`fit_odometry_motion` where they are None.
     """
     if fit and (alpha is None or reverse is None):
-        found = fit_odometry_motion(run.odometry, run.truth).motion
+        found = fit_odometry_motion(run.odometry, run.truth, systematic=False).motion
         alpha = found.alpha if alpha is None else alpha
         reverse = found.reverse if reverse is None else reverse
     if drift is None:

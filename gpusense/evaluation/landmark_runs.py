@@ -12,7 +12,6 @@ from gpusense.evaluation.landmark_motion import DriftingOdometry, run_motion
 from gpusense.learning.landmark.fit import fit_landmark_parameters
 from gpusense.learning.landmark.result import LandmarkFit
 from gpusense.learning.landmark.suspicious import Suspicions, suspicious_landmarks
-from gpusense.localization.evidence import Evidence
 from gpusense.localization.filter import ParticleFilter
 from gpusense.logs.records import LandmarkRun
 from gpusense.models.landmark.model import LandmarkModel
@@ -152,7 +151,7 @@ def localise(
     """
     pf = ParticleFilter(model, motion=run_motion(run) if motion is None else motion, particles=particles, seed=seed)
     pf.initialize(mean=run.truth[0], covariance=np.diag([START**2, START**2, START_HEADING**2]))
-    evidence, degenerate = Evidence(model, seed=seed), 0
+    degenerate = 0
     estimate, gain, lost = np.empty_like(run.truth), np.empty(len(run.time)), np.zeros(len(run.time), np.bool_)
     rows = {int(run.scan[first]): slice(first, last) for first, last in _scans(run)}
     for s in range(len(run.time)):
@@ -162,11 +161,10 @@ def localise(
             pf.predict(run.odometry[s - 1], run.odometry[s], float(run.time[s] - run.time[s - 1]))
         if s in rows:
             features, ids = run.features[rows[s]], run.ids[rows[s]] if known else None
-            evidence.predicted(pf.host_particles(), pf.host_weights(), features)
             pf.correct((features, ids))
         found = pf.estimate()
         degenerate += found.degenerate and s in rows
-        estimate[s], gain[s], lost[s] = found.pose, evidence.gain, evidence.lost
+        estimate[s], gain[s], lost[s] = found.pose, pf.gain, found.lost
     return _track(run, estimate, degenerate, gain, lost)
 
 

@@ -8,23 +8,23 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.files import write_whole
+from gpusense.evaluation.coverage import REGIONS, coverage_report, rank_of
+from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan, read_log
 
 Floats = NDArray[np.float64]
-# Quantiles of chi-square with 3 degrees of freedom.
-REGIONS = {"50": 2.366, "80": 4.642, "95": 7.815}
 # A track has converged where the next scans are within these of the truth [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5
 # Deviations of a tracking start: x, y [m] and heading [rad].
-START = (0.5, 0.5, 0.26)
+START = DEFAULTS.start
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,7 @@ class Track:
         steps: Scans so far.
         poses: Estimated poses.
         covariances: Their covariances.
+        ranks: Ranks of the logged poses among the particles (:func:`rank_of`); empty without logged poses.
         sizes: Effective sample sizes.
         lost: Verdicts.
         explained: Shares of beams that the estimates explain.
@@ -106,6 +107,7 @@ class Track:
     steps: list[Step] = field(default_factory=list)
     poses: list[Floats] = field(default_factory=list)
     covariances: list[Floats] = field(default_factory=list)
+    ranks: list[Floats] = field(default_factory=list)
     sizes: list[float] = field(default_factory=list)
     lost: list[bool] = field(default_factory=list)
     explained: list[float] = field(default_factory=list)
@@ -120,21 +122,17 @@ class Track:
 
     def errors(self) -> tuple[Floats, Floats] | None:
         """Return the errors of position [m] and heading [rad] of each scan; None without logged poses."""
-        truth = self.truth
-        if truth is None:
-            return None
-        difference = np.array(self.poses).reshape(-1, 3) - truth
-        return np.hypot(difference[:, 0], difference[:, 1]), np.abs(wrap_angle(difference[:, 2]))
+        difference = self.differences()
+        return None if difference is None else (np.hypot(*difference[:, :2].T), np.abs(difference[:, 2]))
 
-    def squared_distances(self) -> Floats | None:
-        """Return the normalised estimation error squared (NEES) of each scan; None without logged poses."""
+    def differences(self) -> Floats | None:
+        """Return (S, 3) estimates less logged poses, headings wrapped; None without logged poses."""
         truth = self.truth
         if truth is None:
             return None
         difference = np.array(self.poses).reshape(-1, 3) - truth
         difference[:, 2] = wrap_angle(difference[:, 2])
-        covariance = np.array(self.covariances).reshape(-1, 3, 3) + 1e-12 * np.eye(3)
-        return np.einsum("si,si->s", difference, np.linalg.solve(covariance, difference[:, :, None])[:, :, 0])
+        return difference
 
 
 def start(pf: ParticleFilter, steps: Sequence[Step], *, everywhere: bool) -> None:
@@ -167,8 +165,12 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
         found = pf.estimate()
         times.append(time.perf_counter())
         predict, correct, estimate = np.diff(times)
+        logged = step.scan.pose
+        rank = None if logged is None else rank_of(pf.host_particles(), pf.host_weights(), np.array(logged))
         track.poses.append(found.pose)
         track.covariances.append(found.covariance)
+        if rank is not None:
+            track.ranks.append(rank)
         track.sizes.append(found.effective_sample_size)
         track.lost.append(found.lost)
         track.explained.append(found.explained)
@@ -178,13 +180,13 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
         yield step
 
 
-def summary(track: Track) -> dict[str, float | int | bool | None]:
+def summary(track: Track) -> dict[str, Any]:
     """Return figures of a track: errors, coverage, convergence, verdict and times; None without logged poses."""
     count = len(track.steps)
     seconds = np.array(track.seconds).reshape(-1, 4) * 1000
     means = np.median(seconds, axis=0)
     tail = track.lost[-max(count // 10, 1) :]
-    result: dict[str, float | int | bool | None] = {
+    result: dict[str, Any] = {
         "scans": count,
         "lost": bool(np.mean(tail) > 0.5),
         "scans_lost": int(np.sum(track.lost)),
@@ -193,8 +195,8 @@ def summary(track: Track) -> dict[str, float | int | bool | None]:
         "effective_sample_size_median": float(np.median(track.sizes)),
     }
     result |= dict(zip(("ms_predict", "ms_score", "ms_resample", "ms_estimate"), map(float, means), strict=True))
-    errors, squared, truth = track.errors(), track.squared_distances(), track.truth
-    if errors is None or squared is None or truth is None:
+    errors, differences, truth = track.errors(), track.differences(), track.truth
+    if errors is None or differences is None or truth is None:
         return result | dict.fromkeys(_WITH_TRUTH)
     position, heading = errors
     relative = pose_difference(np.array(track.poses)[:-1], np.array(track.poses)[1:])
@@ -203,15 +205,18 @@ def summary(track: Track) -> dict[str, float | int | bool | None]:
     values = (
         float(np.median(position)), float(np.percentile(position, 95)), float(np.median(heading)),
         float(np.percentile(heading, 95)), float(np.median(step_errors)), float(np.percentile(step_errors, 95)),
-        _converged(position, heading), float(np.median(squared)),
-        *(float(np.mean(squared < limit)) for limit in REGIONS.values()),
+        _converged(position, heading),
     )  # fmt: skip
-    return result | dict(zip(_WITH_TRUTH, values, strict=True))
+    result |= dict(zip(_ERRORS, values, strict=True))
+    return result | coverage_report(differences, np.array(track.covariances), np.array(track.ranks))
 
 
-_WITH_TRUTH = (
+_ERRORS = (
     "error_median", "error_95", "heading_median", "heading_95", "relative_median", "relative_95", "converged_at",
-    "nees_median", *(f"coverage_{name}" for name in REGIONS),
+)  # fmt: skip
+_WITH_TRUTH = (
+    *_ERRORS, *(f"coverage_{name}" for name in REGIONS), "nees_median", "width_95", "width_heading_95",
+    "rank_histogram",
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Defaults of localisation that the filter and the commands share."""
+"""Defaults of localisation that the filter, the motion model and the commands share; the docs have them as a table."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ class Defaults(NamedTuple):
         temperature: Of the filter.
         calibrations: Corrections from which the temperature is learned at first; later two of ten.
         field: Parameters of the likelihood field of ``gpusense localize``.
+        alpha: Noise of the odometry.
+        reverse: Probability that a translation went the other direction.
+        least: Least deviations of a step [m, rad].
+        sideways: Variance of slips to the side per squared turn [m^2/rad^2].
+        start: Deviations of a start at a known pose: x, y [m] and heading [rad].
     """
 
     particles: int = 2000
@@ -49,6 +54,11 @@ class Defaults(NamedTuple):
     field: Mapping[str, Any] = MappingProxyType(
         dict(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.07, interpolation="bilinear")
     )
+    alpha: tuple[float, float, float, float] = (0.02, 0.02, 0.02, 0.02)
+    reverse: float = 0.02
+    least: tuple[float, float] = (0.01, 0.005)
+    sideways: float = 0.02
+    start: tuple[float, float, float] = (0.5, 0.5, 0.26)
 
 
 DEFAULTS = Defaults()

@@ -20,7 +20,7 @@ class Estimate:
         pose: (3,) x, y, theta [m, m, rad].
         covariance: (3, 3) covariance of the particles about it.
         effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N.
-        lost: Whether recent scans contradict the pose; see ``docs/localization.md``.
+        lost: Whether recent scans or features contradict the pose; see ``docs/localization.md``.
         explained: Share of the beams of the last scan that the pose explains; NaN without one.
         temperature: Of the first sensor.
         used: Share of the temperature that the stages of the last correction used: less than 1 where even the last

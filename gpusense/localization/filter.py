@@ -35,7 +35,7 @@ from gpusense.interface.constants import (
     THRESHOLD,
 )
 from gpusense.interface.launches import Program
-from gpusense.localization import starts
+from gpusense.localization import skipping, starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
@@ -72,6 +72,9 @@ class ParticleFilter:
         recovery: None, "augmented": inject uniform particles where the scans' likelihood drops (*Probabilistic
             Robotics* table 8.3), or "sensor": inject them where the scan is likely (sensor resetting, Lenser and
             Veloso 2000) as soon as the filter finds itself lost.
+        beam_skip: None, or a share of the particles in (0, 1): a beam that fewer of them explain is left out, such as
+            one of a person. A scan of which most beams would be left out is used as a whole, and so is each scan while
+            the particles lie apart. Each correction then asks 100 particles on the host first.
 
     Raises:
         TypeError: A model or option of another type.
@@ -99,6 +102,7 @@ class ParticleFilter:
         threshold: float = DEFAULTS.threshold,
         stages: int = DEFAULTS.stages,
         recovery: str | None = None,
+        beam_skip: float | None = None,
     ) -> None:
         chosen = list(models) if isinstance(models, Sequence) else [models]
         if not 0 < len(chosen) <= _MOST_SENSORS:
@@ -124,11 +128,12 @@ class ParticleFilter:
         self.threshold = checks.real("threshold", threshold, above=0, high=1)
         self.stages = checks.integer("stages", stages, low=1, high=6)
         self.recovery = None if recovery is None else checks.choice("recovery", recovery, ("augmented", "sensor"))
+        self.beam_skip = None if beam_skip is None else checks.real("beam_skip", beam_skip, above=0, below=1)
         self._cloud = Cloud(self._backend, self._most, len(self._sensors), self._sensors[0].precision)
         self._step, self._started, self._pending = 0, False, _STILL
         self._shown, self._wide = self._most, 0
         self._pool_size, self._spread = 0, (0.0, 0.0, 0.0)
-        self._verdict = Verdict(self._sensors, self._random_poses)
+        self._verdict = Verdict(self._sensors, self._random_poses, seed=self.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
 
     def __repr__(self) -> str:
@@ -258,6 +263,11 @@ class ParticleFilter:
         given = self._given(readings)
         if not given:
             return
+        if self._verdict.watches(dict(given)):
+            self._verdict.predicted(self.host_particles(), self.host_weights(), dict(given))
+        whole = dict(given)
+        if self.beam_skip is not None:
+            given = self._without_skipped(given, self.beam_skip)
         motion, self._pending = self._pending, _STILL
         drawn = self._cloud.count if self._least == self._most else self._wanted()
         settings = self._settings(motion, [index for index, _ in given])
@@ -265,7 +275,7 @@ class ParticleFilter:
         drawn = self._score(given, motion.kind, drawn)
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
-        self._last = dict(given)
+        self._last = whole
         self._wide = max(self._wide - 1, 0)
         self._verdict.corrected()
         if self.temperature == "auto":
@@ -326,6 +336,20 @@ class ParticleFilter:
                 self._backend.upload(log_p, cloud.log_p[place])
 
         return cloud.correct(kind, self.stages, drawn, len(given), score)
+
+    def _without_skipped(self, given: list[tuple[int, tuple[Any, ...]]], share: float) -> list[tuple[int, Any]]:
+        """Return readings without the beams that too few particles explain."""
+        poses, weights = self.host_particles(), self.host_weights()
+        if not skipping.together(poses, weights):
+            return given
+        asked = slice(None, None, max(len(poses) // skipping.ASKED, 1))
+        few, anywhere = (poses[asked], weights[asked]), self._verdict.anywhere()
+        return [
+            (i, skipping.without_skipped(self._sensors[i], reading, *few, anywhere, share))
+            if self._sensors[i].calibrates
+            else (i, reading)
+            for i, reading in given
+        ]
 
     def _programs(self, source: int, given: list[tuple[int, tuple[Any, ...]]]) -> tuple[Any, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
@@ -449,6 +473,14 @@ class ParticleFilter:
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""
         return tuple(sensor.temperature(self.temperature) for sensor in self._sensors)
+
+    @property
+    def gain(self) -> float:
+        """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
+
+        NaN without a landmark model, and before 20 scans with features.
+        """
+        return self._verdict.gain
 
     @property
     def scoring_seconds(self) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
+from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.pose_algebra import pose_difference
 
 # Below this translation [m] no direction can be read from it.
@@ -96,6 +97,12 @@ class OdometryMotion:
             sign; the tracks of such a log are lost at 0.
         least: Standard deviations of translation and turns that are always added [m, rad]: wheels that slip, a robot
             that is pushed.
+        systematic: Errors that repeat, and are corrected before noise is added: share of the translation that the
+            odometer misses, share of the turns that it misses, and turn for each metre [rad/m], as of wheels of
+            unequal radius (Borenstein and Feng 1996).
+        sideways: Variance of a translation to the side per squared turn [m^2/rad^2]: of a robot that slips as it turns,
+            or whose odometer reports another point than its centre of rotation. 0 is the book's model, which moves no
+            robot to the side.
 
     Raises:
         TypeError, ValueError: a number is missing, negative or not finite.
@@ -106,28 +113,38 @@ class OdometryMotion:
         (0.0, 1.0, 0.0, 0.0)
     """
 
-    alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02)
-    reverse: float = 0.02
-    least: tuple[float, float] = (0.01, 0.005)
+    alpha: tuple[float, ...] = DEFAULTS.alpha
+    reverse: float = DEFAULTS.reverse
+    least: tuple[float, float] = DEFAULTS.least
+    systematic: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sideways: float = DEFAULTS.sideways
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 4))
         object.__setattr__(self, "reverse", checks.real("reverse", self.reverse, low=0, high=1))
         object.__setattr__(self, "least", _least(self.least))
+        object.__setattr__(self, "sideways", checks.real("sideways", self.sideways, low=0))
+        missed = checks.array("systematic", self.systematic, (3,))
+        object.__setattr__(self, "systematic", tuple(float(value) for value in missed))
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
         if len(arguments) != 2:
             raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
         first, trans, second = odometry_turns(*arguments)
+        stretch, gain, drift = self.systematic
+        first, second = (turn * (1 + gain) + drift * trans / 2 for turn in (first, second))
+        trans *= 1 + stretch
         a1, a2, a3, a4 = self.alpha
         at, ar = self.least
         # Noise does not depend on the direction: a turn by half a turn and back is none.
         deviations = [math.sqrt(a1 * turn * turn + a2 * trans * trans + ar * ar) for turn in (first, second)]
-        length = math.sqrt(a3 * trans * trans + a4 * (first * first + second * second) + at * at)
+        squares = first * first + second * second
+        length = math.sqrt(a3 * trans * trans + a4 * squares + at * at)
+        side = math.sqrt(self.sideways * squares + at * at) if self.sideways > 0 else 0.0
         reverse = self.reverse if abs(trans) >= _SHORTEST else 0.0
         return SampledMotion(
-            (first, trans, 0.0, second), (deviations[0], length, 0.0, deviations[1]), STRAIGHT, reverse
+            (first, trans, 0.0, second), (deviations[0], length, side, deviations[1]), STRAIGHT, reverse
         )
 
 
@@ -150,7 +167,7 @@ class OmniMotion:
     """
 
     alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02, 0.02)
-    least: tuple[float, float] = (0.01, 0.005)
+    least: tuple[float, float] = DEFAULTS.least
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 5))
@@ -193,7 +210,7 @@ class VelocityMotion:
     """
 
     alpha: tuple[float, ...] = (0.02, 0.02, 0.02, 0.02, 0.01, 0.01)
-    least: tuple[float, float] = (0.01, 0.005)
+    least: tuple[float, float] = DEFAULTS.least
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _alphas(self.alpha, 6))

@@ -78,21 +78,25 @@ def normalize_weights(log_p: AnyArray) -> Weights:
     return Weights(weights, largest + float(np.log(total / count)), 1.0 / float(np.sum(weights * weights)), False)
 
 
-def resample(weights: AnyArray, count: int, rng: Any = None) -> np.ndarray:
-    """Draw a new set of particles by systematic resampling (book table 4.4, the low-variance sampler).
+def resample(weights: AnyArray, count: int, rng: Any = None, *, method: str = "systematic") -> np.ndarray:
+    """Draw a new set of particles from exact cumulative weights.
 
     Args:
         weights: (N,) weights >= 0 with a positive sum, N > 0; they need not sum to 1.
         count: Number of new particles, >= 0.
-        rng: Random generator, from which one number is drawn: a Generator or RandomState of NumPy, or any seed that
-            ``numpy.random.default_rng`` takes. None draws fresh numbers from the system.
+        rng: Random generator: a Generator or RandomState of NumPy, or any seed that ``numpy.random.default_rng`` takes.
+            None draws fresh numbers from the system.
+        method: "systematic": one random number (book table 4.4, the low-variance sampler); particle i appears ``floor``
+            or ``ceil`` of ``count * w_i`` times. "stratified": one number in each of ``count`` strata (Kitagawa 1996).
+            "residual": ``floor(count * w_i)`` copies, and the rest by independent draws from the weights that are left
+            (Liu and Chen 1998).
 
     Returns:
-        (count,) int64 indices in ascending order; particle i appears ``floor`` or ``ceil`` of ``count * w_i`` times.
+        (count,) int64 indices in ascending order; the expected copies of particle i are ``count * w_i``.
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: A weight is negative or not finite, the sum is 0, or ``rng`` is a negative seed.
+        ValueError: A weight is negative or not finite, the sum is 0, ``rng`` is a negative seed, or another method.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -104,6 +108,7 @@ def resample(weights: AnyArray, count: int, rng: Any = None) -> np.ndarray:
     generator = _generator(rng)
     values = checks.array("weights", weights, ("N",))
     size = checks.integer("count", count, low=0)
+    checks.choice("method", method, ("systematic", "stratified", "residual"))
     if values.size == 0 or not values.max() > 0:
         raise ValueError(f"weights: must have a positive sum, got {values.sum()}")
     if values.min() < 0:
@@ -115,11 +120,33 @@ def resample(weights: AnyArray, count: int, rng: Any = None) -> np.ndarray:
     total = int(ends[-1])
     if size == 0:
         return np.empty(0, np.int64)
+    if method == "residual":
+        return _residual(steps, total, size, generator)
     # The marks (k + u) / size of the unit interval as exact integers: (k total + start) // size without overflow.
     whole, rest = divmod(total, size)
     k = np.arange(size, dtype=np.int64)
-    marks = k * whole + (k * rest + _below(total, generator)) // size
+    start = _below(total, generator, size) if method == "stratified" else _below(total, generator)
+    marks = k * whole + (k * rest + start) // size
     return np.searchsorted(ends, marks, side="right")
+
+
+def _residual(
+    steps: np.ndarray, total: int, size: int, generator: np.random.Generator | np.random.RandomState
+) -> np.ndarray:
+    """Return the indices of residual resampling; copies and what is left are exact."""
+    # size * steps exceeds 64 bits: a long division, bit by bit of size.
+    copies, left = np.zeros(len(steps), np.int64), np.zeros(len(steps), np.int64)
+    for bit in bin(size)[2:]:
+        left = 2 * left + (steps if bit == "1" else 0)
+        copies = 2 * copies + left // total
+        left %= total
+    rest = size - int(copies.sum())
+    if rest:
+        # The sum of what is left is rest * total, which exceeds 64 bits: its cumulative sums divided by rest.
+        ends = np.cumsum(left // rest) + np.cumsum(left % rest) // rest
+        drawn = np.searchsorted(ends, _below(int(ends[-1]), generator, rest), side="right")
+        copies += np.bincount(drawn, minlength=len(steps))
+    return np.repeat(np.arange(len(steps)), copies)
 
 
 def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
@@ -137,8 +164,8 @@ def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
         raise type(error)(f"rng: {rule}, got {checks.show(rng)}") from error
 
 
-def _below(end: int, rng: np.random.Generator | np.random.RandomState) -> int:
-    """Draw an integer from 0 to before ``end``."""
+def _below(end: int, rng: np.random.Generator | np.random.RandomState, count: int | None = None) -> Any:
+    """Draw an integer from 0 to before ``end``, or an array of ``count``."""
     if isinstance(rng, np.random.Generator):
-        return int(rng.integers(0, end))
-    return int(rng.randint(0, end, dtype=np.int64))
+        return rng.integers(0, end, count)
+    return rng.randint(0, end, count, dtype=np.int64)

@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.logs.lines import numbered_lines
+from gpusense._util.lines import numbered_lines
 from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 

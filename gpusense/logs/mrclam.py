@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.logs.lines import numbered_lines
+from gpusense._util.lines import numbered_lines
 from gpusense.logs.records import Floats, Integers, LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 

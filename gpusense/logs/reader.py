@@ -12,7 +12,7 @@ from typing import Literal, overload
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense.logs.lines import numbered_lines
+from gpusense._util.lines import numbered_lines
 from gpusense.logs.records import Odometry, Scan
 
 

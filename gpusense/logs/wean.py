@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gpusense.logs.lines import numbered_lines
+from gpusense._util.lines import numbered_lines
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 

@@ -1,4 +1,4 @@
-"""Read and write maps in the format of ROS map_server: a YAML file beside a PGM, PNG or BMP image."""
+"""Read and write maps in the format of ROS map_server: a YAML file beside a PGM, PNG or BMP image; read BeeSoft's."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from gpusense._util import checks
 from gpusense._util.files import read_mapping
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import open_raster
+from gpusense.world.wean_map import read_probabilities
 
 # The grey that map_saver writes for unknown cells.
 UNKNOWN_GREY = 205
@@ -35,7 +36,7 @@ class _MapYaml:
 
 
 def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> OccupancyGrid:
-    """Read a map in the format of ROS map_server.
+    """Read a map in the format of ROS map_server, or the text of a BeeSoft map (``wean.dat``).
 
     Cells have the bits of nav2_map_server 1.4 to 1.5 (``map_io.cpp``), which computes in float32; earlier versions
     took the mean of the channels in float64. Let g be the grey of a pixel, 0 to 255: its value, or the luma
@@ -55,8 +56,11 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     any maximum. Memory is allocated only after the file has been seen to hold the pixels that its header claims, at
     most 2^31.
 
+    A file ``.dat`` or ``.dat.gz`` has a line for each x with the probabilities that the cells are free, or -1 for
+    unknown, and possibly a header with the resolution, else 0.1 m; its cells are ``round(100 (1 - p))``.
+
     Args:
-        path: The YAML file; the path of ``image`` in it is relative to its folder.
+        path: The YAML file; the path of ``image`` in it is relative to its folder. Or a file ``.dat`` or ``.dat.gz``.
         occupied_threshold: Least occupancy of an occupied cell, as in :class:`OccupancyGrid` [per cent].
 
     Raises:
@@ -76,6 +80,8 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         [[0, 100], [-1, 0]]
     """
     file = checks.existing_file(checks.path("path", path))
+    if file.name.lower().endswith((".dat", ".dat.gz")):
+        return read_probabilities(file, occupied_threshold=occupied_threshold)
     meta = _read_yaml(file)
     size = meta.image.stat().st_size
     with meta.image.open("rb") as stream:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from support.command_line import error_of
 
 import gpusense as gs
@@ -69,6 +72,29 @@ def test_figures_come_as_json(place, capsys):
     assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_score"] > 0
 
 
+def test_what_the_command_fit_wrote_is_used(place, capsys, tmp_path):
+    fitting = ["fit", *call(place)[1:5], "--range-max", "20", "--backend", "numpy", "--sigma-growth", "--fit-motion"]
+    assert cli.main([*fitting, "--out", str(tmp_path)]) == 0
+    assert "odometry: OdometryMotion(" in capsys.readouterr().out
+    written = yaml.safe_load((tmp_path / "parameters.yaml").read_text())
+    noise = written["odometry_motion"]
+    assert written["beam_model"]["sigma_growth"] >= 0
+    assert "alpha1" not in written["amcl"]["ros__parameters"]
+    fitted = ["--params", str(tmp_path / "parameters.yaml"), "--json", "--sideways", "0.5", "--beam-skip", "0.2"]
+    assert cli.main(call(place, *fitted)) == 0
+    used = json.loads(capsys.readouterr().out)["filter"]
+    motion = gs.OdometryMotion(**noise | {"sideways": 0.5})
+    assert "BeamModel" in used and repr(motion) in used
+    for text, message in (
+        ("odometry_motion: {speed: 1}", "odometry_motion: must have keys among"),
+        ("odometry_motion: [1]", "must hold a mapping odometry_motion"),
+        ("odometry_motion: {alpha: [1, 2]}", "odometry_motion: alpha"),
+        ("a: 1", "must hold a mapping beam_model or odometry_motion"),
+    ):
+        (tmp_path / "wrong.yaml").write_text(text)
+        assert message in error_of(call(place, "--params", str(tmp_path / "wrong.yaml")), capsys)
+
+
 def test_a_log_on_a_wrong_map_is_lost(place, capsys):
     assert cli.main(call(place, "--global", "--particles", "500", grid="other.yaml")) == 1
     assert "verdict: LOST" in capsys.readouterr().out
@@ -114,3 +140,52 @@ def test_odometry_that_copies_corrected_poses_is_chained_from_wheel_readings(tmp
 )
 def test_bad_input_is_one_line(place, capsys, more, message):
     assert message in error_of(call(place, *more), capsys)
+
+
+class FakeStream:
+    """A stream of Rerun that keeps what is logged."""
+
+    def __init__(self, name):
+        self.logged, self.times = [], []
+
+    def binary_stream(self):
+        return self
+
+    def set_time(self, timeline, *, sequence):
+        self.times.append((timeline, sequence))
+
+    def log(self, name, value, *, static=False):
+        self.logged.append((name, value))
+
+    def read(self, *, flush):
+        return "\n".join(name for name, _ in self.logged).encode()
+
+
+def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
+    """With a module that has the names of rerun-sdk 0.41 that are used, and without it."""
+    streams, path = [], tmp_path / "run.rrd"
+
+    def open_stream(name):
+        streams.append(FakeStream(name))
+        return streams[-1]
+
+    def archetype(*values, **named):
+        return values, named
+
+    names = ("Points3D", "Arrows3D", "LineStrips3D", "Scalars")
+    fake = SimpleNamespace(RecordingStream=open_stream, **dict.fromkeys(names, archetype))
+    monkeypatch.setitem(sys.modules, "rerun", fake)
+    assert cli.main(call(place, "--limit", "3", "--record", str(path))) == 0
+    assert f"written: {path}" in capsys.readouterr().out
+    names = path.read_text().split()
+    each = ["particles", "scan", "estimate", "logged", "error", "effective_sample_size", "lost"]
+    assert names == ["map", *each * 3, "path/estimate", "path/logged"]
+    assert streams[0].times == [("scan", k) for k in range(3)]
+    kept = dict(streams[0].logged)
+    walls, grid = kept["map"][0][0], gs.read_map(place / "map.yaml")
+    assert walls.shape == (grid.occupied.sum(), 3) and kept["path/logged"][0][0][0].shape == (3, 3)
+    # The ends of beams at the estimate lie at walls.
+    ends = kept["scan"][0][0][:, :2]
+    assert np.median(np.hypot(*(ends[:, None] - walls[None, :, :2]).T).min(axis=0)) < 0.1
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert "pip install 'gpusense[rerun]'" in error_of(call(place, "--record", str(path)), capsys)

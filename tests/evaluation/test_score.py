@@ -131,6 +131,31 @@ def test_command_ranks_the_logged_pose_first(capsys, recorded, model):
     assert document["agreement"] == []
 
 
+def test_temperature_is_calibrated_from_the_log_or_given(capsys, recorded):
+    options = ["--model", "field", "--particles", "50", "--backend", "numpy"]
+    _, out, _ = run(capsys, recorded, *options, "--json")
+    grid = gs.read_map(recorded / "map.yaml")
+    scans = [scan for _, scan in scoring.logged_scans(recorded / "run.log")]
+    model = gs.LikelihoodFieldModel(grid, scans[0].scanner, backend="numpy")
+    poses = np.array([scan.pose for scan in scans])
+    wanted = gs.calibrate_temperature(model, np.array([scan.ranges for scan in scans]), poses)
+    assert json.loads(out)["temperature"] == wanted < 1
+    _, out, _ = run(capsys, recorded, *options)
+    assert f"temperature {wanted:.4g}, calibrated from the scans" in out
+    _, out, _ = run(capsys, recorded, *options, "--temperature", "0.3")
+    assert "temperature 0.3, given" in out
+
+
+@pytest.mark.parametrize("model", ["beam", "field"])
+def test_a_log_on_another_map_ends_in_a_verdict(capsys, recorded, tmp_path, model):
+    options = ["--model", model, "--particles", "50", "--backend", "numpy"]
+    _, out, _ = run(capsys, recorded, *options)
+    assert "verdict: the log fits the map" in out
+    gs.write_map(building(9, (14.0, 12.0)), tmp_path / "other.yaml")
+    code, out, _ = run(capsys, recorded, *options, "--map", str(tmp_path / "other.yaml"))
+    assert code == 1 and "verdict: WRONG MAP" in out
+
+
 def test_parameters_come_from_a_file(capsys, recorded, tmp_path):
     file = tmp_path / "parameters.yaml"
     file.write_text(yaml.safe_dump({"beam_model": gs.BeamParameters(sigma_hit=0.07).to_dict(), "amcl": {}}))

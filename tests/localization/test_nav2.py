@@ -68,18 +68,19 @@ def test_a_file(tmp_path: Path) -> None:
 
 
 def test_what_the_command_fit_wrote(tmp_path: Path) -> None:
-    from gpusense.commands.fit import parameters_yaml
+    from gpusense.commands.parameter_files import parameters_yaml
 
     rng = np.random.default_rng(0)
     expected = rng.uniform(1, 9, 4000)
     fit = gs.fit_beam_parameters(expected + 0.04 + rng.normal(0, 0.1, 4000), expected, 10.0, range_bias=True,
                                  backend="numpy")  # fmt: skip
-    result: Any = SimpleNamespace(fit=fit, incidence=None, data=SimpleNamespace(range_max=10.0))
+    noise = SimpleNamespace(motion=gs.OdometryMotion((0.1, 0.2, 0.3, 0.4)))
+    result: Any = SimpleNamespace(fit=fit, incidence=None, motion=noise, data=SimpleNamespace(range_max=10.0))
     file = tmp_path / "parameters.yaml"
     file.write_text(parameters_yaml(result))
     options = from_nav2(file)
     assert options.model == "beam" and options.parameters == fit.parameters and options.parameters.range_bias > 0
-    assert options.range_limits == (None, 10.0)
+    assert options.range_limits == (None, 10.0) and options.alpha == (0.2,) * 5
     assert from_nav2({"beam_model": fit.parameters.to_dict()}).parameters == fit.parameters
 
 

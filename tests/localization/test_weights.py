@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import binomtest, chisquare
 
 from gpusense.localization.weights import normalize_weights, resample
+
+WEIGHTS = np.random.default_rng(1).random(1000)
 
 
 def test_weights_of_hand_computed_values():
@@ -91,12 +94,39 @@ def test_each_particle_appears_as_often_as_its_weight_says(weights, count, seed)
     assert (appearances[np.array(weights) == 0] == 0).all()
 
 
+@pytest.mark.parametrize("weights", [WEIGHTS, np.array([1e-12, 0, 1, 3, 3]), np.full(7, 1 / 7), np.array([1.0])])
+@pytest.mark.parametrize("count", [1, 7, 4000])
+def test_residual_draws_keep_whole_copies(weights, count):
+    chosen = resample(weights, count, 0, method="residual")
+    copies = np.bincount(chosen, minlength=len(weights))
+    assert len(chosen) == count and (np.diff(chosen) >= 0).all() and (copies[weights == 0] == 0).all()
+    assert (copies >= np.floor(count * weights / weights.sum() - 1e-9)).all()
+
+
+def test_the_rest_of_residual_draws_and_strata_have_their_distributions():
+    weights, rng, repeats = np.array([0.55, 0.3, 0.15]), np.random.default_rng(4), 4000
+    # 5 w = 2.75, 1.5, 0.75: two of what is left, 0.75, 0.5 and 0.75, are drawn one after the other.
+    rest = [resample(weights, 5, rng, method="residual") for _ in range(repeats)]
+    extra = [tuple(np.bincount(chosen, minlength=3) - (2, 1, 0)) for chosen in rest]
+    p = np.array([0.75, 0.5, 0.75]) / 2
+    wanted = {(2, 0, 0): p[0] ** 2, (0, 2, 0): p[1] ** 2, (0, 0, 2): p[2] ** 2, (1, 1, 0): 2 * p[0] * p[1],
+              (1, 0, 1): 2 * p[0] * p[2], (0, 1, 1): 2 * p[1] * p[2]}  # fmt: skip
+    found = [extra.count(case) for case in wanted]
+    assert sum(found) == repeats
+    assert chisquare(found, repeats * np.array(list(wanted.values()))).pvalue > 1e-3
+    # Strata of 0.25: the third holds 0.05 of the first particle and 0.2 of the second, the last 0.1 and 0.15.
+    strata = np.array([resample(weights, 4, rng, method="stratified") for _ in range(repeats)])
+    assert (strata[:, :2] == 0).all() and set(strata[:, 2]) == {0, 1} and set(strata[:, 3]) == {1, 2}
+    for column, value, share in ((2, 0, 0.2), (3, 1, 0.4)):
+        assert binomtest(int((strata[:, column] == value).sum()), repeats, share).pvalue > 1e-3
+    assert abs(np.corrcoef(strata[:, 2], strata[:, 3])[0, 1]) < 0.07
+    with pytest.raises(ValueError, match="method: must be"):
+        resample(weights, 4, 0, method="multinomial")
+
+
 def test_resampling_a_million_equal_weights_takes_each_once():
     chosen = resample(np.full(1_000_000, 1e-6), 1_000_000, np.random.default_rng(3))
     np.testing.assert_array_equal(chosen, np.arange(1_000_000))
-
-
-WEIGHTS = np.random.default_rng(1).random(1000)
 
 
 @pytest.mark.parametrize("seed", [7, [1, 2], np.random.SeedSequence(7), np.uint64(7)], ids=repr)

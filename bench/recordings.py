@@ -1,0 +1,167 @@
+"""Recorded runs with maps and reference poses, for studies of localisation.
+
+A run is a list of events in the order of time: a scan of one of the scanners, the odometry, and the reference pose.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.evaluation.coverage import coverage_report, rank_of
+from gpusense.evaluation.tracking import START, read_steps
+from gpusense.localization.defaults import DEFAULTS
+
+CARMEN = {"intel": "intel", "csail": "csail", "fr079": "freiburg-079", "aces": "aces"}
+JARVIS = ("jarvis-s3000", "jarvis-nav350", "jarvis-fused")
+NAMES = (*CARMEN, *JARVIS, "olin")
+
+
+@dataclass(frozen=True)
+class Event:
+    """A scan: index of its scanner, readings [m], odometry and reference pose of the robot [m, m, rad]."""
+
+    scanner: int
+    ranges: np.ndarray
+    odometry: np.ndarray
+    truth: np.ndarray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run: a map and a geometry for each scanner, and events."""
+
+    name: str
+    places: list
+    events: list
+
+    def models(self, make):
+        """Return a model for each scanner: ``make(grid, scanner)``."""
+        return [make(grid, scanner) for grid, scanner in self.places]
+
+
+def data():
+    return Path(os.environ["GPUSENSE_DATA"])
+
+
+def load(name):
+    """Return a recording by its name."""
+    if name in CARMEN:
+        return _carmen(name)
+    return _olin() if name == "olin" else _jarvis(name)
+
+
+def _carmen(name):
+    """Odd scans in the map of the even ones; raw odometry that is chained from the log's ODOM lines."""
+    folder = data() / "carmen_logs"
+    grid = gs.read_map(folder / "derived_maps" / f"{CARMEN[name]}_even_05cm.yaml")
+    steps = read_steps(folder / f"{CARMEN[name]}-corrected.log.gz", every=2, offset=1)
+    events = [Event(0, s.scan.ranges, np.array(s.odometry), np.array(s.scan.pose)) for s in steps]
+    return Recording(name, [(grid, steps[0].scan.scanner)], events)
+
+
+def _jarvis(name):
+    """The complex run; reflectors give the reference. The maps, of 3 cm, are built of the same run at these poses."""
+    folder = data() / "jarvis_lab"
+    run = np.load(folder / "jarvis_complex_path_fast.npz")
+    mounts = {"s3000": ((0.895, 0.0, 0.0), 50.0), "nav350": ((0.194, 0.0, 0.0), 250.0)}
+    chosen = list(mounts) if name == "jarvis-fused" else [name.removeprefix("jarvis-")]
+    places, rows = [], []
+    for index, which in enumerate(chosen):
+        ranges, (mount, far) = run[f"{which}_ranges"].astype(float), mounts[which]
+        # 0 is no return; so are readings at the end of the scale.
+        ranges[(ranges <= 0) | ~np.isfinite(ranges)] = np.inf
+        far = min(far, float(ranges[np.isfinite(ranges)].max()) + 1)
+        scanner = gs.Scanner.uniform(
+            angle_min=float(run[f"{which}_angle_min"]), angle_increment=float(run[f"{which}_angle_inc"]),
+            count=ranges.shape[1], range_max=far, mount=mount,
+        )  # fmt: skip
+        places.append((gs.read_map(folder / f"jarvis_{which}_from_complex_03cm.yaml"), scanner))
+        valid = run[f"{which}_gt_valid"].astype(bool)
+        for k in np.flatnonzero(valid):
+            event = Event(index, ranges[k], run[f"{which}_odom_pose"][k], run[f"{which}_gt_pose"][k])
+            rows.append((float(run[f"{which}_stamp"][k]), event))
+    rows.sort(key=lambda row: row[0])
+    return Recording(name, places, [event for _, event in rows])
+
+
+def _olin():
+    """Every scan of the bag; the reference was refined scan by scan in the same map, so it is not independent."""
+    folder = data() / "olin_mac_bag"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # free_thresh frees unknown cells: they do not matter to a field.
+        grid = gs.read_map(folder / "mac_1st_floor_9_23.yaml")
+    reference = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
+    scans = list(gs.read_log(folder / "macfirst_floor_take_2", range_max=12.0))
+    events, first = [], np.array(scans[0].odometry)
+    for scan in scans:
+        k = int(np.argmin(np.abs(reference[:, 0] - scan.time)))
+        if abs(reference[k, 0] - scan.time) < 0.02:
+            events.append(Event(0, scan.ranges, gs.pose_difference(first, scan.odometry), reference[k, 1:4]))
+    return Recording("olin", [(grid, scans[0].scanner)], events)
+
+
+def field(backend, **options):
+    """Return a maker of the likelihood field that the command uses."""
+    parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
+    return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, parameters, backend=backend, **options)
+
+
+@dataclass
+class Followed:
+    """A filter's track: estimates less references, covariances, ranks of the references, verdicts, times [ms]."""
+
+    differences: np.ndarray
+    covariances: np.ndarray
+    ranks: np.ndarray
+    lost: np.ndarray
+    temperatures: np.ndarray
+    ms: np.ndarray
+
+
+def follow(recording, models, *, limit=None, **options):
+    """Track a recording from a normal start around the first reference pose; ranks need all particles."""
+    pf = gs.ParticleFilter(models, **options)
+    events = recording.events[:limit]
+    pf.initialize(mean=events[0].truth, covariance=np.diag(np.square(START)))
+    rows = []
+    for before, event in zip([None, *events], events, strict=False):
+        begin = time.perf_counter()
+        if before is not None:
+            pf.predict(before.odometry, event.odometry)
+        pf.correct({models[event.scanner]: event.ranges})
+        found = pf.estimate()
+        ms = (time.perf_counter() - begin) * 1000
+        d = found.pose - event.truth
+        d[2] = gs.wrap_angle(d[2])
+        rank = rank_of(pf.host_particles(), pf.host_weights(), event.truth)
+        rows.append((d, found.covariance, rank, found.lost, found.temperature, ms))
+    return Followed(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def figures(tracks):
+    """Return the figures of several tracks of one setting; the first 5 % of a track count for errors only."""
+    late = [slice(len(t.ms) // 20, None) for t in tracks]
+    reports = [
+        coverage_report(t.differences[s], t.covariances[s], t.ranks[s]) for t, s in zip(tracks, late, strict=True)
+    ]
+    errors = [np.hypot(*t.differences[:, :2].T) for t in tracks]
+    result = dict(
+        seeds=len(tracks), scans=len(errors[0]),
+        median_cm=100 * float(np.median([np.median(e) for e in errors])),
+        p95_cm=100 * float(np.median([np.percentile(e, 95) for e in errors])),
+        heading_deg=float(np.degrees(np.median([np.median(np.abs(t.differences[:, 2])) for t in tracks]))),
+        lost=int(sum(np.median(e[-max(len(e) // 10, 1) :]) > 1 for e in errors)),
+        said_lost=float(np.mean([t.lost.mean() for t in tracks])),
+        temperature=float(np.median([np.median(t.temperatures) for t in tracks])),
+        ms=float(np.median([np.median(t.ms) for t in tracks])),
+    )  # fmt: skip
+    for key in reports[0]:
+        result[key] = np.mean([r[key] for r in reports], axis=0).round(4).tolist()
+    return result

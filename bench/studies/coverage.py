@@ -1,0 +1,88 @@
+"""Confidence of a particle filter against the number of beams: plain product, tempering, thinning, cubes.
+
+For each log, number of beams (bad readings are dropped first, the others thinned evenly) and kind of weights: coverage
+of the 50, 80 and 95 % regions, width of the 95 % interval of the position, median NEES (2.37 is right) and the rank
+histogram of the true poses, which is flat where the weights are right.
+
+    python bench/studies/coverage.py --logs intel csail fr079 --beams 10 30 90 180 --out bench/results/coverage_cpu.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import recordings
+
+import gpusense as gs
+from gpusense.evaluation.machine import machine, machine_line
+from gpusense.localization.defaults import DEFAULTS
+
+# Words, temperature, weights of a peer.
+WEIGHTS = {
+    "plain product": (1.0, None), "temperature 0.1": (0.1, None), "auto": ("auto", None),
+    "sum of cubes (nav2)": (1.0, gs.compat.Amcl()),
+}  # fmt: skip
+
+
+def maker(backend, beams, peer):
+    """Return ``make(grid, scanner)``: the field of the command, or nav2's with the same parameters."""
+    if peer is None:
+        return recordings.field(backend, beams=beams)
+    shared = {name: DEFAULTS.field[name] for name in ("z_hit", "z_max", "z_rand", "sigma_hit")}
+    weights = gs.LikelihoodFieldParameters(**shared)
+    return lambda grid, scanner: gs.LikelihoodFieldModel(
+        grid, scanner, weights, compat=peer, beams=beams, backend=backend
+    )
+
+
+def table(results):
+    """Return the results as a table of Markdown."""
+    lines = [
+        "| log | beams | weights | temperature | median, 95 % error [cm] | coverage 50, 80, 95 % | width of 95 % [cm] "
+        "| median NEES | share of ranks in the outer fifth (0.2 is right) |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for r in results:
+        outer = r["rank_histogram"][0] + r["rank_histogram"][-1]
+        coverage = ", ".join(f"{r[f'coverage_{k}']:.2f}" for k in (50, 80, 95))
+        lines.append(
+            f"| {r['log']} | {r['beams']} | {r['weights']} | {r['temperature']:.3f} | {r['median_cm']:.1f}, "
+            f"{r['p95_cm']:.1f} | {coverage} | {100 * r['width_95']:.0f} | {r['nees_median']:.2f} | {outer:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backend", default="opencl")
+    parser.add_argument("--logs", nargs="+", default=["intel", "csail", "fr079"], choices=recordings.NAMES)
+    parser.add_argument("--beams", nargs="+", type=int, default=[10, 30, 90, 180])
+    parser.add_argument("--particles", type=int, default=2000)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--limit", type=int, default=600, help="scans of each log")
+    parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
+    args = parser.parse_args()
+    results = []
+    for name in args.logs:
+        recording = recordings.load(name)
+        for beams in args.beams:
+            for words, (temperature, peer) in WEIGHTS.items():
+                models = recording.models(maker(args.backend, beams, peer))
+                options = dict(limit=args.limit, particles=args.particles, temperature=temperature)
+                runs = [recordings.follow(recording, models, seed=seed, **options) for seed in range(args.seeds)]
+                row = dict(log=name, beams=beams, weights=words) | recordings.figures(runs)
+                print(table([row]).splitlines()[-1], flush=True)
+                results.append(row)
+    if args.out is not None:
+        command = " ".join(["bench/studies/coverage.py", *sys.argv[1:]])
+        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
+        args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table(results)}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""Whether estimated poses are as certain as they say: coverage, interval width, NEES and ranks.
+
+A calibrated filter has the share p of the true poses in its regions of probability p, a normalised error squared (NEES)
+with the quantiles of chi-square with 3 degrees of freedom, and ranks of the truth that are uniform. Regions are
+ellipsoids of the mean and the covariance; ranks (Talagrand, rank histograms) use the particles themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.localization.pose_algebra import wrap_angle
+
+Floats = NDArray[np.float64]
+# Quantiles of chi-square with 3 degrees of freedom, and of the normal density.
+REGIONS = {"50": 2.366, "80": 4.642, "95": 7.815}
+NEES_MEDIAN, _NORMAL_95 = 2.366, 1.96
+BINS = 10
+
+
+def nees_of(differences: Floats, covariances: Floats) -> Floats:
+    """Return the normalised estimation errors squared.
+
+    Args:
+        differences: (S, 3) estimates less true poses, headings wrapped.
+        covariances: (S, 3, 3) covariances of the estimates.
+    """
+    regular = covariances + 1e-12 * np.eye(3)
+    solved = np.linalg.solve(regular, differences[:, :, None])[:, :, 0]
+    return np.asarray(np.einsum("si,si->s", differences, solved))
+
+
+def rank_of(particles: Floats, weights: Floats, truth: Floats) -> Floats:
+    """Return the weights of the particles behind, to the right of and clockwise of the true pose; (3,), each 0 to 1.
+
+    Args:
+        particles: (N, 3) poses.
+        weights: (N,) weights, sum 1.
+        truth: (3,) the true pose.
+    """
+    dx, dy = (particles[:, :2] - truth[:2]).T
+    cosine, sine = math.cos(truth[2]), math.sin(truth[2])
+    offsets = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, wrap_angle(particles[:, 2] - truth[2])])
+    return np.asarray(((offsets < 0) + 0.5 * (offsets == 0)) @ weights)
+
+
+def coverage_report(differences: Floats, covariances: Floats, ranks: Floats) -> dict[str, Any]:
+    """Return the figures of S estimates: coverage, width of intervals, NEES, rank histogram.
+
+    Widths are medians of 95 % intervals, of the position in its least certain direction [m] and of the heading [rad].
+
+    Args:
+        differences: (S, 3) estimates less true poses, headings wrapped.
+        covariances: (S, 3, 3) covariances of the estimates.
+        ranks: (S, 3) ranks of the true poses.
+    """
+    squared = nees_of(differences, covariances)
+    largest = np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1], 0)
+    counts = np.histogram(ranks, bins=BINS, range=(0, 1))[0]
+    return {
+        **{f"coverage_{name}": float(np.mean(squared < limit)) for name, limit in REGIONS.items()},
+        "nees_median": float(np.median(squared)),
+        "width_95": float(np.median(2 * _NORMAL_95 * np.sqrt(largest))),
+        "width_heading_95": float(np.median(2 * _NORMAL_95 * np.sqrt(np.maximum(covariances[:, 2, 2], 0)))),
+        "rank_histogram": (counts / max(int(counts.sum()), 1)).round(4).tolist(),
+    }

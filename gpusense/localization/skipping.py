@@ -1,0 +1,60 @@
+"""Skipping of beams that most particles cannot explain: people, and furniture that has been moved.
+
+nav2_amcl has the idea as ``do_beamskip``. There a particle explains a beam whose end is within 0.5 m of a wall. Here it
+explains one as in the verdict (:mod:`gpusense.localization.verdict`), so any model of scans can skip. Two faults of
+nav2's are absent: beams that do not exist are not counted as skipped, and where too many would be, the scan is used as
+a whole with the log-likelihoods of all its beams. So is each scan while the particles lie apart: then most beams are
+explained by few particles, and these are the right ones.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gpusense.backends import arrays
+from gpusense.localization.pose_algebra import mean_pose
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.verdict import boundary
+
+# Particles that are asked; largest deviation of particles that lie together [m]; largest share of skipped beams.
+ASKED, _TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
+
+
+def together(poses: np.ndarray, weights: np.ndarray) -> bool:
+    """Tell whether the deviation of particles is at most half a metre along x and along y."""
+    d = poses[:, :2] - mean_pose(poses, weights)[:2]
+    return bool(np.all(weights @ d**2 <= _TOGETHER**2 * weights.sum()))
+
+
+def without_skipped(
+    sensor: Sensor,
+    reading: tuple[Any, ...],
+    poses: np.ndarray,
+    weights: np.ndarray,
+    elsewhere: np.ndarray,
+    share: float,
+) -> tuple[Any, ...]:
+    """Return a scan without the beams that too few particles explain: their readings are missing.
+
+    Args:
+        sensor: A sensor of scans.
+        reading: The scan.
+        poses: (N, 3) particles.
+        weights: (N,) their weights.
+        elsewhere: (M, 3) poses anywhere in the free space.
+        share: Least weight of the particles that explain a used beam, as a share.
+    """
+    parts = sensor.parts(np.vstack([poses, elsewhere]), reading)
+    near, far = parts[: len(poses)], parts[len(poses) :]
+    used = (near != 0).any(axis=0)
+    least = boundary(far[:, used])
+    if least is None:
+        return reading
+    explained = weights @ (near > least) >= share * weights.sum()
+    if np.count_nonzero(used & ~explained) > _MOST_SKIPPED * np.count_nonzero(used):
+        return reading
+    ranges = np.array(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
+    ranges[~(used & explained)] = np.nan
+    return (ranges, *reading[1:])

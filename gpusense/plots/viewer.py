@@ -1,0 +1,113 @@
+"""Record a filter's run for the viewer Rerun: map, particles, scan, estimated and logged poses, errors (rerun-sdk)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util.files import write_whole
+from gpusense.evaluation.tracking import Step, Track
+from gpusense.localization.filter import ParticleFilter
+from gpusense.localization.pose_algebra import compose_poses
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Reading, Scanner, classify
+
+_INSTALL = "recording for Rerun needs the library rerun-sdk: pip install 'gpusense[rerun]'"
+# Most particles of a scan that are recorded; length of the robot's arrow [m].
+_PARTICLES, _ARROW = 2000, 0.7
+# Red, green, blue.
+_WALL, _CLOUD, _SCAN, _ESTIMATE, _LOGGED = (90, 90, 90), (76, 120, 168), (242, 184, 72), (228, 87, 46), (143, 163, 184)
+
+
+class Recording:
+    """Recording of a run, in memory until it is written.
+
+    Args:
+        grid: The map.
+
+    Raises:
+        ImportError: rerun-sdk is not installed.
+    """
+
+    def __init__(self, grid: OccupancyGrid) -> None:
+        try:
+            import rerun
+        except ImportError as error:
+            raise ImportError(f"{_INSTALL} ({error})") from None
+        self._rr: Any = rerun
+        self._stream = rerun.RecordingStream("gpusense localize")
+        self._content = self._stream.binary_stream()
+        walls = grid.cell_centers(*np.nonzero(grid.occupied))
+        self._points("map", walls, _WALL, grid.resolution / 2, static=True)
+
+    def add(self, pf: ParticleFilter, track: Track, step: Step) -> None:
+        """Record the last scan of a track.
+
+        Args:
+            pf: The filter after it.
+            track: The track.
+            step: The scan.
+        """
+        rr, pose = self._rr, track.poses[-1]
+        self._stream.set_time("scan", sequence=step.index)
+        cloud = pf.host_particles()
+        self._points("particles", cloud[:: max(len(cloud) // _PARTICLES, 1), :2], _CLOUD, 0.02)
+        self._points("scan", end_points(step.scan.scanner, step.scan.ranges, pose), _SCAN, 0.03)
+        self._arrow("estimate", pose, _ESTIMATE)
+        if step.scan.pose is not None:
+            self._arrow("logged", np.array(step.scan.pose), _LOGGED)
+            error = float(np.hypot(*(pose[:2] - step.scan.pose[:2])))
+            self._stream.log("error", rr.Scalars(error))
+        self._stream.log("effective_sample_size", rr.Scalars(track.sizes[-1]))
+        self._stream.log("lost", rr.Scalars(float(track.lost[-1])))
+
+    def write(self, track: Track, path: Path) -> None:
+        """Write the recording as a file .rrd, whole or not at all.
+
+        Args:
+            track: The whole track, whose paths are added.
+            path: The file.
+
+        Raises:
+            OSError, ValueError: the file cannot be written.
+        """
+        paths = [("path/estimate", np.array(track.poses).reshape(-1, 3), _ESTIMATE)]
+        if track.truth is not None:
+            paths.append(("path/logged", track.truth, _LOGGED))
+        for name, poses, colour in paths:
+            line = self._rr.LineStrips3D([_flat(poses[:, :2])], colors=[colour])
+            self._stream.log(name, line, static=True)
+        content = self._content.read(flush=True)
+        write_whole(path, lambda stream: stream.write(content))
+
+    def _points(self, name: str, xy: NDArray[np.float64], colour: tuple[int, ...], radius: float, **more: bool) -> None:
+        points = self._rr.Points3D(_flat(xy), colors=[colour], radii=[radius])
+        self._stream.log(name, points, **more)
+
+    def _arrow(self, name: str, pose: NDArray[np.float64], colour: tuple[int, ...]) -> None:
+        x, y, theta = (float(value) for value in pose)
+        vector = (_ARROW * math.cos(theta), _ARROW * math.sin(theta), 0.0)
+        self._stream.log(name, self._rr.Arrows3D(origins=[(x, y, 0.0)], vectors=[vector], colors=[colour]))
+
+
+def end_points(scanner: Scanner, ranges: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (M, 2) ends of the beams that hit something, in the world.
+
+    Args:
+        scanner: The scanner.
+        ranges: (K,) readings [m].
+        pose: (3,) pose of the robot.
+    """
+    hit = classify(ranges, scanner) == Reading.HIT
+    x, y, theta = compose_poses(pose, np.array(scanner.mount))
+    angle, z = theta + scanner.bearings[hit], np.asarray(ranges)[hit]
+    return np.column_stack([x + z * np.cos(angle), y + z * np.sin(angle)])
+
+
+def _flat(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points of the plane as points of space."""
+    return np.column_stack([xy, np.zeros(len(xy))])

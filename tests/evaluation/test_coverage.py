@@ -1,0 +1,43 @@
+"""Coverage, widths, NEES and ranks of estimates whose errors have a known density."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from gpusense.evaluation import coverage
+
+
+def drawn(factor, count=4000):
+    """Return errors of a known covariance, that covariance times ``factor``, and ranks among 200 particles."""
+    rng = np.random.default_rng(0)
+    root = np.array([[0.1, 0, 0], [0.04, 0.05, 0], [0.01, 0, 0.02]])
+    errors, clouds = rng.normal(size=(count, 3)) @ root.T, rng.normal(size=(200, 3)) @ root.T * np.sqrt(factor)
+    ranks = np.array([coverage.rank_of(clouds, np.full(200, 1 / 200), -error) for error in errors])
+    return errors, np.tile(factor * root @ root.T, (count, 1, 1)), ranks, root
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.25, 4.0])
+def test_coverage_follows_the_covariance(factor):
+    errors, covariances, ranks, root = drawn(factor)
+    found = coverage.coverage_report(errors, covariances, ranks)
+    for name, limit in coverage.REGIONS.items():
+        # Four deviations of a share of 4000.
+        assert found[f"coverage_{name}"] == pytest.approx(chi2.cdf(factor * limit, 3), abs=0.032)
+        assert chi2.cdf(limit, 3) == pytest.approx(int(name) / 100, abs=1e-4)
+    assert found["nees_median"] == pytest.approx(chi2.median(3) / factor, rel=0.06)
+    largest = np.linalg.eigvalsh((root @ root.T)[:2, :2])[-1]
+    assert found["width_95"] == pytest.approx(2 * norm.ppf(0.975) * np.sqrt(factor * largest), rel=1e-3)
+    outer = found["rank_histogram"][0] + found["rank_histogram"][-1]
+    # Directions of a rotated frame mix the deviations; the cloud of 200 has its own error.
+    wanted = 2 * norm.cdf(norm.ppf(0.1) * np.sqrt(factor))
+    assert outer == pytest.approx(wanted, abs=0.06) and sum(found["rank_histogram"]) == pytest.approx(1, abs=1e-3)
+
+
+def test_ranks_are_in_the_frame_of_the_true_pose():
+    particles = np.array([[0.0, 0, 0], [1, 1, 0.2], [0, 2, 3.1]])
+    # Facing +y at (0.5, 1.5): ahead is +y, left is -x.
+    found = coverage.rank_of(particles, np.array([0.5, 0.3, 0.2]), np.array([0.5, 1.5, np.pi / 2]))
+    np.testing.assert_allclose(found, [0.8, 0.3, 0.8])
+    np.testing.assert_allclose(coverage.rank_of(particles[:1], np.ones(1), particles[0]), [0.5] * 3)

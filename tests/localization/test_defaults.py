@@ -1,0 +1,48 @@
+"""One table of defaults: the library, the commands and the page have its values."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+from pathlib import Path
+
+import gpusense as gs
+from gpusense.commands import landmarks, localize
+from gpusense.localization.defaults import DEFAULTS
+
+
+def shown(value):
+    if value is None:
+        return "all"
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    return ", ".join(f"{k} {v}" for k, v in value.items()) if hasattr(value, "items") else str(value)
+
+
+def test_the_page_has_the_table():
+    page = (Path(__file__).parents[2] / "docs" / "localization.md").read_text()
+    rows = dict(re.findall(r"^\| (\w+) \| (.*?) \| .* \|$", page[page.index("## Defaults") :], re.M))
+    rows.pop("name")
+    assert rows == {name: shown(value) for name, value in DEFAULTS._asdict().items()}
+
+
+def test_library_and_commands_have_its_values():
+    options = inspect.signature(gs.ParticleFilter).parameters
+    for name in ("particles", "threshold", "stages", "temperature"):
+        assert options[name].default == getattr(DEFAULTS, name), name
+    motion = gs.OdometryMotion()
+    for name in ("alpha", "reverse", "least", "sideways"):
+        assert getattr(motion, name) == getattr(DEFAULTS, name), name
+    assert gs.OmniMotion().least == gs.VelocityMotion().least == DEFAULTS.least
+    parsers = []
+    for command in (localize, landmarks):
+        parsers.append(argparse.ArgumentParser())
+        command.add_arguments(parsers[-1])
+    assert parsers[0].get_default("temperature") == DEFAULTS.temperature
+    assert parsers[1].get_default("particles") == DEFAULTS.particles
+    # Options that stand before a file of parameters have no value of their own; the help has the table's.
+    text = re.sub(r"\s+", " ", parsers[0].format_help())
+    alpha = shown(DEFAULTS.alpha).replace(",", "")
+    for value in (f"default: {DEFAULTS.particles}", alpha, f"default: {DEFAULTS.reverse})"):
+        assert value in text, value

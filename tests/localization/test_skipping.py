@@ -1,0 +1,68 @@
+"""Skipped beams: those of people, no whole scan, none while the particles lie apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.skipping import together, without_skipped
+
+GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
+POSE = np.array([3.0, 2.5, 0.4])
+WALLS = gs.RayCaster(GRID, range_max=10.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
+BLOCKED = np.arange(20, 32)
+RNG = np.random.default_rng(0)
+NEAR = POSE + RNG.normal(0, (0.03, 0.03, 0.01), (50, 3))
+ANYWHERE = np.column_stack([RNG.uniform((0.5, 0.5), (8, 6), (64, 2)), RNG.uniform(-np.pi, np.pi, 64)])
+
+
+def sensor(beams=None):
+    parameters = gs.LikelihoodFieldParameters(sigma_hit=0.1)
+    return Sensor(gs.LikelihoodFieldModel(GRID, SCANNER, parameters, beams=beams, backend="numpy"))
+
+
+def skipped(ranges, beams=None):
+    return without_skipped(sensor(beams), (ranges,), NEAR, np.full(50, 0.02), ANYWHERE, 0.3)[0]
+
+
+@pytest.mark.parametrize("beams", [None, 30])
+def test_beams_of_a_person_are_left_out(beams):
+    ranges = WALLS.copy()
+    ranges[BLOCKED], ranges[5] = 0.5, np.nan
+    found = skipped(ranges, beams)
+    missing = np.isnan(found)
+    assert missing[BLOCKED].all() and missing[5]
+    assert np.array_equal(found[~missing], ranges[~missing]) and ranges[20] == 0.5
+    # Of thinned scans no other beams come in.
+    assert np.count_nonzero(~missing) == pytest.approx((beams or 60) * (60 - 13) / 60, abs=3)
+
+
+def test_a_scan_that_nobody_explains_is_used_as_a_whole():
+    ranges = np.full(60, 0.5)
+    assert skipped(ranges) is ranges
+    assert skipped(np.full(60, np.nan)) is not None
+
+
+def test_particles_that_lie_apart_skip_nothing():
+    assert together(NEAR, np.full(50, 0.02)) and not together(ANYWHERE, np.full(64, 1 / 64))
+
+
+def test_a_filter_skips(backend):
+    field = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    compass = gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend=backend)
+    ranges = WALLS.copy()
+    ranges[BLOCKED] = 0.5
+    poses = []
+    for readings in (ranges, np.where(np.isin(np.arange(60), BLOCKED), np.nan, ranges)):
+        pf = gs.ParticleFilter([field, compass], particles=200, seed=3, beam_skip=0.3)
+        pf.initialize(mean=POSE, covariance=np.diag([1e-3, 1e-3, 1e-4]))
+        pf.correct({field: readings, compass: float(POSE[2])})
+        found = pf.estimate()
+        poses.append(pf.host_particles())
+    assert np.array_equal(*poses)
+    assert found.explained == 1 and np.hypot(*(found.pose - POSE)[:2]) < 0.05
+    with pytest.raises(ValueError, match="beam_skip: must be"):
+        gs.ParticleFilter(field, beam_skip=1.0)

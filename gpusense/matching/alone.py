@@ -46,6 +46,20 @@ def own_uncertainty(
     return spread(information, doubt * options.noise**2, variance, result[:, 19], lever, least)
 
 
+def with_own(field: Uncertainty, own: Uncertainty) -> Uncertainty:
+    """Return what fields and the scans' own lines leave: the sum of the covariances, and the fewer directions."""
+    less = own.observed.sum(axis=1) < field.observed.sum(axis=1)
+    # Infinite parts of opposite signs: the direction that the scan itself does not observe prevails.
+    with np.errstate(invalid="ignore"):
+        covariance = field.covariance + own.covariance
+    covariance = np.where(np.isnan(covariance), own.covariance, covariance)
+    pick = less[:, None, None]
+    return Uncertainty(
+        covariance, np.where(less[:, None], own.eigenvalues, field.eigenvalues),
+        np.where(pick, own.directions, field.directions), np.where(less[:, None], own.observed, field.observed),
+    )  # fmt: skip
+
+
 def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     """Return (S, 3, 3) derivatives that turn information on sensors' poses into that on robots' poses in the world."""
     c, s, (x, y) = np.cos(heading), np.sin(heading), mount

@@ -12,7 +12,7 @@ import threading
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.alone import own_uncertainty
+from gpusense.matching.alone import own_uncertainty, with_own
 from gpusense.matching.chain import DOUBTFUL, concluded, match_pairs, wrapped
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
@@ -203,7 +203,7 @@ class MapMatcher:
         covariance[:, [0, 1], [0, 1]] += bias**2
         covariance[:, 2, 2] += (bias / lever) ** 2
         own = own_uncertainty(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
-        found = _both(found._replace(covariance=covariance), own)
+        found = with_own(found._replace(covariance=covariance), own)
         status = np.full(len(pose), "converged", dtype="<U16")
         status[~found.observed.all(axis=1)] = "unobservable"
         status[~calm] = "no convergence"
@@ -211,20 +211,6 @@ class MapMatcher:
         status[hits.sum(axis=1) < _FEW] = "few points"
         other = np.full((len(pose), 3), np.nan)
         return concluded(pose, found, score, iterations, status, lever, other)
-
-
-def _both(field: Uncertainty, own: Uncertainty) -> Uncertainty:
-    """Return what fields and the scans' own lines leave: the sum of the covariances, and the fewer directions."""
-    less = own.observed.sum(axis=1) < field.observed.sum(axis=1)
-    # Infinite parts of opposite signs: the direction that the scan itself does not observe prevails.
-    with np.errstate(invalid="ignore"):
-        covariance = field.covariance + own.covariance
-    covariance = np.where(np.isnan(covariance), own.covariance, covariance)
-    pick = less[:, None, None]
-    return Uncertainty(
-        covariance, np.where(less[:, None], own.eigenvalues, field.eigenvalues),
-        np.where(pick, own.directions, field.directions), np.where(less[:, None], own.observed, field.observed),
-    )  # fmt: skip
 
 
 def _climb(

@@ -64,6 +64,7 @@ _NAMES = {
     "world.map_files": ("read_map", "write_map"),
     "world.parameters": ("BeamParameters", "IncidenceParameters", "LandmarkParameters", "LikelihoodFieldParameters"),
     "world.scanner": ("Reading", "Scanner", "classify"),
+    "world.sweep": ("deskew_scan",),
     "world.sensor_parameters": ("BeaconParameters", "BumperParameters", "HeadingParameters", "PositionParameters"),
 }
 # Public modules.

@@ -86,3 +86,4 @@ from gpusense.world.sensor_parameters import BeaconParameters as BeaconParameter
 from gpusense.world.sensor_parameters import BumperParameters as BumperParameters
 from gpusense.world.sensor_parameters import HeadingParameters as HeadingParameters
 from gpusense.world.sensor_parameters import PositionParameters as PositionParameters
+from gpusense.world.sweep import deskew_scan as deskew_scan

@@ -12,6 +12,7 @@ from gpusense.backends import Selection, get_backend
 from gpusense.mapping.counts import SCANS, RayCounts, RayEnds, batches, extent
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
+from gpusense.world.sweep import check_motion
 from gpusense.world.windows import LONGEST_SIDE
 
 
@@ -29,6 +30,7 @@ def build_map(
     p_miss: float = 0.45,
     p_prior: float = 0.5,
     occupied_threshold: int = 65,
+    motion: ArrayLike | None = None,
     backend: Selection = "auto",
 ) -> OccupancyGrid:
     """Build an occupancy grid from scans at known poses.
@@ -53,6 +55,9 @@ def build_map(
         p_miss: Occupancy after one miss and an even prior, in (0, 0.5).
         p_prior: Occupancy before any ray, in (0, 1).
         occupied_threshold: Least occupancy of an occupied cell [per cent].
+        motion: (S, 3) motion of the robot during each scan, from odometry: its pose at the last beam in its frame at
+            the first one [m, m, rad]. Beams are measured in their order, evenly in time, and ``poses`` are those at
+            the first beam. None: the robot is at rest.
         backend: The device, see :func:`gpusense.devices`.
 
     Returns:
@@ -72,7 +77,7 @@ def build_map(
     builder = MapBuilder(
         scans, poses, scanner, resolution=resolution, origin=origin, shape=shape, range_limit=range_limit,
         clear_max=clear_max, p_hit=p_hit, p_miss=p_miss, p_prior=p_prior, occupied_threshold=occupied_threshold,
-        backend=backend,
+        motion=motion, backend=backend,
     )  # fmt: skip
     for _ in builder.steps():
         pass
@@ -98,6 +103,7 @@ class MapBuilder:
         p_prior: float,
         occupied_threshold: int,
         backend: Selection,
+        motion: ArrayLike | None = None,
         each: int = SCANS,
     ) -> None:
         if not isinstance(scanner, Scanner):
@@ -110,11 +116,13 @@ class MapBuilder:
             raise TypeError(f"clear_max: must be True or False, got {checks.show(clear_max)}")
         self._occupancy = _occupancy(p_hit, p_miss, p_prior)
         self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
+        moved = check_motion("motion", motion, len(placed))
         device = get_backend(backend)
         self._parts = [
-            RayEnds(readings[part], placed[part], scanner, min(limit, scanner.range_max), clear_max=clear_max)
+            RayEnds(readings[part], placed[part], scanner, min(limit, scanner.range_max), clear_max=clear_max,
+                    motion=None if moved is None else moved[part])
             for part in batches(len(placed), each)
-        ]
+        ]  # fmt: skip
         self._counts = RayCounts(device, cell, *_frame(self._parts, cell, origin, shape))
 
     def steps(self) -> Iterator[float]:

@@ -7,11 +7,13 @@ import math
 import numpy as np
 
 from gpusense.backends import Backend
+from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import RAY_BITS
 from gpusense.interface.launches import launch
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
+from gpusense.world.sweep import beam_poses
 from gpusense.world.windows import LONGEST_SIDE
 
 _INT = np.dtype(np.int32)
@@ -28,6 +30,7 @@ class RayEnds:
         scanner: The scanner's geometry.
         range_limit: Readings beyond it clear cells up to it and mark no obstacle [m].
         clear_max: Whether max readings clear cells up to ``range_limit``; otherwise they are left out.
+        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.sweep``; None: it is at rest.
 
     Attributes:
         start: (R, 2) [m].
@@ -36,23 +39,31 @@ class RayEnds:
     """
 
     def __init__(
-        self, scans: np.ndarray, poses: np.ndarray, scanner: Scanner, range_limit: float, *, clear_max: bool
-    ) -> None:
+        self, scans: np.ndarray, poses: np.ndarray, scanner: Scanner, range_limit: float, *, clear_max: bool,
+        motion: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         kinds = classify(scans, scanner)
         hit = (kinds == Reading.HIT) & (scans <= range_limit)
         used = (kinds == Reading.HIT) | (kinds == Reading.MAX) if clear_max else kinds == Reading.HIT
         length = np.where(hit, scans, range_limit)[used]
-        cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
-        x, y, _ = scanner.mount
-        start = poses[:, :2] + np.hstack([cos * x - sin * y, sin * x + cos * y])
-        ray = ray_vectors(scanner.bearings, scanner.mount)
         scan, beam = np.nonzero(used)
-        cos, sin = cos[scan, 0], sin[scan, 0]
-        along, across = ray[beam, 0], ray[beam, 1]
+        poses = poses[scan] if motion is None else _poses_of_beams(poses, motion, scanner.count)[scan, beam]
+        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        x, y, _ = scanner.mount
+        along, across = ray_vectors(scanner.bearings, scanner.mount)[beam].T
         turned = np.stack([cos * along - sin * across, sin * along + cos * across], axis=1)
-        self.start = start[scan]
+        self.start = poses[:, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
         self.end = self.start + length[:, None] * turned
         self.hit = hit[used]
+
+
+def _poses_of_beams(poses: np.ndarray, motion: np.ndarray, beams: int) -> np.ndarray:
+    """Return the (S, K, 3) poses in the world of a robot that moves during S scans."""
+    place, heading = beam_poses(motion, beams)
+    cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
+    x = poses[:, 0, None] + cos * place[..., 0] - sin * place[..., 1]
+    y = poses[:, 1, None] + sin * place[..., 0] + cos * place[..., 1]
+    return np.stack([x, y, poses[:, 2, None] + heading], axis=-1)
 
 
 class RayCounts:
@@ -73,6 +84,7 @@ class RayCounts:
     ) -> None:
         self._backend, self._shape = backend, shape
         self._frame = OccupancyGrid([[0]], resolution, origin)
+        self._space = Workspace(backend)
         self._hits = backend.upload(np.zeros(shape, _INT))
         self._misses = backend.upload(np.zeros(shape, _INT))
         self.rays = 0
@@ -85,15 +97,16 @@ class RayCounts:
             np.rint(self._frame.world_to_cells(xy) * (1 << RAY_BITS)).clip(-(2.0**30), 2.0**30).astype(np.int32)
             for xy in (ends.start, ends.end)
         ]
-        backend = self._backend
-        start, end = map(backend.upload, places)
         rows, cols = self._shape
-        one = launch(
-            "count_rays", (), (len(ends.hit),), start=start, end=end, hit=backend.upload(ends.hit.astype(np.int32)),
-            hits=self._hits, misses=self._misses, rows=rows, cols=cols, rays=len(ends.hit),
-        )  # fmt: skip
-        backend.run((one,))
-        backend.synchronize()
+        with self._space as space:
+            start, end = (space.upload(name, place) for name, place in zip(("start", "end"), places, strict=True))
+            one = launch(
+                "count_rays", (), (len(ends.hit),), start=start, end=end,
+                hit=space.upload("hit", ends.hit.astype(np.int32)), hits=self._hits, misses=self._misses, rows=rows,
+                cols=cols, rays=len(ends.hit),
+            )  # fmt: skip
+            self._backend.run((one,))
+            space.wait()
         self.rays += len(ends.hit)
 
     def counts(self) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from gpusense.matching.to_map import match_to_map
 from gpusense.models.arguments import real_dtype
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
+from gpusense.world.sweep import check_motion, still_readings
 
 METHODS = ("auto", "icp", "gauss_newton", "correlative")
 
@@ -40,6 +41,8 @@ def match_scan(
     capture: float = 1.0,
     window: ArrayLike = (1.2, 1.05),
     temperature: float = 1.0,
+    motion: ArrayLike | None = None,
+    reference_motion: ArrayLike | None = None,
 ) -> ScanMatch:
     """Return the pose of a scan in the frame of an earlier scan, or in a map.
 
@@ -66,6 +69,10 @@ def match_scan(
         window: Half widths of the search: distance from the guess [m], and turn [rad].
         temperature: In (0, 1]: multiplies the information, for errors that are not independent from beam to beam. 1 is
             right for noise of ranges alone; recorded pairs have 0.02 to 0.1.
+        motion: (3,) or (S, 3) motion of the robot during the second scan, from odometry: its pose at the last beam in
+            its frame at the first one [m, m, rad]. Beams are measured in their order, evenly in time; guess and result
+            are poses at the first beam. None: the robot is at rest.
+        reference_motion: Likewise during the reference scan; not for a map.
 
     Returns:
         The match, or S matches.
@@ -90,22 +97,27 @@ def match_scan(
     checks.real("temperature", temperature, above=0, high=1)
     device = get_backend(backend)
     real_dtype(precision, device)
-    matches, single = _matches(reference, ranges, scanner, guess, method, device, precision, options)
+    moved = motion, reference_motion
+    matches, single = _matches(reference, ranges, scanner, guess, method, device, precision, options, moved)
     matches = replace(matches, covariance=matches.covariance / temperature)
     return matches[0] if single else matches
 
 
 def _matches(
     reference: AnyArray | OccupancyGrid, ranges: AnyArray, scanner: Scanner, guess: ArrayLike, method: Method,
-    device: Backend, precision: Precision, options: MatchOptions,
+    device: Backend, precision: Precision, options: MatchOptions, motions: tuple[object, object],
 ) -> tuple[ScanMatch, bool]:  # fmt: skip
-    """Check the scans and the guess; return S matches, and whether a single one is wanted."""
+    """Check the scans, the guess and the motions; return S matches, and whether a single one is wanted."""
     second = readings("ranges", ranges, scanner, device)
+    motion = check_motion("motion", motions[0], 1 if second.ndim == 1 else len(second))
     if isinstance(reference, OccupancyGrid):
         if method == "icp":
             raise ValueError("method: 'icp' needs a scan as reference, got a map: use 'gauss_newton'")
+        if motions[1] is not None:
+            raise ValueError("reference_motion: must be None with a map, got a motion")
         poses = check_guess(guess, None if second.ndim == 1 else len(second), np.inf)
-        matches = match_to_map(reference, np.atleast_2d(second), scanner, poses, method, device, precision, options)
+        still = _still(np.atleast_2d(second), scanner, motion)
+        matches = match_to_map(reference, still, scanner, poses, method, device, precision, options)
         return matches, second.ndim == 1
     first = readings("reference", reference, scanner, device)
     single = first.ndim == 1 and second.ndim == 1
@@ -114,14 +126,24 @@ def _matches(
         rule = f"must be one scan, or as many as ranges has, {len(second)}"
         raise ValueError(f"reference: {rule}, got {len(first)}")
     poses = check_guess(guess, None if single else len(second))
+    if motion is not None and len(motion) != len(second):
+        motion = np.repeat(motion, len(second), axis=0)
+    before = check_motion("reference_motion", motions[1], len(first))
     if method in ("gauss_newton", "correlative") and len(second):
+        first, second = _still(first, scanner, before), _still(second, scanner, motion)
         matches = match_by_maps(first, second, scanner, poses, method, device, precision, options)
         return matches, single
     real = np.dtype(precision)
-    points = scan_points(np.concatenate([first, second]), scanner, real)
+    moved = [np.zeros((len(scans), 3)) if m is None else m for scans, m in ((first, before), (second, motion))]
+    points = scan_points(np.concatenate([first, second]), scanner, real, np.concatenate(moved))
     pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
     matches = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
     return matches, single
+
+
+def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:
+    """Return (S, K) readings as those of a robot at rest."""
+    return ranges if motion is None else still_readings(ranges, scanner, motion)
 
 
 def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> np.ndarray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.sweep import sensor_points
 
 _FULL_TURN = 2 * math.pi
 # Points nearer than this have no bearing [m].
@@ -42,14 +43,18 @@ class ScanPoints:
         return np.maximum(np.sqrt(self.squares / np.maximum(self.counts, 1)), 1e-3)[scan]
 
 
-def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype) -> ScanPoints:
+def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray | None = None) -> ScanPoints:
     """Return the points of the hits of (S, K) readings.
 
     Args:
         ranges: Readings [m].
         scanner: The scanner; its mount's yaw is added to bearings.
         real: Precision of the points.
+        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.sweep``; points are then in the
+            frames at the first beams. None: the robot is at rest.
     """
+    if motion is not None and motion.any():
+        return _moved_points(ranges, scanner, real, motion)
     angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
     order = np.argsort(angle, kind="stable")
     angle = angle[order]
@@ -65,7 +70,23 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype) -> ScanPoi
     # Points as single items, which a mask takes whole.
     items = everything.view(np.dtype((np.void, 4 * everything.itemsize)))[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
+    return _points(point, hit, bearing, np.einsum("sk,sk->s", z, z))
+
+
+def _moved_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray) -> ScanPoints:
+    """Return the points of scans of a robot that moves."""
+    hit = (classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT) & (ranges > _NEAREST)
+    place = sensor_points(ranges.astype(np.float64), scanner, motion)[hit]
+    direction = np.mod(np.arctan2(place[:, 1], place[:, 0]), _FULL_TURN)
+    point = np.column_stack([place, direction, np.hypot(*place.T)]).astype(real)
+    order = np.lexsort((direction, np.nonzero(hit)[0]))
+    squares = np.bincount(np.nonzero(hit)[0], np.square(place).sum(axis=1), len(hit))
+    return _points(point[order], hit, np.sort(np.mod(scanner.bearings, _FULL_TURN)), squares)
+
+
+def _points(point: np.ndarray, hit: np.ndarray, bearing: np.ndarray, squares: np.ndarray) -> ScanPoints:
+    """Return points with the starts of their scans, and the gap of a scanner's ascending bearings."""
     start = np.append(0, np.cumsum(np.count_nonzero(hit, axis=1))).astype(np.int32)
     steps = np.diff(bearing.astype(np.float64))
     gap = _GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
-    return ScanPoints(point, start, gap, np.einsum("sk,sk->s", z, z))
+    return ScanPoints(np.ascontiguousarray(point), start, gap, squares)

@@ -12,6 +12,7 @@ import threading
 import numpy as np
 
 from gpusense.backends import Backend
+from gpusense.matching.alone import own_uncertainty, with_own
 from gpusense.matching.chain import DOUBTFUL, concluded, match_pairs, wrapped
 from gpusense.matching.climb import climb
 from gpusense.matching.options import MatchOptions
@@ -198,7 +199,8 @@ class MapMatcher:
         covariance = found.covariance.copy()
         covariance[:, [0, 1], [0, 1]] += bias**2
         covariance[:, 2, 2] += (bias / lever) ** 2
-        found = found._replace(covariance=covariance)
+        own = own_uncertainty(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
+        found = with_own(found._replace(covariance=covariance), own)
         status = np.full(len(pose), "converged", dtype="<U16")
         status[~found.observed.all(axis=1)] = "unobservable"
         status[~calm] = "no convergence"

@@ -17,7 +17,7 @@ from gpusense.matching.icp import REACH
 _FEW, _OVERLAP, _POOR = 8, 0.1, 0.46
 # A direction is observed if it has this many pairs, and more than this times the information that errors of lines make
 # up.
-_LEAST_PAIRS, _LEAST_RATIO = 1.5, 1.0
+LEAST_PAIRS, _LEAST_RATIO = 1.5, 1.0
 # Errors of pairs that share points of a line are not independent: a pair's error has the variance of its own point and
 # of the mean of a line's points, but means of overlapping lines add up as if each point were alone.
 _SHARED = 2 / (1 + 1 / (2 * REACH + 1))
@@ -81,7 +81,7 @@ def uncertainty(
     """
     sigma, factor = noise_of(squared / scale**2)
     doubted = doubt * ((sigma * scale) ** 2)[:, None, None]
-    return spread(information, doubted, _SHARED * factor * scale**2, pairs, lever, np.full(len(lever), _LEAST_PAIRS))
+    return spread(information, doubted, _SHARED * factor * scale**2, pairs, lever, np.full(len(lever), LEAST_PAIRS))
 
 
 def spread(

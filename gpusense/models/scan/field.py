@@ -13,6 +13,7 @@ from gpusense.backends import Selection
 from gpusense.interface.plan import Omission, launch_omissions, scene_omissions
 from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.run import finish
+from gpusense.models.scan.differentiable import Differentiable
 from gpusense.models.scan.field_gradient import gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
@@ -128,6 +129,14 @@ class LikelihoodFieldModel(ScanModel):
         log_p, gradient, information = in_world(numbers, self.grid.origin[2])
         shape = request.shape
         return log_p.reshape(shape), gradient.reshape(*shape, 3), information.reshape(*shape, 3, 3)
+
+    def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
+        if self.parameters.interpolation != "bilinear":
+            return None
+        return Differentiable(
+            lambda poses: self.log_likelihood(poses, ranges), lambda poses: self.gradient(poses, ranges)[:2],
+            self._field_pipeline.real,
+        )  # fmt: skip
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
         """Replace cells of the map; afterwards every result is that of a model of the changed grid.

@@ -18,6 +18,7 @@ from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
+from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
 from gpusense.models.scan.rules import Beams, Rules, check_beams
@@ -148,7 +149,9 @@ class ScanModel(ABC):
 
         Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy, in host memory or, for
         ``warp:cuda`` backends, on the model's device; arrays of pyopencl, if the model's backend is their queue. The
-        result is then an array of the same library in the same memory.
+        result is then an array of the same library in the same memory. For an interpolated likelihood field, poses may
+        be a tensor of PyTorch that requires gradients, or be traced by ``jax.grad`` or ``jax.jit``: the result is then
+        differentiable with respect to them, once, by the analytic gradient.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
@@ -169,12 +172,20 @@ class ScanModel(ABC):
             ValueError: a wrong shape, or a pose that is not finite; the message names it.
             MemoryError: the device cannot hold the map's table, or even a few particles.
         """
+        if out is None and not per_beam and is_recorded(poses):
+            calls = self._differentiable(ranges)
+            if calls is not None:
+                return cast(np.ndarray, log_likelihood_of(poses, calls))
         request = self._request(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p
+
+    def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
+        """Return the calls by which log-likelihoods are differentiated; None for a model without a gradient."""
+        return None
 
     def bind(self, poses: Any, ranges: Any, *, out: Any = None) -> BoundCall:
         """Bind arrays that stay in place to a call of ``log_likelihood``, for filters that repeat it.

@@ -1,0 +1,159 @@
+"""Motion of the robot while a scan is measured: beams are measured one after the other, evenly in time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.world.frames import ray_vectors
+from gpusense.world.scanner import Reading, Scanner, classes
+
+Floats = NDArray[np.float64]
+
+# Two neighbouring readings lie on one surface if their ranges differ by less than this share of a range, and [m].
+_RATIO, _SLACK = 0.1, 0.05
+# A beam has a reading only if one was measured within this many steps between bearings.
+_FARTHEST = 1.5
+
+
+def check_motion(name: str, motion: object, scans: int) -> Floats | None:
+    """Return the motions during S scans, (S, 3); None where there is none.
+
+    Args:
+        name: The argument's name.
+        motion: (3,) for all scans, or (S, 3), or None.
+        scans: S.
+
+    Raises:
+        TypeError, ValueError: another kind or shape, or values that are not finite.
+    """
+    if motion is None:
+        return None
+    read = checks.as_array(name, motion)
+    values = checks.array(name, read, (scans, 3) if read.ndim == 2 else (3,))
+    return np.array(np.broadcast_to(values, (scans, 3)), np.float64)
+
+
+def beam_poses(motion: Floats, beams: int) -> tuple[Floats, Floats]:
+    """Return the robot's pose at each beam in its frame at the first one, for constant velocities.
+
+    A robot with constant velocities moves on an arc; the chord to a share f of an arc that turns by theta has the
+    length sin(f theta / 2) / sin(theta / 2) of the whole chord, and is turned by (f - 1) theta / 2 from it.
+
+    Args:
+        motion: (S, 3) pose at the last beam in the frame at the first one [m, m, rad].
+        beams: K.
+
+    Returns:
+        (S, K, 2) positions [m] and (S, K) headings [rad].
+    """
+    share = np.arange(beams) / max(beams - 1, 1)
+    half = motion[:, 2, None] / 2
+    # sinc has no division by zero where the robot does not turn.
+    length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
+    turn = (share - 1) * half
+    c, s = length * np.cos(turn), length * np.sin(turn)
+    x, y = motion[:, 0, None], motion[:, 1, None]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1), 2 * share * half
+
+
+def sensor_points(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
+    """Return the end points of (S, K) readings in a frame at the sensor at the first beam, with the robot's axes.
+
+    Args:
+        ranges: Readings [m]; end points of those that are no hits have no meaning.
+        scanner: The scanner.
+        motion: (S, 3) motions during the scans.
+
+    Returns:
+        (S, K, 2) [m].
+    """
+    place, heading = beam_poses(motion, scanner.count)
+    mount = np.array(scanner.mount[:2])
+    with np.errstate(invalid="ignore"):
+        point = ranges[..., None] * ray_vectors(scanner.bearings, scanner.mount) + mount
+        c, s = np.cos(heading), np.sin(heading)
+        turned = np.stack([c * point[..., 0] - s * point[..., 1], s * point[..., 0] + c * point[..., 1]], axis=-1)
+        result: Floats = turned + place - mount
+    return result
+
+
+def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Floats:
+    """Return the readings that a robot at rest would have had where the first beam was measured.
+
+    Beams are measured in their order and evenly in time, and the robot's velocities are constant meanwhile. The end
+    points of the hits are moved into the frame of the first beam. Where two neighbours lie on one surface, a beam
+    between them meets the straight line through both; elsewhere it takes the nearest reading.
+
+    Args:
+        ranges: (K,) readings [m], or (S, K).
+        scanner: The scanner.
+        motion: (3,) or (S, 3) pose of the robot at the last beam in its frame at the first one [m, m, rad], from
+            odometry.
+
+    Returns:
+        (K,) or (S, K) readings [m]; NaN for beams along which nothing was measured.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind or breaks its rule; the message names it.
+
+    Example:
+        >>> import gpusense as gs
+        >>> scanner = gs.Scanner([-0.2, -0.1, 0.0], range_max=9.0)
+        >>> gs.deskew_scan([2.04, 1.91, 1.8], scanner, motion=(0.2, 0.0, 0.0)).round(2).tolist()
+        [2.04, 2.01, 2.0]
+    """
+    if not isinstance(scanner, Scanner):
+        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+    read = checks.as_array("ranges", ranges)
+    shape = ("S", scanner.count) if read.ndim == 2 else (scanner.count,)
+    values = np.atleast_2d(checks.array("ranges", read, shape, finite=False))
+    moved = check_motion("motion", motion, len(values))
+    if moved is None:
+        raise TypeError("motion: must be (3,) or (S, 3), got None")
+    result = still_readings(values, scanner, moved)
+    return result if read.ndim == 2 else result[0]
+
+
+def still_readings(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
+    """Return (S, K) readings of a robot at rest; see :func:`deskew_scan`."""
+    if scanner.count < 2:
+        return ranges.astype(np.float64)
+    ranges = ranges.astype(np.float64)
+    hit = classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT
+    point = sensor_points(ranges, scanner, motion)
+    # Beams without a hit turn with the robot.
+    bearing = scanner.bearings + beam_poses(motion, scanner.count)[1]
+    with np.errstate(invalid="ignore"):
+        direction = np.arctan2(point[..., 1], point[..., 0]) - scanner.mount[2]
+        reach = np.hypot(point[..., 0], point[..., 1])
+    unwrapped = direction + 2 * math.pi * np.round(np.where(hit, bearing - direction, 0) / (2 * math.pi))
+    measured, value = np.where(hit, unwrapped, bearing), np.where(hit, reach, ranges)
+    rows = [_resampled(*row, scanner.bearings) for row in zip(measured, value, hit, strict=True)]
+    return np.array(rows).reshape(ranges.shape)
+
+
+def _resampled(measured: Floats, value: Floats, hit: NDArray[np.bool], wanted: Floats) -> Floats:
+    """Return the readings at the wanted bearings from those at the measured ones.
+
+    A straight line through points at ranges a and b, and bearings 0 and t, has 1 / r = (sin(t - u) / a + sin(u) / b) /
+    sin(t) at the bearing u.
+    """
+    number = np.argsort(measured, kind="stable")
+    bearing = measured[number]
+    after = np.clip(np.searchsorted(bearing, wanted), 1, len(bearing) - 1)
+    before = after - 1
+    low, high = number[before], number[after]
+    u, t = wanted - bearing[before], bearing[after] - bearing[before]
+    near = np.where(u < t - u, low, high)
+    step = float(np.median(np.diff(bearing)))
+    result = np.where(np.abs(wanted - measured[near]) <= _FARTHEST * step, value[near], np.nan)
+    a, b = value[low], value[high]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        one = hit[low] & hit[high] & (np.abs(low - high) == 1) & (u >= 0) & (u <= t) & (t > 0) & (t < math.pi / 2)
+        one &= np.abs(a - b) < _RATIO * np.minimum(a, b) + _SLACK
+        line = np.sin(t) / (np.sin(t - u) / a + np.sin(u) / b)
+    return np.where(one, line, result)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,43 +11,20 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.backends import BackendInfo
-from gpusense.interface.constants import (
-    DEVIATION,
-    FARTHEST_THETA,
-    FARTHEST_X,
-    FAST_RATE,
-    FIRST,
-    JITTER,
-    MEAN,
-    MOST_INJECTED,
-    PER_BEAM_SCALE,
-    POOL,
-    REVERSE,
-    SCALE,
-    SEED,
-    SETTINGS,
-    SHARE,
-    SLOW_RATE,
-    STATE,
-    STEP,
-    STRATIFIED,
-    TEMPERATURE,
-    THRESHOLD,
-)
-from gpusense.interface.launches import Program
-from gpusense.localization import skipping, starts
+from gpusense.interface.constants import FIRST, STATE, TEMPERATURE
+from gpusense.localization import options, skipping, starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import Estimate, clustered, covariance_of
-from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion, settings_of
+from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
+from gpusense.localization.scoring import Given, Scoring, given_of
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import Verdict
 from gpusense.world.grid import OccupancyGrid
 
 _MOST_SENSORS = FIRST - TEMPERATURE
 _STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
-_MOST = 1 << 24
 
 
 class ParticleFilter:
@@ -75,6 +52,10 @@ class ParticleFilter:
         beam_skip: None, or a share of the particles in (0, 1): a beam that fewer of them explain is left out, such as
             one of a person. A scan of which most beams would be left out is used as a whole, and so is each scan while
             the particles lie apart. Each correction then asks 100 particles on the host first.
+
+    Attributes:
+        motion: The motion model.
+        options: The options, checked.
 
     Raises:
         TypeError: A model or option of another type.
@@ -104,44 +85,31 @@ class ParticleFilter:
         recovery: str | None = None,
         beam_skip: float | None = None,
     ) -> None:
-        chosen = list(models) if isinstance(models, Sequence) else [models]
-        if not 0 < len(chosen) <= _MOST_SENSORS:
-            raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
-        self._sensors = [Sensor(model) for model in chosen]
+        self._sensors = _sensors_of(models)
         self._backend = self._sensors[0].backend
-        if any(sensor.backend is not self._backend for sensor in self._sensors):
-            names = ", ".join(sorted({sensor.backend.info.selection for sensor in self._sensors}))
-            raise ValueError(f"models: must be of one device, got {names}")
-        if len({sensor.precision for sensor in self._sensors}) > 1:
-            raise ValueError("models: must have one precision, got float32 and float64")
-        if not self._backend.info.float64:
-            raise ValueError(f"models: must be on a device with float64, got {self._backend.info.name}")
         self.motion: MotionModel = OdometryMotion() if motion is None else motion
         if not hasattr(self.motion, "sampled"):
             raise TypeError(f"motion: must be a motion model, got {checks.show(motion)}")
-        self._least, self._most = _counts(particles)
-        self.seed = checks.integer("seed", seed, low=0, high=(1 << 64) - 1)
-        self.temperature = temperature
-        if temperature != "auto":
-            self.temperature = checks.real("temperature", temperature, above=0, high=1)
-        self.resampling = checks.choice("resampling", resampling, ("systematic", "stratified"))
-        self.threshold = checks.real("threshold", threshold, above=0, high=1)
-        self.stages = checks.integer("stages", stages, low=1, high=6)
-        self.recovery = None if recovery is None else checks.choice("recovery", recovery, ("augmented", "sensor"))
-        self.beam_skip = None if beam_skip is None else checks.real("beam_skip", beam_skip, above=0, below=1)
-        self._cloud = Cloud(self._backend, self._most, len(self._sensors), self._sensors[0].precision)
+        self.options = options.checked(
+            particles=particles, seed=seed, temperature=temperature, resampling=resampling, threshold=threshold,
+            stages=stages, recovery=recovery, beam_skip=beam_skip,
+        )  # fmt: skip
+        most = self.options.most
+        self._cloud = Cloud(self._backend, most, len(self._sensors), self._sensors[0].precision)
+        self._scoring = Scoring(self._cloud, self._sensors)
         self._step, self._started, self._pending = 0, False, _STILL
-        self._shown, self._wide = self._most, 0
-        self._pool_size, self._spread = 0, (0.0, 0.0, 0.0)
-        self._verdict = Verdict(self._sensors, self._random_poses, seed=self.seed)
+        self._shown, self._wide = most, 0
+        self._pool = 0, (0.0, 0.0, 0.0)
+        self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
 
     def __repr__(self) -> str:
-        count = f"{self._least}" if self._least == self._most else f"({self._least}, {self._most})"
+        one = self.options
+        count = f"{one.least}" if one.least == one.most else f"({one.least}, {one.most})"
         sensors = ", ".join(type(sensor.model).__name__ for sensor in self._sensors)
         return (
-            f"ParticleFilter([{sensors}], {self.motion!r}, particles={count}, temperature={self.temperature!r}, "
-            f"stages={self.stages}, backend={self.device.selection!r})"
+            f"ParticleFilter([{sensors}], {self.motion!r}, particles={count}, temperature={one.temperature!r}, "
+            f"stages={one.stages}, backend={self.device.selection!r})"
         )
 
     @property
@@ -198,7 +166,8 @@ class ParticleFilter:
         self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))
 
     def _number(self, particles: int | None) -> int:
-        return self._most if particles is None else checks.integer("particles", particles, low=1, high=self._most)
+        most = self.options.most
+        return most if particles is None else checks.integer("particles", particles, low=1, high=most)
 
     def _place(self, poses: np.ndarray) -> None:
         """Replace all particles, and forget what was learned about the likelihood of scans."""
@@ -206,21 +175,21 @@ class ParticleFilter:
         self._shown, self._started, self._pending, self._wide = len(poses), True, _STILL, 0
         self._backend.upload(np.zeros(STATE), self._cloud.state)
         self._verdict.reset()
-        if self.recovery == "augmented" and not self._pool_size:
+        if self.options.recovery == "augmented" and not self._pool[0]:
             self._set_pool(*starts.free_pool([sensor.model for sensor in self._sensors], None))
 
     def _set_pool(self, pool: np.ndarray, spread: tuple[float, float, float]) -> None:
         self._cloud.set_pool(pool)
-        self._pool_size, self._spread = len(pool), spread
+        self._pool = len(pool), spread
 
     def _key(self) -> tuple[int, int, int]:
         """Return the two words of the seed, and a number of this step."""
         self._step += 1
-        return self.seed & 0xFFFFFFFF, self.seed >> 32, self._step
+        return *self.options.words, self._step
 
     def _random_poses(self, count: int) -> np.ndarray:
         """Return poses anywhere in the free space, the same ones each time; around the particles without a grid."""
-        key = (self.seed & 0xFFFFFFFF, self.seed >> 32, 0)
+        key = (*self.options.words, 0)
         try:
             pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], None)
         except ValueError:
@@ -260,27 +229,26 @@ class ParticleFilter:
             TypeError, ValueError: readings that the model refuses.
         """
         self._check_started()
-        given = self._given(readings)
+        given = given_of(readings, self._sensors)
         if not given:
             return
-        if self._verdict.watches(dict(given)):
-            self._verdict.predicted(self.host_particles(), self.host_weights(), dict(given))
-        whole = dict(given)
-        if self.beam_skip is not None:
-            given = self._without_skipped(given, self.beam_skip)
+        chosen, whole = self.options, dict(given)
+        if self._verdict.watches(whole):
+            self._verdict.predicted(self.host_particles(), self.host_weights(), whole)
+        if chosen.beam_skip is not None:
+            given = self._without_skipped(given, chosen.beam_skip)
         motion, self._pending = self._pending, _STILL
-        drawn = self._cloud.count if self._least == self._most else self._wanted()
-        settings = self._settings(motion, [index for index, _ in given])
-        self._cloud.upload_settings(settings)
+        drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
+        self._cloud.upload_settings(self._settings(motion, [index for index, _ in given]))
         drawn = self._score(given, motion.kind, drawn)
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
         self._last = whole
         self._wide = max(self._wide - 1, 0)
         self._verdict.corrected()
-        if self.temperature == "auto":
+        if chosen.temperature == "auto":
             self._calibrate(given)
-        if self.recovery == "sensor" and self._verdict.due and self.estimate().lost:
+        if chosen.recovery == "sensor" and self._verdict.due and self.estimate().lost:
             self.reset()
 
     def reset(self) -> None:
@@ -296,7 +264,7 @@ class ParticleFilter:
         score = np.zeros(len(tries))
         for index, reading in self._last.items():
             sensor = self._sensors[index]
-            score += sensor.temperature(self.temperature, reading) * sensor.log_likelihood(tries, reading)
+            score += sensor.temperature(self.options.temperature, reading) * sensor.log_likelihood(tries, reading)
         with np.errstate(invalid="ignore"):
             best = np.argsort(-score, kind="stable")[: max(count // 10, 1)]
         chosen = starts.spread(tries[best], (0.1, 0.1, 0.05), count, self._key(), each=True)
@@ -313,31 +281,11 @@ class ParticleFilter:
         self._cloud.move(motion.kind)
         self._shown = self._cloud.count
 
-    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> int:
+    def _score(self, given: list[Given], kind: int, drawn: int) -> int:
         """Run the stages of a correction; return the number of particles drawn."""
-        cloud = self._cloud
-        recorded = self._backend.info.kind == "gpu" and all(self._sensors[i].records(reading) for i, reading in given)
-        if recorded:
-            for index, reading in given:
-                self._sensors[index].upload(reading)
-            key = (tuple((i, self._sensors[i].version) for i, _ in given), cloud.count)
-            cloud.replay(kind, self.stages, drawn, key, lambda source: self._programs(source, given))
-            return drawn
+        return self._scoring.correct(given, kind, self.options.stages, drawn)
 
-        def score(source: int) -> None:
-            if self._backend.info.kind == "gpu":
-                poses: Any = cloud.lent(cloud.poses[source], (cloud.count, 3))
-                for place, (index, reading) in enumerate(given):
-                    self._sensors[index].log_likelihood(poses, reading, self._log_p(place))
-                return
-            poses = cloud.host_poses(source, cloud.count)
-            for place, (index, reading) in enumerate(given):
-                log_p = self._sensors[index].log_likelihood(poses, reading)
-                self._backend.upload(log_p, cloud.log_p[place])
-
-        return cloud.correct(kind, self.stages, drawn, len(given), score)
-
-    def _without_skipped(self, given: list[tuple[int, tuple[Any, ...]]], share: float) -> list[tuple[int, Any]]:
+    def _without_skipped(self, given: list[Given], share: float) -> list[Given]:
         """Return readings without the beams that too few particles explain."""
         poses, weights = self.host_particles(), self.host_weights()
         if not skipping.together(poses, weights):
@@ -351,65 +299,16 @@ class ParticleFilter:
             for i, reading in given
         ]
 
-    def _programs(self, source: int, given: list[tuple[int, tuple[Any, ...]]]) -> tuple[Any, object]:
-        """Return the launches that score the poses of a buffer, and the owners of their memory."""
-        cloud = self._cloud
-        program: Program = ()
-        owners: list[object] = []
-        cloud.use(len(given))
-        poses = cloud.lent(cloud.poses[source], (cloud.count, 3))
-        for place, (index, _) in enumerate(given):
-            out = self._log_p(place)
-            launches, owner = self._sensors[index].program(poses, out)
-            program += launches
-            owners.append((poses, out, owner))
-        return program, owners
-
-    def _log_p(self, place: int) -> Any:
-        """Return the array for a sensor's log-likelihoods as one of the device's library."""
-        cloud = self._cloud
-        part = self._backend.part(cloud.log_p[place], 0, cloud.count, cloud.precision)
-        return self._backend.lend(part, (cloud.count,), cloud.precision)
-
-    def _given(self, readings: Any) -> list[tuple[int, tuple[Any, ...]]]:
-        """Return (index of a sensor, its readings) of those that are not missing, in the order of the sensors."""
-        if isinstance(readings, Mapping):
-            index = {id(sensor.model): i for i, sensor in enumerate(self._sensors)}
-            for model in readings:
-                if id(model) not in index:
-                    raise KeyError(f"readings: must be of the filter's models, got those of {checks.show(model)}")
-            pairs = sorted((index[id(model)], value) for model, value in readings.items() if value is not None)
-        elif len(self._sensors) > 1:
-            raise TypeError(f"readings: must be a mapping from models to their readings, got {checks.show(readings)}")
-        else:
-            pairs = [] if readings is None else [(0, readings)]
-        given = [(i, value if isinstance(value, tuple) else (value,)) for i, value in pairs]
-        return given
-
     def _settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
         """Return the numbers of a step."""
-        s, count = np.zeros(SETTINGS), self._cloud.count
-        s[SEED], s[SEED + 1], s[STEP] = self._key()
-        s[MEAN : DEVIATION + 4], s[REVERSE] = settings_of(motion)
-        s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
-        s[POOL], s[POOL + 1 : POOL + 4] = self._pool_size, self._spread
-        s[SHARE], s[THRESHOLD] = DEFAULTS.share, self.threshold
-        s[STRATIFIED] = float(self.resampling == "stratified")
-        # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold.
-        spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(self.threshold)) + 2
-        s[SCALE] = 2.0 ** (52 - spare)
-        if self.recovery == "augmented":
-            s[SLOW_RATE], s[FAST_RATE] = DEFAULTS.slow, DEFAULTS.fast
-            s[MOST_INJECTED] = DEFAULTS.most_injected
-        total, wide = 0.0, DEFAULTS.wide_share if self._wide and self.temperature == "auto" else 1.0
-        for place, index in enumerate(given):
-            sensor = self._sensors[index]
-            s[TEMPERATURE + place] = sensor.temperature(self.temperature) * (wide if sensor.calibrates else 1.0)
-            total += s[TEMPERATURE + place] * max(sensor.beams, 1)
-        s[PER_BEAM_SCALE] = 1 / total if total > 0 else 0.0
-        return s
+        temperature, sensors = self.options.temperature, []
+        wide = DEFAULTS.wide_share if self._wide and temperature == "auto" else 1.0
+        for sensor in (self._sensors[index] for index in given):
+            sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
+        step, count = self._key()[2], self._cloud.count
+        return options.settings_of_step(self.options, motion, step, count, self._pool, sensors)
 
-    def _calibrate(self, given: list[tuple[int, tuple[Any, ...]]]) -> None:
+    def _calibrate(self, given: list[Given]) -> None:
         """Learn the correlation of beams at the estimate, often at first and seldom later."""
         due = [(i, reading) for i, reading in given if self._sensors[i].calibrates]
         count = self._verdict.corrections
@@ -425,7 +324,7 @@ class ParticleFilter:
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""
         poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
-        return kld_count(poses, self._least, self._most)
+        return kld_count(poses, self.options.least, self.options.most)
 
     def _check_started(self) -> None:
         if not self._started:
@@ -472,7 +371,7 @@ class ParticleFilter:
     @property
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""
-        return tuple(sensor.temperature(self.temperature) for sensor in self._sensors)
+        return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
 
     @property
     def gain(self) -> float:
@@ -538,12 +437,18 @@ class ParticleFilter:
         return self._cloud.explain()
 
 
-def _counts(particles: Any) -> tuple[int, int]:
-    """Return the least and the largest number of particles."""
-    pair = particles if isinstance(particles, (tuple, list)) else (particles, particles)
-    if len(pair) != 2:
-        raise ValueError(f"particles: must be a number or (least, most), got {checks.show(particles)}")
-    least, most = (checks.integer("particles", value, low=1, high=_MOST) for value in pair)
-    if least > most:
-        raise ValueError(f"particles: least must be at most the largest, got {checks.show(particles)}")
-    return least, most
+def _sensors_of(models: Any) -> list[Sensor]:
+    """Return the sensors of models, all of one device and one precision."""
+    chosen = list(models) if isinstance(models, Sequence) else [models]
+    if not 0 < len(chosen) <= _MOST_SENSORS:
+        raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
+    sensors = [Sensor(model) for model in chosen]
+    backend = sensors[0].backend
+    if any(sensor.backend is not backend for sensor in sensors):
+        names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))
+        raise ValueError(f"models: must be of one device, got {names}")
+    if len({sensor.precision for sensor in sensors}) > 1:
+        raise ValueError("models: must have one precision, got float32 and float64")
+    if not backend.info.float64:
+        raise ValueError(f"models: must be on a device with float64, got {backend.info.name}")
+    return sensors

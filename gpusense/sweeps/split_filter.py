@@ -64,7 +64,7 @@ class SplitParticleFilter(ParticleFilter):
             raise ValueError(f"executors: must be one for each of {len(devices)} devices, got {len(executors)}")
         models = models_of(make, devices[0])
         super().__init__(models, **options)
-        most, count = self._most, len(devices)
+        most, count = self.options.most, len(devices)
         # Parts are whole blocks, whose number does not always divide by that of the shards.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)
         team: Here | There
@@ -79,7 +79,7 @@ class SplitParticleFilter(ParticleFilter):
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
 
     def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> int:
-        return self._cloud.step(kind, self.stages, drawn, given)
+        return self._cloud.step(kind, self.options.stages, drawn, given)
 
     @property
     def particles(self) -> Any:

@@ -1,0 +1,137 @@
+"""Options of a particle filter, and the numbers of its steps that follow from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.interface.constants import (
+    DEVIATION,
+    FARTHEST_THETA,
+    FARTHEST_X,
+    FAST_RATE,
+    JITTER,
+    MEAN,
+    MOST_INJECTED,
+    PER_BEAM_SCALE,
+    POOL,
+    REVERSE,
+    SCALE,
+    SEED,
+    SETTINGS,
+    SHARE,
+    SLOW_RATE,
+    STEP,
+    STRATIFIED,
+    TEMPERATURE,
+    THRESHOLD,
+)
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.motion import SampledMotion, settings_of
+
+_MOST = 1 << 24
+
+
+class Options(NamedTuple):
+    """Options of :class:`gpusense.ParticleFilter`, which has their meanings.
+
+    Attributes:
+        least: Fewest particles.
+        most: Most particles.
+        seed: Seed of the random numbers.
+        temperature: Factor of the log-likelihoods of scans, or "auto".
+        resampling: "systematic" or "stratified".
+        threshold: Resample below this share of the particles.
+        stages: Most stages of a correction.
+        recovery: None, "augmented" or "sensor".
+        beam_skip: None, or a share of the particles.
+    """
+
+    least: int
+    most: int
+    seed: int
+    temperature: float | str
+    resampling: str
+    threshold: float
+    stages: int
+    recovery: str | None
+    beam_skip: float | None
+
+    @property
+    def words(self) -> tuple[int, int]:
+        """The seed in two words of 32 bits."""
+        return self.seed & 0xFFFFFFFF, self.seed >> 32
+
+
+def checked(*, particles: Any, temperature: Any, recovery: Any, beam_skip: Any, **options: Any) -> Options:
+    """Check the options of a filter.
+
+    Raises:
+        TypeError, ValueError: an option breaks its rule.
+    """
+    least, most = _counts(particles)
+    return Options(
+        least=least,
+        most=most,
+        seed=checks.integer("seed", options["seed"], low=0, high=(1 << 64) - 1),
+        temperature="auto" if temperature == "auto" else checks.real("temperature", temperature, above=0, high=1),
+        resampling=checks.choice("resampling", options["resampling"], ("systematic", "stratified")),
+        threshold=checks.real("threshold", options["threshold"], above=0, high=1),
+        stages=checks.integer("stages", options["stages"], low=1, high=6),
+        recovery=None if recovery is None else checks.choice("recovery", recovery, ("augmented", "sensor")),
+        beam_skip=None if beam_skip is None else checks.real("beam_skip", beam_skip, above=0, below=1),
+    )
+
+
+def _counts(particles: Any) -> tuple[int, int]:
+    """Return the least and the largest number of particles."""
+    pair = particles if isinstance(particles, (tuple, list)) else (particles, particles)
+    if len(pair) != 2:
+        raise ValueError(f"particles: must be a number or (least, most), got {checks.show(particles)}")
+    least, most = (checks.integer("particles", value, low=1, high=_MOST) for value in pair)
+    if least > most:
+        raise ValueError(f"particles: least must be at most the largest, got {checks.show(particles)}")
+    return least, most
+
+
+def settings_of_step(
+    options: Options,
+    motion: SampledMotion,
+    step: int,
+    count: int,
+    pool: tuple[int, tuple[float, float, float]],
+    sensors: Sequence[tuple[float, int]],
+) -> np.ndarray:
+    """Return the numbers of a step, by the places in ``interface.constants``.
+
+    Args:
+        options: Options of the filter.
+        motion: The move that begins the step.
+        step: Number of the step.
+        count: Particles.
+        pool: Poses that recovery injects: their number, and how far they are spread in x, y [m] and heading [rad].
+        sensors: Temperature and beams of each sensor that is used.
+    """
+    s = np.zeros(SETTINGS)
+    s[SEED], s[SEED + 1], s[STEP] = *options.words, step
+    s[MEAN : DEVIATION + 4], s[REVERSE] = settings_of(motion)
+    s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
+    s[POOL], s[POOL + 1 : POOL + 4] = pool
+    s[SHARE], s[THRESHOLD] = DEFAULTS.share, options.threshold
+    s[STRATIFIED] = float(options.resampling == "stratified")
+    # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold.
+    spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(options.threshold)) + 2
+    s[SCALE] = 2.0 ** (52 - spare)
+    if options.recovery == "augmented":
+        s[SLOW_RATE], s[FAST_RATE] = DEFAULTS.slow, DEFAULTS.fast
+        s[MOST_INJECTED] = DEFAULTS.most_injected
+    total = 0.0
+    for place, (temperature, beams) in enumerate(sensors):
+        s[TEMPERATURE + place] = temperature
+        total += temperature * max(beams, 1)
+    s[PER_BEAM_SCALE] = 1 / total if total > 0 else 0.0
+    return s

@@ -49,6 +49,11 @@ class Scoring:
     def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
         self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
 
+    def records(self, given: Sequence[Given]) -> bool:
+        """Tell whether a step with such readings is one recorded program: on a GPU that can score all of them."""
+        gpu = self._backend.info.kind == "gpu"
+        return gpu and all(self._sensors[index].records(reading) for index, reading in given)
+
     def correct(self, given: Sequence[Given], kind: int, stages: int, drawn: int) -> int:
         """Run a step, and return the number of particles drawn.
 
@@ -59,7 +64,7 @@ class Scoring:
             drawn: Particles of the next step.
         """
         cloud, gpu = self._cloud, self._backend.info.kind == "gpu"
-        if gpu and all(self._sensors[index].records(reading) for index, reading in given):
+        if self.records(given):
             for index, reading in given:
                 self._sensors[index].upload(reading)
             key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)

@@ -29,7 +29,7 @@ from gpusense.reference.estimate import finish_estimate, join_poses
 from gpusense.reference.rungs import rung_of
 from gpusense.reference.weighing import join_weights, set_weights
 from gpusense.sweeps import held
-from gpusense.sweeps.parts import Part, finished, parts_of
+from gpusense.sweeps.parts import Given, Part, finished, parts_of
 from gpusense.sweeps.shard import Shard
 
 _PLAIN = frozenset[str]()
@@ -127,16 +127,13 @@ class SplitCloud(Cloud):
         backend: Device of the estimates.
         capacity: Most particles of the filter.
         precision: Of log-likelihoods.
-        early: Whether a correction ends with the stage that leaves nothing, as on processors.
 
     Attributes:
         exchanged: Bytes of particles that were handed to shards.
     """
 
-    def __init__(
-        self, team: Here | There, backend: Backend, capacity: int, precision: np.dtype, *, early: bool
-    ) -> None:
-        self.backend, self.capacity, self.precision, self._team, self._early = backend, capacity, precision, team, early
+    def __init__(self, team: Here | There, backend: Backend, capacity: int, precision: np.dtype) -> None:
+        self.backend, self.capacity, self.precision, self._team = backend, capacity, precision, team
         self.shown, self.next, self.exchanged = 0, 0, 0
         # The filter sets it to zero when it begins; the state itself is on the host.
         self.state = backend.upload(np.zeros(STATE))
@@ -181,7 +178,7 @@ class SplitCloud(Cloud):
         self._all("begin", self._settings, kind, 0)
         self.shown = self.next
 
-    def step(self, kind: int, stages: int, drawn: int, given: Sequence[tuple[int, tuple[Any, ...]]]) -> int:
+    def step(self, kind: int, stages: int, drawn: int, given: Sequence[Given], *, early: bool) -> int:
         """Run a correction, and return the number of particles drawn.
 
         Args:
@@ -189,6 +186,7 @@ class SplitCloud(Cloud):
             stages: Most stages.
             drawn: Particles of the next step.
             given: Indices of sensors with their readings.
+            early: Whether the correction ends with the stage that leaves nothing, as where no step is recorded.
         """
         self._all("begin", self._settings, kind, len(given))
         source, stage = self.next, 0
@@ -197,7 +195,7 @@ class SplitCloud(Cloud):
             self._stage(source, (stage, stages), parts_of(drawn, self._size) if last else self._parts, given)
             self.shown, self.next = source, 1 - source
             done = self._numbers[stage * STAGE + LEFT] == 0.0
-            if last or (done and self._early):
+            if last or (done and early):
                 return drawn if last else self.count
             source = 1 - source
             if done:

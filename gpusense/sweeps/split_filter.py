@@ -72,14 +72,14 @@ class SplitParticleFilter(ParticleFilter):
             team = Here([models, *(models_of(make, device) for device in devices[1:])], share)
         else:
             team = There(executors, make, devices, share)
-        early = self._backend.info.kind != "gpu"
-        self._cloud = SplitCloud(team, self._backend, most, self._sensors[0].precision, early=early)
+        self._cloud = SplitCloud(team, self._backend, most, self._sensors[0].precision)
 
     def __repr__(self) -> str:
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
 
     def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> int:
-        return self._cloud.step(kind, self.options.stages, drawn, given)
+        recorded = self._scoring.records(given)
+        return self._cloud.step(kind, self.options.stages, drawn, given, early=not recorded)
 
     @property
     def particles(self) -> Any:

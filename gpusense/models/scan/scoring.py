@@ -16,6 +16,8 @@ from gpusense.models.scan.readings import Readings
 from gpusense.models.scan.request import Request
 from gpusense.world.windows import whole
 
+_WIDE = frozenset({"WIDE"})
+
 
 @dataclass
 class LastCall:
@@ -89,7 +91,8 @@ class _Scorer:
                 key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
                 lambda: pipeline.program(scoring), version=pipeline.map.version,
             )  # fmt: skip
-        self._last.flags = flags
+        # Poses are placed in vectors, whatever scores them.
+        self._last.flags = (flags - _WIDE) | (scoring.flags & _WIDE)
         if readings.scans > 1:
             self._last.together = max(self._last.together, readings.scans)
         if request.per_beam:

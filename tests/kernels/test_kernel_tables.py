@@ -32,6 +32,7 @@ from gpusense.world.windows import Window
 # ---- distances
 
 
+@pytest.mark.sampled(0.5)
 @each_grid
 @pytest.mark.parametrize("columns_first", [True, False])
 def test_distances_are_the_squares_of_the_exact_transform(
@@ -284,6 +285,7 @@ def test_updated_rectangles_are_those_made_anew(
         np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize("sectors", SECTORS)
 def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(

@@ -92,14 +92,15 @@ def row(name, runs):
     return result
 
 
-def global_starts(data, backend, starts, scans_each=15):
-    """Return the share of starts anywhere on the map that have converged after some scans."""
+def global_starts(data, backend, starts, particles, scans_each=15):
+    """Return the share of starts anywhere on the map that have converged after some scans, and the time of a scan."""
     scans, grid, odometry = data
     model, good = field(grid, scans[0].scanner, backend), 0
     odd = list(range(1, len(scans), 2))
+    begin = time.perf_counter()
     for seed in range(starts):
         first = int(np.random.default_rng(seed).integers(0, len(odd) - scans_each))
-        pf = gs.ParticleFilter(model, particles=DEFAULTS.particles_everywhere, seed=seed)
+        pf = gs.ParticleFilter(model, particles=particles, seed=seed)
         pf.initialize_uniform()
         near = []
         for k, at in enumerate(odd[first : first + scans_each]):
@@ -109,8 +110,12 @@ def global_starts(data, backend, starts, scans_each=15):
             d = pf.estimate().pose - np.array(scans[at].pose)
             near.append(np.hypot(d[0], d[1]) < 1 and abs(gs.wrap_angle(d[2])) < np.radians(20))
         good += all(near[-3:])
-    print(f"global starts: {good} of {starts} within {scans_each} scans", flush=True)
-    return dict(name="global starts", runs=starts, good=good, scans=scans_each)
+    ms = (time.perf_counter() - begin) / (starts * scans_each) * 1000
+    print(
+        f"global starts, {particles} particles: {good} of {starts} within {scans_each} scans, {ms:.1f} ms a scan",
+        flush=True,
+    )
+    return dict(name="global starts", particles=particles, runs=starts, good=good, scans=scans_each, ms=ms)
 
 
 def main() -> None:
@@ -121,6 +126,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--limit", type=int, help="scans of each log")
     parser.add_argument("--starts", type=int, default=20, help="global starts on intel")
+    parser.add_argument("--start-particles", nargs="+", type=int, default=[DEFAULTS.particles_everywhere])
     parser.add_argument("--coverage", action="store_true", help="compare temperatures and thinning")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
@@ -135,7 +141,8 @@ def main() -> None:
             for motion, words in ((None, "default noise"), (fitted, "fitted noise")):
                 options = dict(particles=count, motion=motion)
                 runs = [track(data, model, args.limit, seed=seed, **options) for seed in range(args.seeds)]
-                results.append(row(f"{name}, {count} particles, {words}", runs))
+                if runs:
+                    results.append(row(f"{name}, {count} particles, {words}", runs))
         if args.coverage:
             for words, temperature, options in (
                 ("plain product", 1.0, {}), ("temperature 0.1", 0.1, {}), ("20 beams, product", 1.0, dict(beams=20)),
@@ -146,7 +153,7 @@ def main() -> None:
                 run = track(data, other, args.limit, particles=2000, seed=0, temperature=temperature)
                 results.append(row(f"{name}, 2000 particles, {words}", [run]))
     if "intel" in args.logs and args.starts:
-        results.append(global_starts(load("intel"), args.backend, args.starts))
+        results += [global_starts(load("intel"), args.backend, args.starts, count) for count in args.start_particles]
     if args.out is not None:
         args.out.write_text(
             json.dumps(dict(machine=machine(), arguments=vars(args) | {"out": ""}, results=results), indent=1)

@@ -13,7 +13,7 @@ from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
-from gpusense.matching.uncertainty import Uncertainty, statuses, symmetric, uncertainty
+from gpusense.matching.uncertainty import Uncertainty, inflation_of, statuses, symmetric, uncertainty
 
 # A score below this starts a search of the window, and a score below the second one, far from the guess, a search
 # nearby: far is in capture radii and rad.
@@ -31,7 +31,7 @@ _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
 
 class Best(NamedTuple):
-    """The best results (S, 24), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
+    """The best results (S, 32), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
 
     result: np.ndarray
     other: np.ndarray
@@ -201,7 +201,8 @@ def _finished(best: Best, lever: np.ndarray, options: MatchOptions, mount: tuple
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
     information, doubt = (moved.transpose(0, 2, 1) @ symmetric(result[:, at : at + 6]) @ moved for at in (6, 12))
     squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
-    found = uncertainty(information, doubt, squared, options.least_scale, result[:, 19], lever)
+    inflation = inflation_of(result[:, 24:])
+    found = uncertainty(information, doubt, squared, options.least_scale, result[:, 19], lever, inflation)
     status = statuses(result, found.observed)
     return concluded(pose, found, result[:, 3], result[:, 4], status, lever, best.other)
 

@@ -75,7 +75,7 @@ class IcpPairs:
             rules: See the kernel file ``icp``.
 
         Returns:
-            (P, M, 24) results in float64, as the kernel file describes them.
+            (P, M, 32) results in float64, as the kernel file describes them.
         """
         starts = guesses.shape[1]
         result = np.empty((len(pairs), starts, MATCH_RESULT), self._real)

@@ -2,6 +2,12 @@
 
 The information of Gauss-Newton counts errors of the lines as information: in a corridor, noise turns lines, and turned
 lines seem to constrain the position along it. Its expected value, ``variance * doubt``, is subtracted first.
+
+Errors of neighbours are correlated: they share points of a line, and what is wrong with a surface. The variance of
+their weighted sum is 1 + 2 sum rho_k times that of independent ones, with the autocorrelation rho_k of k points. Sums of
+blocks of successive points measure it (Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data"):
+the ratio of the sum of squares of the blocks' sums to that of single points is 1 + 2 sum (1 - k / b) rho_k for blocks of
+b points.
 """
 
 from __future__ import annotations
@@ -11,16 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpusense.matching.icp import REACH
-
 # Least pairs of points of a match, least share of points in common sight, and least score.
 _FEW, _OVERLAP, _POOR = 8, 0.1, 0.46
 # A direction is observed if it has this many pairs, and more than this times the information that errors of lines make
 # up.
 LEAST_PAIRS, _LEAST_RATIO = 1.5, 1.0
-# Errors of pairs that share points of a line are not independent: a pair's error has the variance of its own point and
-# of the mean of a line's points, but means of overlapping lines add up as if each point were alone.
-_SHARED = 2 / (1 + 1 / (2 * REACH + 1))
 
 
 class Uncertainty(NamedTuple):
@@ -66,9 +67,30 @@ def _noise_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.append(0, mean_wuu / mean_w), np.append(0, sigma), np.append(0, factor)
 
 
+def inflation_of(squares: np.ndarray) -> np.ndarray:
+    """Return (S,) variances of sums of weighted errors, relative to independent errors; at least 1.
+
+    The ratio rises with the size of blocks, and the more points they have, the less is known of it: its steps count
+    until the first one that is not positive. The last of them counts twice: with blocks beyond the reach of the
+    correlation, what is missing halves with each step.
+
+    Args:
+        squares: (S, 8) sums of squares of the sums of blocks of 1, 2, 4 to 128 points.
+    """
+    ratio = squares / np.where(squares[:, :1] > 0, squares[:, :1], 1)
+    step = np.diff(ratio, axis=1)
+    rises = np.logical_and.accumulate(step > 0, axis=1)
+    steps = np.where(rises, step, 0)
+    count = rises.sum(axis=1)
+    last = np.where(count > 0, steps[np.arange(len(steps)), count - 1], 0)
+    inflation: np.ndarray = 1 + steps.sum(axis=1) + last
+    return inflation
+
+
 def uncertainty(
-    information: np.ndarray, doubt: np.ndarray, squared: np.ndarray, scale: float, pairs: np.ndarray, lever: np.ndarray
-) -> Uncertainty:
+    information: np.ndarray, doubt: np.ndarray, squared: np.ndarray, scale: float, pairs: np.ndarray,
+    lever: np.ndarray, inflation: np.ndarray,
+) -> Uncertainty:  # fmt: skip
     """Return covariances, eigenvalues and observed directions.
 
     Args:
@@ -78,10 +100,12 @@ def uncertainty(
         scale: Scale of the weights [m].
         pairs: (S,) sums of weights.
         lever: (S,) length by which headings are multiplied [m].
+        inflation: (S,) factor of the covariance because errors of neighbours are correlated.
     """
     sigma, factor = noise_of(squared / scale**2)
     doubted = doubt * ((sigma * scale) ** 2)[:, None, None]
-    return spread(information, doubted, _SHARED * factor * scale**2, pairs, lever, np.full(len(lever), LEAST_PAIRS))
+    variance = inflation * factor * scale**2
+    return spread(information, doubted, variance, pairs, lever, np.full(len(lever), LEAST_PAIRS))
 
 
 def spread(
@@ -123,7 +147,7 @@ def _infinite(lost: np.ndarray) -> np.ndarray:
 
 
 def statuses(result: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Return the status of (S, 24) results of the kernel ``match_scans``."""
+    """Return the status of (S, 32) results of the kernel ``match_scans``."""
     pairs, seen, through, unseen = result[:, 18], result[:, 21], result[:, 22], result[:, 23]
     status = np.full(len(result), "converged", dtype="<U16")
     status[~observed.all(axis=1)] = "unobservable"

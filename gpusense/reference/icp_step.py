@@ -1,6 +1,8 @@
 """Steps of point-to-line ICP that bodies of one place and of several at once share.
 
-They are places among the bearings of a scan, and the normal equations.
+They are places among the bearings of a scan, the normal equations, and sums of blocks of points.
+
+Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 """
 
 from __future__ import annotations
@@ -8,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 FULL_TURN = 6.283185307179586
+# Blocks have 1, 2, 4 to 2^(MATCH_BLOCKS - 1) points.
+MATCH_BLOCKS = 8
 
 
 def bearing_of(place: np.ndarray) -> np.ndarray:
@@ -34,3 +38,9 @@ def solve(information: np.ndarray, gradient: np.ndarray) -> np.ndarray | None:
     except np.linalg.LinAlgError:
         return None
     return np.linalg.solve(factor.T, np.linalg.solve(factor, gradient)).astype(real)
+
+
+def block_squares(number: np.ndarray) -> np.ndarray:
+    """Return for blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of numbers."""
+    padded = np.append(number, np.zeros(-len(number) % (1 << (MATCH_BLOCKS - 1)), number.dtype))
+    return np.array([np.square(padded.reshape(-1, 1 << level).sum(axis=1)).sum() for level in range(MATCH_BLOCKS)])

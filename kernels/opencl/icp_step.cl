@@ -1,8 +1,11 @@
 // Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a
-// scan, and the normal equations.
+// scan, the normal equations, and sums of blocks of points.
+// Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 
 // Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
 #define MATCH_SUMS 18
+// Blocks have 1, 2, 4 to 2^(MATCH_BLOCKS - 1) points.
+#define MATCH_BLOCKS 8
 #define FULL_TURN ((real)6.283185307179586)
 
 // Return the bearing of a place in [0, 2 pi).
@@ -35,4 +38,27 @@ real4 solve(const real *sums) {
     const real u = sums[6] / a, v = (sums[7] - b * u) / d, w = (sums[8] - c * u - e * v) / f;
     const real theta = w / f, y = (v - e * theta) / d, x = (u - b * y - c * theta) / a;
     return (real4)(x, y, theta, 1);
+}
+
+// Add the number of the i-th point to blocks: squares[l] is the sum of squared sums of blocks of 2^l points, open[l] the
+// sum of a block that waits for the second half of its pair.
+void add_to_blocks(real *squares, real *open, const int levels, const int i, const real number) {
+    real sum = number;
+    for (int l = 0; l < levels; ++l) {
+        squares[l] += sum * sum;
+        if ((i >> l & 1) == 0) {
+            open[l] = sum;
+            return;
+        }
+        sum += open[l];
+    }
+}
+
+// Add the last blocks, which have fewer points.
+void close_blocks(real *squares, const real *open, const int levels, const int count) {
+    real rest = 0;
+    for (int l = 0; l + 1 < levels; ++l) {
+        if (count >> l & 1) rest += open[l];
+        squares[l + 1] += rest * rest;
+    }
 }

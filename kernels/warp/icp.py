@@ -13,12 +13,14 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import icp_step
+from .icp_step import MATCH_BLOCKS
 from .prelude import kernel, precision, work_item
 
 # Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 # and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
-# that the other scan should see, points that contradict it, points that it did not see.
-MATCH_RESULT = wp.constant(24)
+# that the other scan should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to
+# 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin.
+MATCH_RESULT = wp.constant(32)
 
 
 @functools.cache
@@ -80,7 +82,8 @@ def functions(flags):
                 k += 1
         return which
 
-    # Return the sums with a pair of a line and a place; arm is the place relative to the second scan's origin.
+    # Return the sums with a pair of a line and a place, and its weighted error; arm is the place relative to the second
+    # scan's origin.
     @wp.func
     def add_pairing(before: Sums, line: vec4, place: vec2, arm: vec2, scale: real, last: wp.bool):
         sums = before
@@ -110,7 +113,7 @@ def functions(flags):
         sums[15] += weight
         sums[16] += weight * error * error
         sums[17] += ONE
-        return sums
+        return sums, weight * error
 
     # Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of
     # agreements, points that the other scan should see, points that contradict it because it saw through them, and
@@ -159,8 +162,9 @@ def functions(flags):
         return total
 
     return SimpleNamespace(
-        Sums=Sums, bearing_of=bearing_of, points_before=points_before, nearest_point=nearest_point,
-        add_pairing=add_pairing, solve=step.solve, agreement=agreement,
+        Sums=Sums, Blocks=step.Blocks, bearing_of=bearing_of, points_before=points_before,
+        nearest_point=nearest_point, add_pairing=add_pairing, solve=step.solve, agreement=agreement,
+        add_to_blocks=step.add_to_blocks, close_blocks=step.close_blocks,
     )  # fmt: skip
 
 
@@ -174,6 +178,7 @@ def make(name, flags):
         made.Sums, made.bearing_of, made.points_before, made.nearest_point,
     )  # fmt: skip
     add_pairing, solve, agreement = made.add_pairing, made.solve, made.agreement
+    Blocks, add_to_blocks, close_blocks = made.Blocks, made.add_to_blocks, made.close_blocks
     ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
     TENTH, TEN, LARGEST_TURN, QUIET_TURN = real(0.1), real(10.0), real(0.3), real(0.03)
     # Weight in the score of a point that the other scan did not see; one that disagrees has 1.
@@ -291,6 +296,7 @@ def make(name, flags):
         others = start[which.y + 1] - second
         pose = guess[n]
         sums = Sums()
+        blocks = Blocks()
         capture = rules.capture
         scale = rules.scale
         cosine = wp.cos(pose.z)
@@ -303,9 +309,11 @@ def make(name, flags):
         while running == 1 and iteration < rules.iterations and settled == 0 and count > 0:
             last = capture <= rules.least_capture and scale <= rules.least_scale
             sums = Sums()
+            blocks = Blocks()
             stride = int(rules.stride)
             skip = int(rules.skip)
-            if last and rules.thin == 0:
+            full = last and rules.thin == 0
+            if full:
                 stride = 1
                 skip = 1
             i = int(0)
@@ -315,11 +323,16 @@ def make(name, flags):
                 place = vec2(arm.x + pose.x, arm.y + pose.y)
                 ahead = points_before(point, first, count, bearing_of(place), ahead)
                 near = nearest_point(point, first, count, ahead, skip, place, capture * capture)
+                pull = real(0.0)
                 if near >= 0:
                     at = line[first + near]
                     if at.w > ZERO:
-                        sums = add_pairing(sums, at, place, arm, scale, last)
+                        sums, pull = add_pairing(sums, at, place, arm, scale, last)
+                if full:
+                    blocks = add_to_blocks(blocks, i, pull)
                 i += stride
+            if full:
+                blocks = close_blocks(blocks, others)
             iteration += 1
             step = solve(sums)
             if step.w == ZERO:
@@ -372,5 +385,7 @@ def make(name, flags):
         result[out + 21] = both.y
         result[out + 22] = both.z
         result[out + 23] = both.w
+        for i in range(MATCH_BLOCKS):
+            result[out + 24 + i] = blocks[i]
 
     return {"fit_lines": fit_lines, "match_scans": match_scans}[name]

@@ -1,5 +1,7 @@
 """Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a
-scan, and the normal equations.
+scan, the normal equations, and sums of blocks of points.
+
+Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 """
 
 import functools
@@ -11,6 +13,8 @@ from .prelude import precision
 
 # Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
 MATCH_SUMS = 18
+# Blocks have 1, 2, 4 to 2^(MATCH_BLOCKS - 1) points.
+MATCH_BLOCKS = 8
 
 
 @functools.cache
@@ -19,6 +23,8 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
+    # Squares, and sums of blocks that wait for the second half of their pair.
+    Blocks = wp.types.vector(length=2 * MATCH_BLOCKS, dtype=real)
     ZERO, ONE, THREE, FOUR = real(0.0), real(1.0), real(3.0), real(4.0)
     FULL_TURN = real(6.283185307179586)
     DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
@@ -73,4 +79,34 @@ def functions(flags):
         x = (u - b * y - c * theta) / a
         return vec4(x, y, theta, ONE)
 
-    return SimpleNamespace(Sums=Sums, bearing_of=bearing_of, points_before=points_before, solve=solve)
+    # Return blocks with the number of the i-th point: element l is the sum of squared sums of blocks of 2^l points.
+    @wp.func
+    def add_to_blocks(before: Blocks, i: wp.int32, number: real):
+        blocks = before
+        total = number
+        waits = int(0)
+        for level in range(MATCH_BLOCKS):
+            if waits == 0:
+                blocks[level] += total * total
+                if ((i >> level) & 1) == 0:
+                    blocks[MATCH_BLOCKS + level] = total
+                    waits = 1
+                else:
+                    total += blocks[MATCH_BLOCKS + level]
+        return blocks
+
+    # Return blocks with the last ones, which have fewer points.
+    @wp.func
+    def close_blocks(before: Blocks, count: wp.int32):
+        blocks = before
+        rest = real(0.0)
+        for level in range(MATCH_BLOCKS - 1):
+            if ((count >> level) & 1) == 1:
+                rest += blocks[MATCH_BLOCKS + level]
+            blocks[level + 1] += rest * rest
+        return blocks
+
+    return SimpleNamespace(
+        Sums=Sums, Blocks=Blocks, bearing_of=bearing_of, points_before=points_before, solve=solve,
+        add_to_blocks=add_to_blocks, close_blocks=close_blocks,
+    )  # fmt: skip

@@ -60,6 +60,8 @@ ON_PURPOSE = [
     Purpose("field", "quick_value careful_value", KERNELS_ONLY, QUICK),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("icp", "_refine", REFERENCE_ONLY, "the kernel's loop, with the variables that the kernel keeps"),
+    Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
+    Purpose("icp_step", "block_squares", REFERENCE_ONLY, ARRAYS),
     Purpose(
         "landmark_grid", "squared_reach with_landmark", KERNELS_ONLY,
         "kernels look at landmarks one by one and shrink the disc; the reference evaluates all in the disc",

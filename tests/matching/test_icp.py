@@ -79,7 +79,7 @@ def test_the_step_is_gauss_newtons():
     angle = rng.uniform(-3, 3, 20)
     line = np.column_stack([np.cos(angle), np.sin(angle), rng.normal(size=20), np.ones(20)])
     arm = rng.normal(size=(20, 2))
-    information, gradient, _, numbers = reference.add_pairing(line, arm, arm, 0.5, False)
+    information, gradient, _, numbers, pull = reference.add_pairing(line, arm, arm, 0.5, False)
 
     def error(pose):
         c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -91,3 +91,4 @@ def test_the_step_is_gauss_newtons():
     np.testing.assert_allclose(information, jacobian.T @ (weight[:, None] * jacobian), atol=1e-8)
     np.testing.assert_allclose(gradient, -jacobian.T @ (weight * error(np.zeros(3))), atol=1e-8)
     assert numbers[0] == pytest.approx(weight.sum())
+    np.testing.assert_allclose(pull, weight * error(np.zeros(3)))

@@ -4,7 +4,7 @@
 // requires: icp_step lanes/math
 
 // Numbers of a result; see icp.cl.
-#define MATCH_RESULT 24
+#define MATCH_RESULT 32
 // Weight in the score of a point that the other scan did not see; one that disagrees has 1.
 #define UNSEEN ((real)0.13)
 // tan(pi / 8). arcsin s < s + ARCSIN s^3. Errors of bearings are far below BEARING_ERROR.
@@ -98,9 +98,10 @@ ilanes nearest_lanes(global const real4 *point, const int count, const int skip,
     return which;
 }
 
-// Add pairs of lines and places that are counted (1, others 0); arm is the place relative to the second scan's origin.
-void add_pairing_lanes(lanes *sums, const lanes *line, const lanes x, const lanes y, const lanes arm_x,
-                       const lanes arm_y, const real scale, const int last, const lanes counted) {
+// Add pairs of lines and places that are counted (1, others 0), and return their weighted errors; arm is the place
+// relative to the second scan's origin.
+lanes add_pairing_lanes(lanes *sums, const lanes *line, const lanes x, const lanes y, const lanes arm_x,
+                        const lanes arm_y, const real scale, const int last, const lanes counted) {
     const lanes error = line[0] * x + line[1] * y - line[2], ratio = error / scale;
     lanes weight = 1 / (1 + ratio * ratio);
     if (last) weight *= weight;
@@ -127,6 +128,7 @@ void add_pairing_lanes(lanes *sums, const lanes *line, const lanes x, const lane
     sums[15] += weight;
     sums[16] += pull * error;
     sums[17] += counted;
+    return pull;
 }
 
 // Return the points of a block from the first-th on, every stride-th; the last one stands in for missing ones.
@@ -183,14 +185,21 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
     return all + (real4)(sum_lanes(sum), sum_lanes(seen), 0, 0);
 }
 
-// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin).
+// Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
 void sum_pairs(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                const int others, const int stride, const int skip, const real4 pose, const real capture,
-               const real scale, const int last, real *sums) {
+               const real scale, const int last, const int full, real *sums, real *squares) {
     global const real *numbers = (global const real *)other;
     lanes total[MATCH_SUMS];
     int hint = 0;
+    // Squares of blocks of 1, 2, 4 and 8 points within LANES of them.
+    lanes one = 0;
+    float8 two = 0;
+    float4 four = 0;
+    float2 eight = 0;
+    real open[MATCH_BLOCKS];
     for (int i = 0; i < MATCH_SUMS; ++i) total[i] = 0;
+    for (int i = 0; i < MATCH_BLOCKS; ++i) squares[i] = open[i] = 0;
     for (int i = 0; i < others; i += LANES * stride) {
         const ilanes block = block_of(i, stride, others), at = 4 * block;
         const int *k = (const int *)&at;
@@ -202,9 +211,24 @@ void sum_pairs(global const real4 *point, global const real4 *line, const int co
         const int size = min(LANES, (others - i + stride - 1) / stride);
         const lanes present = to_lanes(block_of(0, 1, LANES)) < (real)size ? (lanes)1 : (lanes)0;
         const lanes found = present * lines_lanes(line, which, lines);
-        add_pairing_lanes(total, lines, x, y, arm_x, arm_y, scale, last, lines[3] > 0.0f ? found : (lanes)0);
+        const lanes counted = lines[3] > 0.0f ? found : (lanes)0;
+        const lanes pull = add_pairing_lanes(total, lines, x, y, arm_x, arm_y, scale, last, counted);
+        if (!full) continue;
+        const float8 by_two = pull.even + pull.odd;
+        const float4 by_four = by_two.even + by_two.odd;
+        const float2 by_eight = by_four.even + by_four.odd;
+        one += pull * pull;
+        two += by_two * by_two;
+        four += by_four * by_four;
+        eight += by_eight * by_eight;
+        add_to_blocks(squares + 4, open, MATCH_BLOCKS - 4, i / LANES, by_eight.x + by_eight.y);
     }
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = sum_lanes(total[i]);
+    if (!full) return;
+    close_blocks(squares + 4, open, MATCH_BLOCKS - 4, (others + LANES - 1) / LANES);
+    const float4 pair = two.lo + two.hi;
+    squares[0] = sum_lanes(one), squares[1] = pair.x + pair.y + pair.z + pair.w;
+    squares[2] = four.x + four.y + four.z + four.w, squares[3] = eight.x + eight.y;
 }
 
 // Fit lines to LANES points of a scan and their neighbours; see icp.cl. Farthest neighbours are MOST points away.
@@ -274,15 +298,17 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     const int first = start[which.x], count = start[which.x + 1] - first;
     const int second = start[which.y], others = start[which.y + 1] - second;
     real4 pose = guess[n];
-    real sums[MATCH_SUMS];
+    real sums[MATCH_SUMS], squares[MATCH_BLOCKS];
     real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
     int iteration = 0, settled = 0, calm = 0;
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
+    for (int i = 0; i < MATCH_BLOCKS; ++i) squares[i] = 0;
     while (iteration < rules.iterations && !settled && count > 0) {
         const int last = capture <= rules.least_capture && scale <= rules.least_scale;
         const int full = last && !rules.thin;
         sum_pairs(point + first, line + first, count, point + second, others, full ? 1 : rules.stride,
-                  full ? 1 : rules.skip, (real4)(pose.x, pose.y, cosine, sine), capture, scale, last, sums);
+                  full ? 1 : rules.skip, (real4)(pose.x, pose.y, cosine, sine), capture, scale, last, full, sums,
+                  squares);
         ++iteration;
         real4 step = solve(sums);
         if (step.w == 0) break;
@@ -321,4 +347,5 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     }
     out[18] = sums[17], out[19] = sums[15], out[20] = sums[16];
     out[21] = both.y, out[22] = both.z, out[23] = both.w;
+    for (int i = 0; i < MATCH_BLOCKS; ++i) out[24 + i] = squares[i];
 }

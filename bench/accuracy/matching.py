@@ -7,7 +7,8 @@ odometry's guess, without a guess, and from the reference +-0.5 m and +-10 degre
 scans of neighbouring poses in six maps, from guesses with such errors. Rows "map": odd scans of logs in the maps of
 their even ones, from such guesses. A match is wrong beyond 0.2 m or 5 degrees. Times are those of one call with all
 matches, the best of ``--repeats``, after a call that compiles; processor times are summed over cores. NEES is the
-squared error by the predicted covariance over 3: 1 in the mean if the covariance is right.
+squared error by the predicted covariance over 3: 1 in the mean if the covariance is right; of pairs also over the third
+of the matches with the least turn of the robot, and that with the largest.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
     deviation = np.sqrt(np.einsum("sii->si", match.covariance)[:, :2].max(axis=1))
     lies = wrong & match.converged & (distance > 10 * deviation)
     names, counts = np.unique(match.status, return_counts=True)
+    thirds = [squared[some] for some in np.array_split(np.argsort(np.abs(truth[sure, 2])), 3)]
     return {
         "what": kind, "set": name, "guess": guess, "backend": backend, "matches": len(truth),
         "median_mm": 1e3 * np.median(distance), "p95_mm": 1e3 * np.percentile(distance, 95),
@@ -69,6 +71,7 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
         "wrong_percent": 100 * wrong.mean(), "confident_wrong": int(lies.sum()),
         "statuses": dict(zip(names.tolist(), counts.tolist(), strict=True)),
         "nees_mean": squared.mean(), "nees_median": np.median(squared),
+        "nees_by_turn": [part.mean() if len(part) else np.nan for part in thirds],
         "ms": 1e3 * wall / len(truth), "processor_ms": 1e3 * processor / len(truth),
     }  # fmt: skip
 
@@ -151,6 +154,12 @@ def in_maps(data: Path, backend: str, limit: int, seed: int) -> list[dict[str, A
     return rows
 
 
+def by_turn(found: dict[str, Any]) -> str:
+    """Return the NEES of a row's pairs with the least and the largest turn."""
+    least, _, largest = found["nees_by_turn"]
+    return f"{least:.1f} / {largest:.1f}" if found["what"] == "pairs" else "-"
+
+
 def main(argv: list[str] | None = None) -> None:
     """Measure, and publish a table."""
     parser = make_parser(__doc__, backend="auto")
@@ -170,13 +179,13 @@ def main(argv: list[str] | None = None) -> None:
         [
             r["what"], r["set"], r["guess"], str(r["matches"]), f"{r['median_mm']:.1f} / {r['p95_mm']:.0f}",
             f"{r['median_deg']:.3f} / {r['p95_deg']:.2f}", f"{r['wrong_percent']:.1f}", str(r["confident_wrong"]),
-            f"{r['nees_mean']:.1f} / {r['nees_median']:.1f}", f"{r['ms']:.2f}", f"{r['processor_ms']:.2f}",
+            f"{r['nees_mean']:.2f} / {r['nees_median']:.2f}", by_turn(r), f"{r['ms']:.2f}", f"{r['processor_ms']:.2f}",
         ]
         for r in rows
     ]  # fmt: skip
     columns = [
         "what", "set", "guess", "matches", "median / p95 mm", "median / p95 deg", "wrong %", "confident and wrong",
-        "NEES mean / median", "ms", "processor ms",
+        "NEES mean / median", "least / largest turn", "ms", "processor ms",
     ]  # fmt: skip
     publish(__file__, arguments, table(columns, lines), {"rows": rows})
 

@@ -67,8 +67,9 @@ def match_scan(
         noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight.
         capture: Farthest distance between paired points at the start [m]: the error of a good guess.
         window: Half widths of the search: distance from the guess [m], and turn [rad].
-        temperature: In (0, 1]: multiplies the information, for errors that are not independent from beam to beam. 1 is
-            right for noise of ranges alone; recorded pairs have 0.02 to 0.1.
+        temperature: In (0, 1]: multiplies the information, for errors that the scans do not show, such as motion during
+            a scan. Correlation of neighbouring beams is measured and already part of a covariance between scans. 1 is
+            right for noise of ranges alone; recorded pairs have 0.06 to 0.16.
         motion: (3,) or (S, 3) motion of the robot during the second scan, from odometry: its pose at the last beam in
             its frame at the first one [m, m, rad]. Beams are measured in their order, evenly in time; guess and result
             are poses at the first beam. None: the robot is at rest.

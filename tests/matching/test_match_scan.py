@@ -9,6 +9,8 @@ import pytest
 from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, SQUARE, WALL, random_pairs, segments_scan
 
 import gpusense as gs
+from gpusense.matching.uncertainty import inflation_of
+from gpusense.reference.icp_step import block_squares
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +70,45 @@ def test_covariance_is_that_of_the_errors():
     squared = np.einsum("si,sij,sj->s", error, np.linalg.inv(match.covariance), error) / 3
     # Corners and occlusions make errors larger than those of noise alone.
     assert 0.6 < np.median(squared) / 0.79 < 1.8
+
+
+def successive(rng: np.random.Generator, shape: tuple[int, int], rho: float) -> np.ndarray:
+    """Return numbers of unit variance, each of which has the correlation rho with the one before it in its row."""
+    noise = rng.normal(size=shape)
+    for k in range(1, shape[1]):
+        noise[:, k] = rho * noise[:, k - 1] + math.sqrt(1 - rho * rho) * noise[:, k]
+    return noise
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8, 0.95])
+def test_covariance_is_that_of_correlated_errors(rho):
+    """Errors of 1 cm that repeat from beam to beam: the covariance is the scatter of 150 estimates."""
+    rng = np.random.default_rng(7)
+    scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=np.pi / 360, count=720, range_max=30.0)
+    truth = np.array([0.1, 0.05, 0.03])
+    first, second = (segments_scan(ROOM, pose, scanner) for pose in ((0.0, 0.0, 0.0), tuple(truth)))
+    first = first + 0.01 * rng.normal(size=(150, 720))
+    match = gs.match_scan(first, second + 0.01 * successive(rng, (150, 720), rho), scanner, truth, backend="opencl")
+    error = match.pose - truth
+    squared = np.einsum("si,sij,sj->s", error, np.linalg.inv(match.covariance), error) / 3
+    # The mean of 150 has a deviation of 0.07. The heading is a sum of errors of both signs along a wall, so correlation
+    # adds less to its variance than to that of positions. A covariance of independent errors has a mean of 1.5, 6.6, 23.
+    assert 0.6 < squared.mean() < 1.5
+    scatter = np.cov(error.T)[:2, :2]
+    np.testing.assert_allclose(np.trace(match.covariance.mean(axis=0)[:2, :2]) / np.trace(scatter), 1.0, atol=0.4)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
+def test_blocks_tell_the_inflation_of_the_variance(rho):
+    """It is (1 + rho) / (1 - rho) with a correlation of rho^k over k points."""
+    numbers = successive(np.random.default_rng(0), (1000, 500), rho)
+    squares = np.mean([block_squares(row) for row in numbers], axis=0)
+    assert inflation_of(squares[None])[0] == pytest.approx((1 + rho) / (1 - rho), rel=0.1)
+
+
+def test_inflations_are_at_least_1():
+    alternating, nothing = block_squares(np.array([1.0, -1.0] * 100)), np.zeros(8)
+    assert inflation_of(np.stack([alternating, nothing])).tolist() == [1, 1]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])

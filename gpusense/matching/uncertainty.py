@@ -4,9 +4,9 @@ The information of Gauss-Newton counts errors of the lines as information: in a 
 lines seem to constrain the position along it. Its expected value, ``variance * doubt``, is subtracted first.
 
 Errors of neighbours are correlated: they share points of a line, and errors of a surface. The variance of their
-weighted sum is 1 + 2 sum rho_k times that of independent errors, with the autocorrelation rho_k over k points. Blocks of
-successive points measure it (Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data"). The sum
-of squares of the sums of blocks of b points is 1 + 2 sum (1 - k / b) rho_k times that of single points.
+weighted sum is 1 + 2 sum rho_k times that of independent errors, with the autocorrelation rho_k over k points. Blocks
+of successive points measure it (Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data"): the
+sum of squares of the sums of blocks of b points is 1 + 2 sum (1 - k / b) rho_k times that of single points.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def inflation_of(squares: np.ndarray) -> np.ndarray:
     """Return (S,) variances of sums of weighted errors, relative to independent errors; at least 1.
 
     The ratio to single points rises with the size of blocks, and is less certain with large ones. So its steps count
-    until the first one that is not positive. The last of them counts twice: once blocks are longer than the correlation,
-    each step is half of the one before.
+    until the first one that is not positive. The last of them counts twice: once blocks are longer than the
+    correlation, each step is half of the one before.
 
     Args:
         squares: (S, 8) sums of squares of the sums of blocks of 1, 2, 4 to 128 points.

@@ -255,6 +255,15 @@ class Cloud:
         degenerate = bool(numbers[DEGENERATE])
         return Summary(float(own[SAMPLE_SIZE]), min(used, 1.0), degenerate, stage + 1, numbers)
 
+    def shares(self, count: int) -> Any:
+        """Return the weights of the shown particles, whose sum is 1, as an array of the device's library."""
+        out = self.backend.blank(count, _DOUBLE)
+        program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, self.block)
+        program += self.sums.launch("normalize_weights", count, weight=self.weight, estimate=self.estimated, share=out,
+                                    particles=count)  # fmt: skip
+        self.backend.run(program)
+        return self.backend.lend(out, (count,), _DOUBLE)
+
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernel's estimate of the shown particles: mean, covariance, sum of weights, best particle."""
         poses = self.poses[self.shown]

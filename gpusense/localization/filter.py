@@ -421,11 +421,9 @@ class ParticleFilter:
     @property
     def weights(self) -> Any:
         """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
-        weights = self.host_weights()
-        if self._backend.info.kind != "gpu":
-            return weights
-        buffer = self._backend.blank(self._shown, weights.dtype)
-        return self._backend.lend(self._backend.upload(weights, buffer), weights.shape, weights.dtype)
+        self._check_started()
+        self.flush()
+        return self._cloud.shares(self._shown) if self._backend.info.kind == "gpu" else self.host_weights()
 
     def _array(self, buffer: Any, shape: tuple[int, ...]) -> Any:
         if self._backend.info.kind == "gpu":

@@ -70,3 +70,10 @@ def finish_estimate(
     estimate[3], estimate[4] = total[5] / weight - x * x, total[6] / weight - x * y
     estimate[5], estimate[6] = total[7] / weight, total[8] / weight - y * y
     estimate[7], estimate[8] = total[9] / weight, total[10] / weight
+
+
+def normalize_weights(
+    flags: frozenset[str], weight: np.ndarray, estimate: np.ndarray, share: np.ndarray, particles: int
+) -> None:
+    """Divide weights by their sum, which the estimate holds."""
+    share[:particles] = weight[:particles] / estimate[9]

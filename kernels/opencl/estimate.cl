@@ -75,3 +75,10 @@ kernel void finish_estimate(global const double *poses, global const double *sum
     estimate[5] = sums[7] / weight, estimate[6] = sums[8] / weight - y * y;
     estimate[7] = sums[9] / weight, estimate[8] = sums[10] / weight;
 }
+
+// Divide weights by their sum, which the estimate holds: one work-item takes a particle.
+kernel void normalize_weights(global const double *weight, global const double *estimate, global double *share,
+                              const int particles) {
+    const int n = get_global_id(0);
+    if (n < particles) share[n] = weight[n] / estimate[9];
+}

@@ -136,4 +136,17 @@ def make(name, flags):
         estimate[7] = sums[9] / weight
         estimate[8] = sums[10] / weight
 
-    return {"sum_poses": sum_poses, "join_poses": join_poses, "finish_estimate": finish_estimate}[name]
+    # Divide weights by their sum, which the estimate holds: one work-item takes a particle.
+    @kernel
+    def normalize_weights(
+        weight: wp.array(dtype=wp.float64),
+        estimate: wp.array(dtype=wp.float64),
+        share: wp.array(dtype=wp.float64),
+        particles: wp.int32,
+    ):
+        n = wp.tid()
+        if n < particles:
+            share[n] = weight[n] / estimate[9]
+
+    kernels = {"sum_poses": sum_poses, "join_poses": join_poses, "finish_estimate": finish_estimate}
+    return (kernels | {"normalize_weights": normalize_weights})[name]

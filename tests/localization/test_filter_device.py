@@ -41,6 +41,7 @@ def test_particles_of_a_gpu_are_arrays_of_the_device(warp_as_gpu):
     assert isinstance(particles, wp.array) and particles.shape == (300, 3) and weights.shape == (300,)
     assert particles.ptr == pf.particles.ptr
     np.testing.assert_array_equal(particles.numpy(), pf.host_particles())
+    np.testing.assert_allclose(weights.numpy(), pf.host_weights(), rtol=1e-14)
 
 
 def test_a_gpu_tracks_as_a_processor_does(warp_as_gpu, monkeypatch):

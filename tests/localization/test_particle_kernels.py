@@ -139,7 +139,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True):
         settings=settings, state=state, a=rng.normal(size=3 * count), b=np.zeros(3 * count), before=np.ones(count),
         first=(rng.normal(size=count) ** 2 * -30).astype(real), second=(rng.normal(size=count) ** 2 * -3).astype(real),
         score=np.zeros(count), weight=np.zeros(count), ends=np.zeros(count), pool=rng.normal(size=15),
-        estimate=np.zeros(c.ESTIMATE),
+        estimate=np.zeros(c.ESTIMATE), share=np.zeros(count),
     )  # fmt: skip
     buffers["first"][:3] = -np.inf
     on = {name: device.upload(values) for name, values in buffers.items()}
@@ -162,6 +162,8 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True):
                                ends=on["ends"], state=on["state"], pool=on["pool"], after=on["before"],
                                particles=count, drawn=count, stage=stage, **step)  # fmt: skip
     program += sums.estimate(on["a"], on["weight"], on["estimate"], count, block)
+    program += sums.launch("normalize_weights", count, weight=on["weight"], estimate=on["estimate"], share=on["share"],
+                           particles=count)  # fmt: skip
     if not lanes:
         program = [one._replace(flags=one.flags - {"WIDE"}) for one in program]
     device.run(tuple(program))

@@ -47,4 +47,8 @@ KERNELS: dict[str, Kernel] = {
     "finish_estimate": kernel(
         "estimate", "whole", "double poses [3]", "double sums [13]", "out double estimate [12]", "int again", group=1,
     ),
+    "normalize_weights": kernel(
+        "estimate", "pose", "double weight [particles]", "double estimate [12]", "out double share [particles]",
+        "int particles",
+    ),
 }  # fmt: skip

@@ -20,11 +20,12 @@ kernel void sum_poses(global const double *poses, global const double *weight, g
     for (int k = 0; k < 11; k++) total[k] = 0.0;
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
-        const long place = 3 * (long)n;
         const choices there = lane < (long)count;
-        const doubles w = there ? load_doubles(weight, n, 1, count) : (doubles)0.0;
-        const doubles x = load_doubles(poses, place, 3, count) - x0, y = load_doubles(poses, place + 1, 3, count) - y0;
-        const doubles angle = wrap_once_lanes(load_doubles(poses, place + 2, 3, count) - theta0);
+        const doubles w = there ? load_doubles(weight, n, count) : (doubles)0.0;
+        doubles x, y, theta;
+        load_poses(poses, n, count, &x, &y, &theta);
+        x -= x0, y -= y0;
+        const doubles angle = wrap_once_lanes(theta - theta0);
         doubles cosine, sine;
         cos_sin_lanes(angle, &cosine, &sine);
         const doubles w_x = w * x, w_y = w * y;

@@ -49,18 +49,14 @@ void move_lanes(global const double *source, global const double *settings, glob
         random_words_lanes(indices, step, MOTION_STREAM + 1, key_0, key_1, words);
         ahead = uniform_of_lanes(words[0]) < settings[REVERSE] ? -ahead : ahead;
     }
-    const long place = 3 * (long)begin;
-    const doubles x = load_doubles(source, place, 3, count), y = load_doubles(source, place + 1, 3, count);
-    const doubles theta = load_doubles(source, place + 2, 3, count) + first;
+    doubles x, y, before;
+    load_poses(source, begin, count, &x, &y, &before);
+    const doubles theta = before + first;
     doubles cosine, sine;
     cos_sin_lanes(theta, &cosine, &sine);
     const doubles to_x = x + (ahead * cosine - left * sine), to_y = y + (ahead * sine + left * cosine);
     const doubles turned = wrap_once_lanes(theta + second);
-    for (int i = 0; i < count; i++) {
-        target[place + 3 * i] = ((const double *)&to_x)[i];
-        target[place + 3 * i + 1] = ((const double *)&to_y)[i];
-        target[place + 3 * i + 2] = ((const double *)&turned)[i];
-    }
+    store_poses(to_x, to_y, turned, target, begin, count);
 }
 
 // A work-item takes LANES particles.

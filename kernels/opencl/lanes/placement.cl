@@ -10,12 +10,18 @@ typedef double coordinate;
 #define FARTHEST 1073741824.0
 #define BELOW_ONE 0x1.fffffep-1f
 
-// Load an axis of poses; a lane beyond the last of count repeats it.
-doubles load_axis(global const coordinate *poses, const long place, const int count) {
-    doubles found;
-    for (int i = 0; i < DOUBLES; i++) ((double *)&found)[i] = poses[place + 3 * (i < count ? i : count - 1)];
-    return found;
+#if POSES_FLOAT32
+// Read poses from particle n on; a lane beyond the last of count repeats it.
+void load_coordinates(global const coordinate *poses, const int n, const int count, doubles *x, doubles *y,
+                      doubles *theta) {
+    for (int i = 0; i < DOUBLES; i++) {
+        global const coordinate *one = poses + 3 * ((long)n + (i < count ? i : count - 1));
+        ((double *)x)[i] = one[0], ((double *)y)[i] = one[1], ((double *)theta)[i] = one[2];
+    }
 }
+#else
+#define load_coordinates load_poses
+#endif
 
 // Clamp coordinates to +-FARTHEST cells; NaN becomes -FARTHEST.
 doubles within_reach_lanes(const doubles position) {
@@ -52,9 +58,8 @@ void cos_sin_any(const doubles theta, doubles *cosines, doubles *sines) {
 // Place the poses from begin on, at most DOUBLES of them.
 void place_lanes(global const coordinate *poses, global int2 *pose_cell, global real4 *pose, global real4 *pose_low,
                  global int *pose_status, const Frame frame, const Window window, const int begin, const int count) {
-    const long first = 3 * (long)begin;
-    doubles x = load_axis(poses, first, count), y = load_axis(poses, first + 1, count);
-    const doubles theta = load_axis(poses, first + 2, count);
+    doubles x, y, theta;
+    load_coordinates(poses, begin, count, &x, &y, &theta);
     const choices finite = (x - x) + (y - y) + (theta - theta) == 0.0;
     doubles cosine, sine;
     cos_sin_any(theta, &cosine, &sine);

@@ -19,10 +19,10 @@ kernel void weigh_particles(global const double *score, global const double *bef
     for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
-        doubles likelihood = tempered_lanes(load_doubles(score, n, 1, count), high, left);
+        doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, left);
         // Lanes without a particle have no weight.
         const choices there = (choices)(0, 1, 2, 3, 4, 5, 6, 7) < (long)count;
-        const doubles prior = there ? load_doubles(before, n, 1, count) : (doubles)0.0;
+        const doubles prior = there ? load_doubles(before, n, count) : (doubles)0.0;
         old += floor_lanes(prior * scale);
         for (int k = 0; k < RUNGS; k++) {
             const doubles weight = prior * likelihood;
@@ -52,14 +52,16 @@ kernel void set_weights(global const double *score, global const double *before,
     for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
-        doubles likelihood = tempered_lanes(load_doubles(score, n, 1, count), high, left);
+        doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, left);
         for (int k = 0; k < rung; k++) likelihood = sqrt(likelihood);
-        const doubles chosen = load_doubles(before, n, 1, count) * likelihood, whole = floor_lanes(chosen * scale);
-        for (int i = 0; i < count; i++) {
-            weight[n + i] = ((const double *)&chosen)[i];
-            sum += ((const double *)&whole)[i];
-            ends[n + i] = sum;
+        const doubles chosen = load_doubles(before, n, count) * likelihood, whole = floor_lanes(chosen * scale);
+        store_doubles(chosen, weight, n, count);
+        doubles upto;
+        for (int i = 0; i < DOUBLES; i++) {
+            sum += i < count ? ((const double *)&whole)[i] : 0.0;
+            ((double *)&upto)[i] = sum;
         }
+        store_doubles(upto, ends, n, count);
     }
     if (b == 0) set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
 }

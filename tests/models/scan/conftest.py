@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 
 import pytest
 from support.array_libraries import Array, installed
@@ -25,4 +26,7 @@ def gathering(needs, monkeypatch):
     monkeypatch.setattr(device, "_graphs", GraphCache(device._device))
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
+    # Libraries that other tests of this process have used may have left threads.
+    earlier, everything = set(threading.enumerate()), threading.enumerate
+    monkeypatch.setattr(threading, "enumerate", lambda: [one for one in everything() if one not in earlier])
     return device, started

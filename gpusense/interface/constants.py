@@ -48,6 +48,8 @@ def strands_in(terms: int) -> int:
 SEED, STEP, MEAN, DEVIATION, REVERSE, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = 0, 2, 3, 7, 11, 12, 13, 14, 15
 SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED, STRATIFIED = range(19, 27)
 TEMPERATURE = 27
+# Kinds of draws, by the setting STRATIFIED.
+SYSTEMATIC, INDEPENDENT, RESIDUAL = 0, 1, 2
 # Where a filter is split: index of the first particle here, particles of the whole filter now and in the next step; the
 # last two are 0 where all particles are here.
 FIRST, WHOLE, DRAWN = 61, 62, 63

@@ -57,6 +57,7 @@ class Cloud:
         capacity: Most particles.
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
+        residual: Whether draws are those of residual resampling.
 
     Attributes:
         count: Particles.
@@ -64,7 +65,9 @@ class Cloud:
         next: Index of the buffer with the poses of the next step.
     """
 
-    def __init__(self, backend: Backend, capacity: int, sensors: int, precision: np.dtype) -> None:
+    def __init__(
+        self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
+    ) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.shown, self.next = capacity, 0, 0
         self.block = block_of(capacity)
@@ -77,6 +80,8 @@ class Cloud:
         self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
         self.settings, self.state = backend.empty(SETTINGS, _DOUBLE), backend.upload(np.zeros(STATE))
         self.pool = backend.upload(np.zeros(3))
+        # Cumulative numbers of certain copies.
+        self._copies = backend.empty(capacity, _DOUBLE) if residual else None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
         self._estimates: dict[Hashable, Recording | None] = {}
         self._uploads: list[np.ndarray] = []
@@ -142,7 +147,8 @@ class Cloud:
     def drawing(self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int) -> Program:
         """Return the launch that draws from poses with cumulative weights, given with their number."""
         poses, ends, count = source
-        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends,
+        copies = ends if self._copies is None else self._copies
+        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends, copies=copies,
                                 settings=self.settings, state=self.state, pool=self.pool, target=target,
                                 after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
 
@@ -152,6 +158,9 @@ class Cloud:
         found, numbers = (scored[0], scored[1]), self.numbers()
         weights = self.sums.weigh(numbers, found, stage)
         weights += self.sums.set_weights(numbers, found, (stage, stages), (self.weight, self.ends))
+        if self._copies is not None:
+            given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
+            weights += self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage)
         draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage)
         return self.scoring(self._sensors) + find + weights + draw
 

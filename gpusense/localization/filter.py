@@ -43,7 +43,7 @@ class ParticleFilter:
         seed: Seed of the random numbers, 0 to 2^64 - 1.
         temperature: Factor of the log-likelihoods of scans in (0, 1], or "auto": from the correlation of beams, which
             the filter measures while it runs (:func:`calibrate_temperature`). Other sensors have temperature 1.
-        resampling: "systematic" or "stratified".
+        resampling: "systematic", "stratified" or "residual"; sums are exact in each.
         threshold: Resample where the effective sample size is below this share of the particles.
         stages: Most stages of a correction, 1 to 6; 1 is the plain particle filter with tempered weights.
         recovery: None, "augmented": inject uniform particles where the scans' likelihood drops (*Probabilistic
@@ -95,7 +95,8 @@ class ParticleFilter:
             stages=stages, recovery=recovery, beam_skip=beam_skip,
         )  # fmt: skip
         most = self.options.most
-        self._cloud = Cloud(self._backend, most, len(self._sensors), self._sensors[0].precision)
+        residual = self.options.resampling == "residual"
+        self._cloud = Cloud(self._backend, most, len(self._sensors), self._sensors[0].precision, residual=residual)
         self._scoring = Scoring(self._cloud, self._sensors)
         self._step, self._started, self._pending = 0, False, _STILL
         self._shown, self._wide = most, 0

@@ -14,11 +14,13 @@ from gpusense.interface.constants import (
     FARTHEST_THETA,
     FARTHEST_X,
     FAST_RATE,
+    INDEPENDENT,
     JITTER,
     MEAN,
     MOST_INJECTED,
     PER_BEAM_SCALE,
     POOL,
+    RESIDUAL,
     REVERSE,
     SCALE,
     SEED,
@@ -27,6 +29,7 @@ from gpusense.interface.constants import (
     SLOW_RATE,
     STEP,
     STRATIFIED,
+    SYSTEMATIC,
     TEMPERATURE,
     THRESHOLD,
 )
@@ -34,6 +37,7 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import SampledMotion, settings_of
 
 _MOST = 1 << 24
+_DRAWS = {"systematic": SYSTEMATIC, "stratified": INDEPENDENT, "residual": RESIDUAL}
 
 
 class Options(NamedTuple):
@@ -44,7 +48,7 @@ class Options(NamedTuple):
         most: Most particles.
         seed: Seed of the random numbers.
         temperature: Factor of the log-likelihoods of scans, or "auto".
-        resampling: "systematic" or "stratified".
+        resampling: "systematic", "stratified" or "residual".
         threshold: Resample below this share of the particles.
         stages: Most stages of a correction.
         recovery: None, "augmented" or "sensor".
@@ -79,7 +83,7 @@ def checked(*, particles: Any, temperature: Any, recovery: Any, beam_skip: Any, 
         most=most,
         seed=checks.integer("seed", options["seed"], low=0, high=(1 << 64) - 1),
         temperature="auto" if temperature == "auto" else checks.real("temperature", temperature, above=0, high=1),
-        resampling=checks.choice("resampling", options["resampling"], ("systematic", "stratified")),
+        resampling=checks.choice("resampling", options["resampling"], ("systematic", "stratified", "residual")),
         threshold=checks.real("threshold", options["threshold"], above=0, high=1),
         stages=checks.integer("stages", options["stages"], low=1, high=6),
         recovery=None if recovery is None else checks.choice("recovery", recovery, ("augmented", "sensor")),
@@ -122,7 +126,7 @@ def settings_of_step(
     s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
     s[POOL], s[POOL + 1 : POOL + 4] = pool
     s[SHARE], s[THRESHOLD] = DEFAULTS.share, options.threshold
-    s[STRATIFIED] = float(options.resampling == "stratified")
+    s[STRATIFIED] = _DRAWS[options.resampling]
     # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold.
     spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(options.threshold)) + 2
     s[SCALE] = 2.0 ** (52 - spare)

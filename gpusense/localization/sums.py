@@ -98,6 +98,23 @@ class Sums:
                            joined=self._joined, totals=self.totals, fan=fans_of(blocks)[0], stage=stage,
                            stages=stages, weight=weight, ends=ends, **numbers)  # fmt: skip
 
+    def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
+        """Return the launches that add up the certain copies of residual resampling; the sums of weights are lost.
+
+        Args:
+            numbers: Arguments by name: ends, state, particles, block, blocks.
+            copies: Receives their cumulative numbers.
+            drawn: Particles to draw.
+            stage: The stage.
+        """
+        blocks = numbers["blocks"]
+        return (
+            *self.launch("count_copies", blocks, sums=self.rows, drawn=drawn, stage=stage, **numbers),
+            *self._join("join_weights", WEIGHT_SUMS, blocks, self.totals),
+            *self.launch("set_copies", blocks, sums=self.rows, joined=self._joined, copies=copies,
+                         fan=fans_of(blocks)[0], drawn=drawn, stage=stage, **numbers),
+        )  # fmt: skip
+
     def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, block: int) -> Program:
         """Return the launches that write the estimate of a cloud."""
         program: Program = ()

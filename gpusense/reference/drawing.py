@@ -1,17 +1,64 @@
 """Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
 
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
-Robotics* table 4.4, and Kitagawa (1996). Between two stages of a correction a drawn pose moves by a fraction of the
-difference of two others, whose spread is that of the cloud (differential evolution: ter Braak 2006); differences
-between separate clusters are shortened. Injected poses come from a pool: free cells, or the modes of a likelihood map.
+Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
+expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a
+correction a drawn pose moves by a fraction of the difference of two others, whose spread is that of the cloud
+(differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come from
+a pool: free cells, or the modes of a likelihood map.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import DRAWN, FIRST, STAGE, STRATIFIED, TOTAL
-from gpusense.reference.draws import copy_particle, draw_particle, found_at, is_copied, mark_of, start_of
+from gpusense.interface.constants import DRAWN, FIRST, RESIDUAL, STAGE, STRATIFIED, TOTAL, WEIGHT_SUMS
+from gpusense.reference.draws import (
+    copies_of,
+    copy_particle,
+    draw_particle,
+    found_at,
+    found_residual,
+    is_copied,
+    mark_of,
+    start_of,
+)
+
+
+def count_copies(
+    flags: frozenset[str],
+    ends: np.ndarray,
+    state: np.ndarray,
+    sums: np.ndarray,
+    particles: int,
+    block: int,
+    blocks: int,
+    drawn: int,
+    stage: int,
+) -> None:
+    """Count the certain copies of each block; the other columns are 0."""
+    copies = copies_of(ends[:particles], state[stage * STAGE + TOTAL], drawn)
+    table = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS)
+    table[:] = 0.0
+    table[:, 0] = np.add.reduceat(copies, np.arange(0, particles, block))
+
+
+def set_copies(
+    flags: frozenset[str],
+    ends: np.ndarray,
+    state: np.ndarray,
+    sums: np.ndarray,
+    joined: np.ndarray,
+    copies: np.ndarray,
+    particles: int,
+    block: int,
+    blocks: int,
+    fan: int,
+    drawn: int,
+    stage: int,
+) -> None:
+    """Set the cumulative numbers of certain copies."""
+    copies[:particles] = np.cumsum(copies_of(ends[:particles], state[stage * STAGE + TOTAL], drawn))
 
 
 def draw_particles(
@@ -19,6 +66,7 @@ def draw_particles(
     source: np.ndarray,
     weight: np.ndarray,
     ends: np.ndarray,
+    copies: np.ndarray,
     settings: np.ndarray,
     state: np.ndarray,
     pool: np.ndarray,
@@ -35,6 +83,11 @@ def draw_particles(
         return
     index = n + int(settings[FIRST])
     start = start_of(settings, stage, index if settings[STRATIFIED] > 0.0 else np.zeros(1, np.uint64))
-    whole = settings[DRAWN] if settings[DRAWN] > 0.0 else float(drawn)
-    chosen = found_at(ends, mark_of((index + start) / whole, own[TOTAL]), particles)
+    if settings[STRATIFIED] == RESIDUAL:
+        certain = found_at(copies, n.astype(np.float64), particles)
+        rest = found_residual(ends, copies, start, own[TOTAL], particles, drawn)
+        chosen = np.where(n < copies[particles - 1], certain, rest)
+    else:
+        whole = settings[DRAWN] if settings[DRAWN] > 0.0 else float(drawn)
+        chosen = found_at(ends, mark_of((index + start) / whole, own[TOTAL]), particles)
     draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)

@@ -36,6 +36,26 @@ def found_at(ends: np.ndarray, mark: np.ndarray, particles: int) -> np.ndarray:
     return np.minimum(np.searchsorted(ends[:particles], mark, side="right"), particles - 1)
 
 
+def copies_of(ends: np.ndarray, total: float, drawn: int) -> np.ndarray:
+    """Return the copies that residual resampling makes for certain: the whole part of the expected number of each."""
+    weight = np.diff(ends, prepend=0.0)
+    return np.floor(drawn * weight / total) if total > 0.0 else np.zeros_like(weight)
+
+
+def found_residual(
+    ends: np.ndarray, copies: np.ndarray, fraction: np.ndarray, total: float, particles: int, drawn: int
+) -> np.ndarray:
+    """Return the first index whose cumulative residual weight exceeds a fraction of all residual weights."""
+    rest = ends[:particles] - copies[:particles] * (total / drawn)
+    # Roundings may leave a sum below the one before it: search as devices do.
+    mark, low, high = fraction * rest[-1], np.zeros(len(fraction), np.int64), np.full(len(fraction), particles - 1)
+    while (low < high).any():
+        middle = (low + high) // 2
+        above = rest[middle] > mark
+        high, low = np.where(above & (low < high), middle, high), np.where(above | (low >= high), low, middle + 1)
+    return low
+
+
 def mark_of(fraction: np.ndarray, total: float) -> np.ndarray:
     """Return the mark at a fraction of the total, below the total."""
     return np.minimum(np.floor(fraction * total), total - 1.0)

@@ -30,7 +30,8 @@ class SplitParticleFilter(ParticleFilter):
         **options: Options of :class:`ParticleFilter`.
 
     Raises:
-        TypeError, ValueError: an argument breaks its rule; see :class:`ParticleFilter`.
+        TypeError, ValueError: an argument breaks its rule; see :class:`ParticleFilter`. Residual resampling cannot be
+            split.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -64,6 +65,8 @@ class SplitParticleFilter(ParticleFilter):
             raise ValueError(f"executors: must be one for each of {len(devices)} devices, got {len(executors)}")
         models = models_of(make, devices[0])
         super().__init__(models, **options)
+        if self.options.resampling == "residual":
+            raise ValueError("resampling: must be 'systematic' or 'stratified' for a split filter, got 'residual'")
         most, count = self.options.most, len(devices)
         # Parts are whole blocks, whose number does not always divide by that of the shards.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)

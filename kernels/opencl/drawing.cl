@@ -1,15 +1,49 @@
 // Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
 // Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: "Probabilistic
-// Robotics" table 4.4, and Kitagawa (1996). Between two stages of a correction a drawn pose moves by a fraction of the
-// difference of two others, whose spread is that of the cloud (differential evolution: ter Braak 2006); differences
-// between separate clusters are shortened. Injected poses come from a pool: free cells, or the modes of a likelihood map.
+// Robotics" table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
+// expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a
+// correction a drawn pose moves by a fraction of the difference of two others, whose spread is that of the cloud
+// (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come from
+// a pool: free cells, or the modes of a likelihood map.
 // requires: draws
+
+#define WEIGHT_SUMS 17
+
+// Count the certain copies of a block; the other columns are 0: one work-item takes a block.
+kernel void count_copies(global const double *ends, global const double *state, global double *sums,
+                         const int particles, const int block, const int blocks, const int drawn, const int stage) {
+    const int b = get_global_id(0), begin = b * block;
+    if (begin >= particles) return;
+    const double total = state[stage * STAGE + TOTAL];
+    const int end = min(begin + block, particles);
+    double sum = 0.0;
+    for (int n = begin; n < end; n++) sum += copies_of(ends, total, drawn, n);
+    global double *row = sums + (long)b * WEIGHT_SUMS;
+    for (int k = 0; k < WEIGHT_SUMS; k++) row[k] = k == 0 ? sum : 0.0;
+}
+
+// Set the cumulative numbers of certain copies: one work-item takes a block.
+kernel void set_copies(global const double *ends, global const double *state, global const double *sums,
+                       global const double *joined, global double *copies, const int particles, const int block,
+                       const int blocks, const int fan, const int drawn, const int stage) {
+    const int b = get_global_id(0), begin = b * block;
+    if (begin >= particles) return;
+    const double total = state[stage * STAGE + TOTAL];
+    const int end = min(begin + block, particles);
+    double sum = 0.0;
+    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS];
+    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS];
+    for (int n = begin; n < end; n++) {
+        sum += copies_of(ends, total, drawn, n);
+        copies[n] = sum;
+    }
+}
 
 // Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a particle.
 kernel void draw_particles(global const double *source, global const double *weight, global const double *ends,
-                           global const double *settings, global const double *state, global const double *pool,
-                           global double *target, global double *after, const int particles, const int drawn,
-                           const int stage) {
+                           global const double *copies, global const double *settings, global const double *state,
+                           global const double *pool, global double *target, global double *after,
+                           const int particles, const int drawn, const int stage) {
     const int n = get_global_id(0);
     if (n >= drawn) return;
     global const double *own = state + stage * STAGE;
@@ -19,8 +53,13 @@ kernel void draw_particles(global const double *source, global const double *wei
     }
     const uint index = (uint)settings[FIRST] + (uint)n;
     const double start = start_of(settings, stage, settings[STRATIFIED] > 0.0 ? index : 0);
-    const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
-    const double mark = mark_of(((double)index + start) / whole, own[TOTAL]);
-    const int chosen = found_at(ends, mark, particles);
+    int chosen;
+    if (settings[STRATIFIED] == RESIDUAL) {
+        chosen = (double)n < copies[particles - 1] ? found_at(copies, (double)n, particles)
+                                                   : found_residual(ends, copies, start, own[TOTAL], particles, drawn);
+    } else {
+        const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
+        chosen = found_at(ends, mark_of(((double)index + start) / whole, own[TOTAL]), particles);
+    }
     draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen);
 }

@@ -7,6 +7,7 @@
 #define POOL 15
 #define SCALE 21
 #define STRATIFIED 26
+#define RESIDUAL 2.0
 #define WHOLE 62
 #define DRAWN 63
 #define LEFT 0
@@ -24,6 +25,26 @@ int found_at(global const double *ends, const double mark, const int particles) 
     while (low < high) {
         const int middle = low + (high - low) / 2;
         if (ends[middle] > mark) high = middle;
+        else low = middle + 1;
+    }
+    return low;
+}
+
+// Return the copies that residual resampling makes for certain: the whole part of the expected number.
+double copies_of(global const double *ends, const double total, const int drawn, const int n) {
+    const double weight = ends[n] - (n > 0 ? ends[n - 1] : 0.0);
+    return total > 0.0 ? floor((double)drawn * weight / total) : 0.0;
+}
+
+// Return the first index whose cumulative residual weight exceeds a fraction of all residual weights.
+int found_residual(global const double *ends, global const double *copies, const double fraction, const double total,
+                   const int particles, const int drawn) {
+    const double each = total / (double)drawn;
+    const double mark = fraction * (ends[particles - 1] - copies[particles - 1] * each);
+    int low = 0, high = particles - 1;
+    while (low < high) {
+        const int middle = low + (high - low) / 2;
+        if (ends[middle] - copies[middle] * each > mark) high = middle;
         else low = middle + 1;
     }
     return low;

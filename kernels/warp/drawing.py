@@ -1,9 +1,11 @@
 """Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
 
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
-Robotics* table 4.4, and Kitagawa (1996). Between two stages of a correction a drawn pose moves by a fraction of the
-difference of two others, whose spread is that of the cloud (differential evolution: ter Braak 2006); differences
-between separate clusters are shortened. Injected poses come from a pool: free cells, or the modes of a likelihood map.
+Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
+expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a
+correction a drawn pose moves by a fraction of the difference of two others, whose spread is that of the cloud
+(differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come from
+a pool: free cells, or the modes of a likelihood map.
 """
 
 import functools
@@ -14,7 +16,8 @@ from . import draws
 from .prelude import kernel
 
 STRATIFIED, FIRST, DRAWN, TOTAL, STAGE = (wp.constant(place) for place in (26, 61, 63, 1, 8))
-ZERO = wp.constant(wp.float64(0.0))
+WEIGHT_SUMS = wp.constant(17)
+ZERO, RESIDUAL = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(2.0))
 
 
 @functools.cache
@@ -23,6 +26,60 @@ def make(name, flags):
     of = draws.functions(frozenset())
     found_at, mark_of, is_copied, start_of = of.found_at, of.mark_of, of.is_copied, of.start_of
     copy_particle, draw_particle = of.copy_particle, of.draw_particle
+    copies_of, found_residual = of.copies_of, of.found_residual
+
+    # Count the certain copies of a block; the other columns are 0: one work-item takes a block.
+    @kernel
+    def count_copies(
+        ends: wp.array(dtype=wp.float64),
+        state: wp.array(dtype=wp.float64),
+        sums: wp.array(dtype=wp.float64),
+        particles: wp.int32,
+        block: wp.int32,
+        blocks: wp.int32,
+        drawn: wp.int32,
+        stage: wp.int32,
+    ):
+        b = wp.tid()
+        begin = b * block
+        if begin >= particles:
+            return
+        total = state[stage * STAGE + TOTAL]
+        counted = ZERO + ZERO
+        for n in range(begin, wp.min(begin + block, particles)):
+            counted += copies_of(ends, total, drawn, n)
+        sums[b * WEIGHT_SUMS] = counted
+        for k in range(1, WEIGHT_SUMS):
+            sums[b * WEIGHT_SUMS + k] = ZERO
+
+    # Set the cumulative numbers of certain copies: one work-item takes a block.
+    @kernel
+    def set_copies(
+        ends: wp.array(dtype=wp.float64),
+        state: wp.array(dtype=wp.float64),
+        sums: wp.array(dtype=wp.float64),
+        joined: wp.array(dtype=wp.float64),
+        copies: wp.array(dtype=wp.float64),
+        particles: wp.int32,
+        block: wp.int32,
+        blocks: wp.int32,
+        fan: wp.int32,
+        drawn: wp.int32,
+        stage: wp.int32,
+    ):
+        b = wp.tid()
+        begin = b * block
+        if begin >= particles:
+            return
+        total = state[stage * STAGE + TOTAL]
+        counted = ZERO + ZERO
+        for g in range(b / fan):
+            counted += joined[g * WEIGHT_SUMS]
+        for i in range(b - b % fan, b):
+            counted += sums[i * WEIGHT_SUMS]
+        for n in range(begin, wp.min(begin + block, particles)):
+            counted += copies_of(ends, total, drawn, n)
+            copies[n] = counted
 
     # Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a
     # particle.
@@ -31,6 +88,7 @@ def make(name, flags):
         source: wp.array(dtype=wp.float64),
         weight: wp.array(dtype=wp.float64),
         ends: wp.array(dtype=wp.float64),
+        copies: wp.array(dtype=wp.float64),
         settings: wp.array(dtype=wp.float64),
         state: wp.array(dtype=wp.float64),
         pool: wp.array(dtype=wp.float64),
@@ -52,8 +110,15 @@ def make(name, flags):
         first = wp.uint32(0)
         if settings[STRATIFIED] > ZERO:
             first = index
-        mark = mark_of((wp.float64(index) + start_of(settings, stage, first)) / whole, total)
-        chosen = found_at(ends, mark, particles)
+        start = start_of(settings, stage, first)
+        chosen = int(0)
+        if settings[STRATIFIED] == RESIDUAL:
+            if wp.float64(n) < copies[particles - 1]:
+                chosen = found_at(copies, wp.float64(n), particles)
+            else:
+                chosen = found_residual(ends, copies, start, total, particles, drawn)
+        else:
+            chosen = found_at(ends, mark_of((wp.float64(index) + start) / whole, total), particles)
         draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)
 
-    return {"draw_particles": draw_particles}[name]
+    return {"count_copies": count_copies, "set_copies": set_copies, "draw_particles": draw_particles}[name]

@@ -38,6 +38,39 @@ def functions(flags):
                 low = middle + 1
         return low
 
+    # Return the copies that residual resampling makes for certain: the whole part of the expected number.
+    @wp.func
+    def copies_of(ends: wp.array(dtype=wp.float64), total: wp.float64, drawn: wp.int32, n: wp.int32):
+        weight = ends[n]
+        if n > 0:
+            weight = ends[n] - ends[n - 1]
+        copies = ZERO
+        if total > ZERO:
+            copies = wp.floor(wp.float64(drawn) * weight / total)
+        return copies
+
+    # Return the first index whose cumulative residual weight exceeds a fraction of all residual weights.
+    @wp.func
+    def found_residual(
+        ends: wp.array(dtype=wp.float64),
+        copies: wp.array(dtype=wp.float64),
+        fraction: wp.float64,
+        total: wp.float64,
+        particles: wp.int32,
+        drawn: wp.int32,
+    ):
+        each = total / wp.float64(drawn)
+        mark = fraction * (ends[particles - 1] - copies[particles - 1] * each)
+        low = int(0)
+        high = particles - 1
+        while low < high:
+            middle = low + (high - low) // 2
+            if ends[middle] - copies[middle] * each > mark:
+                high = middle
+            else:
+                low = middle + 1
+        return low
+
     # Return the mark at a fraction of the total, below the total.
     @wp.func
     def mark_of(fraction: wp.float64, total: wp.float64):
@@ -132,6 +165,6 @@ def functions(flags):
         target[3 * n + 2] = theta
 
     return SimpleNamespace(
-        found_at=found_at, mark_of=mark_of, is_copied=is_copied, copy_particle=copy_particle, start_of=start_of,
-        draw_particle=draw_particle,
+        found_at=found_at, copies_of=copies_of, found_residual=found_residual, mark_of=mark_of, is_copied=is_copied,
+        copy_particle=copy_particle, words_of=words_of, start_of=start_of, draw_particle=draw_particle,
     )  # fmt: skip

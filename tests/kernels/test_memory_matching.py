@@ -85,7 +85,8 @@ for shape in ((30, 30), (7, 5)):
 for count, width in zip((37, 2100, 37), lanes):
     both[0].info, clouds = dataclasses.replace(before, lanes=width), []
     for one in both:
-        filter_ = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend=one), particles=count, seed=3)
+        filter_ = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend=one), particles=count, seed=3,
+                                    resampling="residual" if width == lanes[0] else "systematic")
         filter_.initialize(mean=poses[0], covariance=np.diag([0.1, 0.1, 0.1]) ** 2)
         filter_.predict((0.0, 0.0, 0.0), (0.05, 0.0, 0.02))
         filter_.correct(ranges[0])

@@ -98,7 +98,7 @@ def test_a_reverse_has_its_probability():
     assert stats.binomtest(int((pose[::3] < 0).sum()), count, 0.1).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("stratified", [0.0, 1.0])
+@pytest.mark.parametrize("stratified", [c.SYSTEMATIC, c.INDEPENDENT, c.RESIDUAL])
 def test_draws_keep_the_expected_copies(stratified):
     count, repeats = 50, 400
     weight = np.floor(np.random.default_rng(0).exponential(size=count) * 2.0**30)
@@ -109,28 +109,31 @@ def test_draws_keep_the_expected_copies(stratified):
     state = np.zeros(c.STATE)
     state[c.TOTAL], state[c.RESAMPLED] = ends[-1], 1.0
     expected = count * weight / weight.sum()
+    certain = np.cumsum(np.floor(expected))
     for step in range(repeats):
         target, after = np.zeros(3 * count), np.zeros(count)
         draw_particles(
-            PLAIN, source.reshape(-1), weight, ends, settings_of_step(STEP=step, STRATIFIED=stratified), state,
+            PLAIN, source.reshape(-1), weight, ends, certain, settings_of_step(STEP=step, STRATIFIED=stratified), state,
             np.zeros(3), target, after, count, count, 0,
         )  # fmt: skip
         found = np.bincount(target[::3].astype(int), minlength=count)
         copies += found
-        if not stratified:
+        if stratified == c.SYSTEMATIC:
             assert (np.abs(found - expected) < 1).all()
+        elif stratified == c.RESIDUAL:
+            assert (found >= np.floor(expected)).all()
     assert copies[7] == 0
     np.testing.assert_allclose(copies / repeats, expected, atol=5 * np.sqrt(expected.max() / repeats))
 
 
-def run_step(selection, count, flags=PLAIN, *, lanes=True):
+def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC):
     """Return all buffers after two motions, a correction of two stages and an estimate."""
     device, rng = get_backend(selection), np.random.default_rng(0)
     sums, block = Sums(device, 2 * count + 16), 8
     settings = settings_of_step(
         SEED=[123456789, 4000000000], MEAN=[0.1, 1, 0.02, -0.2], DEVIATION=[0.1, 0.2, 0.05, 0.1], REVERSE=0.1,
         JITTER=0.2, FARTHEST_X=1, FARTHEST_THETA=0.5, POOL=[5, 0.1, 0.1, 3.0], SCALE=2.0**36,
-        PER_BEAM_SCALE=0.01, SLOW_RATE=0.05, FAST_RATE=0.3, MOST_INJECTED=0.3, TEMPERATURE=[0.7, 0.9],
+        PER_BEAM_SCALE=0.01, SLOW_RATE=0.05, FAST_RATE=0.3, MOST_INJECTED=0.3, TEMPERATURE=[0.7, 0.9], STRATIFIED=draws,
     )  # fmt: skip
     state = np.zeros(c.STATE)
     state[c.SLOW], state[c.FAST] = 0.9, 0.6
@@ -138,7 +141,8 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True):
     buffers = dict(
         settings=settings, state=state, a=rng.normal(size=3 * count), b=np.zeros(3 * count), before=np.ones(count),
         first=(rng.normal(size=count) ** 2 * -30).astype(real), second=(rng.normal(size=count) ** 2 * -3).astype(real),
-        score=np.zeros(count), weight=np.zeros(count), ends=np.zeros(count), pool=rng.normal(size=15),
+        score=np.zeros(count), weight=np.zeros(count), ends=np.zeros(count), copies=np.zeros(count),
+        pool=rng.normal(size=15),
         estimate=np.zeros(c.ESTIMATE), share=np.zeros(count),
     )  # fmt: skip
     buffers["first"][:3] = -np.inf
@@ -158,9 +162,12 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True):
         find, *scored = sums.highest(numbers["blocks"])
         program += find + sums.weigh(numbers, scored, stage)
         program += sums.set_weights(numbers, scored, (stage, 2), (on["weight"], on["ends"]))
+        if draws == c.RESIDUAL:
+            given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
+            program += sums.copies(dict(given, ends=on["ends"]), on["copies"], count, stage)
         program += sums.launch("draw_particles", count, source=on[source], target=on[target], weight=on["weight"],
-                               ends=on["ends"], state=on["state"], pool=on["pool"], after=on["before"],
-                               particles=count, drawn=count, stage=stage, **step)  # fmt: skip
+                               ends=on["ends"], copies=on["copies"], state=on["state"], pool=on["pool"],
+                               after=on["before"], particles=count, drawn=count, stage=stage, **step)  # fmt: skip
     program += sums.estimate(on["a"], on["weight"], on["estimate"], count, block)
     program += sums.launch("normalize_weights", count, weight=on["weight"], estimate=on["estimate"], share=on["share"],
                            particles=count)  # fmt: skip
@@ -180,3 +187,14 @@ def test_every_backend_has_the_bits_of_the_reference(backend, count, flags, lane
     expected, found = run_step("numpy", count, flags), run_step(backend, count, flags, lanes=lanes)
     for name, values in expected.items():
         assert np.array_equal(values, found[name]), name
+
+
+@pytest.mark.parametrize("draws", [c.INDEPENDENT, c.RESIDUAL], ids=["stratified", "residual"])
+@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+def test_other_draws_have_the_bits_of_the_reference(backend, draws, lanes):
+    expected, found = run_step("numpy", 1500, draws=draws), run_step(backend, 1500, lanes=lanes, draws=draws)
+    for name, values in expected.items():
+        assert np.array_equal(values, found[name]), name
+    if draws == c.RESIDUAL:
+        # Certain copies of the second stage, in order.
+        assert 0 < found["copies"][-1] <= 1500 and (np.diff(found["copies"]) >= 0).all()

@@ -73,6 +73,11 @@ def test_gpus_weigh_by_several_sensors(warp_as_gpu):
     assert equal(states(pf, 2), expected)
 
 
+def test_residual_draws_cannot_be_split():
+    with pytest.raises(ValueError, match="resampling: must be 'systematic' or 'stratified'"):
+        SplitParticleFilter(field, devices=["numpy"] * 2, particles=100, resampling="residual")
+
+
 def test_shares_are_whole_blocks():
     for count in (1, 16, 17, 1000, 12345):
         for shards in (1, 2, 3, 8):
@@ -96,7 +101,7 @@ def test_kernels_count_particles_from_the_first(device):
     state[c.TOTAL], state[c.RESAMPLED], state[c.LEFT] = ends[-1], 1.0, 0.5
     moved, drawn, after = np.zeros(600), np.zeros(600), np.zeros(200)
     move_particles(plain, source, settings, moved, 200, c.STRAIGHT)
-    draw_particles(plain, source, ends, ends, settings, state, np.zeros(3), drawn, after, 200, 200, 0)
+    draw_particles(plain, source, ends, ends, ends, settings, state, np.zeros(3), drawn, after, 200, 200, 0)
     for first in (0, 100):
         settings[c.FIRST], settings[c.WHOLE], settings[c.DRAWN] = first, 200, 200
         up, target = device.upload, device.empty(300, np.dtype(float))
@@ -105,7 +110,7 @@ def test_kernels_count_particles_from_the_first(device):
                            particles=100, kind=c.STRAIGHT),))  # fmt: skip
         assert np.array_equal(device.download(target, np.empty(300)), moved[3 * first : 3 * first + 300])
         device.run((launch("draw_particles", plain, (100,), source=up(source), weight=up(ends), ends=up(ends),
-                           settings=up(settings), state=up(state), pool=up(np.zeros(3)), target=target,
+                           copies=up(ends), settings=up(settings), state=up(state), pool=up(np.zeros(3)), target=target,
                            after=up(np.zeros(100)), particles=200, drawn=100, stage=0),))  # fmt: skip
         assert np.array_equal(device.download(target, np.empty(300)), drawn[3 * first : 3 * first + 300])
 

@@ -32,10 +32,19 @@ KERNELS: dict[str, Kernel] = {
         f"out {_STATE}", "out double weight [particles]", "out double ends [particles]", "int particles", "int block",
         "int blocks", "int fan", "int groups", "int stage", "int stages", group=16,
     ),
+    "count_copies": kernel(
+        "drawing", "group", "double ends [particles]", _STATE, f"out {_SUMS}", "int particles", "int block",
+        "int blocks", "int drawn", "int stage", group=16,
+    ),
+    "set_copies": kernel(
+        "drawing", "group", "double ends [particles]", _STATE, _SUMS, "double joined [17]",
+        "out double copies [particles]", "int particles", "int block", "int blocks", "int fan", "int drawn",
+        "int stage", group=16,
+    ),
     "draw_particles": kernel(
         "drawing", "pose", "double source [3 * particles]", "double weight [particles]", "double ends [particles]",
-        _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]", "out double after [drawn]",
-        "int particles", "int drawn", "int stage", wide=True,
+        "double copies [particles]", _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]",
+        "out double after [drawn]", "int particles", "int drawn", "int stage", wide=True,
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [12]",

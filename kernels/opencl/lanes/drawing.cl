@@ -4,12 +4,13 @@
 
 // A work-item takes LANES particles.
 kernel void draw_particles(global const double *source, global const double *weight, global const double *ends,
-                           global const double *settings, global const double *state, global const double *pool,
-                           global double *target, global double *after, const int particles, const int drawn,
-                           const int stage) {
+                           global const double *copies, global const double *settings, global const double *state,
+                           global const double *pool, global double *target, global double *after,
+                           const int particles, const int drawn, const int stage) {
     const int first = LANES * get_global_id(0), last = min(first + LANES, drawn);
     global const double *own = state + stage * STAGE;
     const int copied = is_copied(own, particles, drawn), stratified = settings[STRATIFIED] > 0.0;
+    const int residual = settings[STRATIFIED] == RESIDUAL;
     const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
     double start = start_of(settings, stage, 0);
     int chosen = 0;
@@ -20,9 +21,15 @@ kernel void draw_particles(global const double *source, global const double *wei
         }
         const uint index = (uint)settings[FIRST] + (uint)n;
         if (stratified) start = start_of(settings, stage, index);
-        const double mark = mark_of(((double)index + start) / whole, own[TOTAL]);
-        if (n == first) chosen = found_at(ends, mark, particles);
-        while (chosen < particles - 1 && !(ends[chosen] > mark)) chosen++;
+        if (residual) {
+            chosen = (double)n < copies[particles - 1]
+                         ? found_at(copies, (double)n, particles)
+                         : found_residual(ends, copies, start, own[TOTAL], particles, drawn);
+        } else {
+            const double mark = mark_of(((double)index + start) / whole, own[TOTAL]);
+            if (n == first) chosen = found_at(ends, mark, particles);
+            while (chosen < particles - 1 && !(ends[chosen] > mark)) chosen++;
+        }
         draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen);
     }
 }

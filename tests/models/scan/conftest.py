@@ -27,6 +27,6 @@ def gathering(needs, monkeypatch):
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
     # Libraries that other tests of this process have used may have left threads.
-    earlier, everything = set(threading.enumerate()), threading.enumerate
+    earlier, everything = {*threading.enumerate()} - {threading.current_thread()}, threading.enumerate
     monkeypatch.setattr(threading, "enumerate", lambda: [one for one in everything() if one not in earlier])
     return device, started

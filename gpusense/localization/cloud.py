@@ -267,7 +267,7 @@ class Cloud:
     def shares(self, count: int) -> Any:
         """Return the weights of the shown particles, whose sum is 1, as an array of the device's library."""
         out = self.backend.blank(count, _DOUBLE)
-        program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, self.block)
+        program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count)
         program += self.sums.launch("normalize_weights", count, weight=self.weight, estimate=self.estimated, share=out,
                                     particles=count)  # fmt: skip
         self.backend.run(program)
@@ -276,11 +276,11 @@ class Cloud:
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernel's estimate of the shown particles: mean, covariance, sum of weights, best particle."""
         poses = self.poses[self.shown]
-        key = self.shown, count, self.block
+        key = self.shown, count
         if recording := self._estimates.get(key):
             recording()
         else:
-            program = self.sums.estimate(poses, self.weight, self.estimated, count, self.block)
+            program = self.sums.estimate(poses, self.weight, self.estimated, count)
             self.backend.run(program)
             # Clouds that change their size seldom ask twice for the same.
             kept = self.backend.record(program) if key in self._estimates else None

@@ -115,9 +115,12 @@ class Sums:
                          fan=fans_of(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
-    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, block: int) -> Program:
-        """Return the launches that write the estimate of a cloud."""
+    def estimate(
+        self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, block: int | None = None
+    ) -> Program:
+        """Return the launches that write the estimate of a cloud, by blocks of its own number of particles."""
         program: Program = ()
+        block = block or block_of(count)
         for again in (0, 1):
             program += self.launch("sum_poses", -(-count // block), poses=poses, weight=weight, estimate=estimate,
                                    sums=self.rows, particles=count, block=block, again=again)  # fmt: skip

@@ -20,6 +20,7 @@ OPTIONS = [
     dict(stages=1),
     dict(stages=1, resampling="stratified", threshold=1.0),
     dict(particles=(200, 600), stages=2),
+    dict(particles=(300, 9000), stages=2),
     dict(recovery="augmented", particles=401),
 ]
 

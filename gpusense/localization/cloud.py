@@ -144,10 +144,12 @@ class Cloud:
             for sensor, log_p in enumerate(self.log_p[:sensors])
         )  # fmt: skip
 
-    def drawing(self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int) -> Program:
+    def drawing(
+        self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int, copies: Buffer | None = None
+    ) -> Program:
         """Return the launch that draws from poses with cumulative weights, given with their number."""
         poses, ends, count = source
-        copies = ends if self._copies is None else self._copies
+        copies = ends if copies is None else copies
         return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends, copies=copies,
                                 settings=self.settings, state=self.state, pool=self.pool, target=target,
                                 after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
@@ -161,7 +163,8 @@ class Cloud:
         if self._copies is not None:
             given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
             weights += self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage)
-        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage)
+        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage,
+                            self._copies)
         return self.scoring(self._sensors) + find + weights + draw
 
     # ---- steps

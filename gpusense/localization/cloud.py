@@ -149,7 +149,7 @@ class Cloud:
     ) -> Program:
         """Return the launch that draws from poses with cumulative weights, given with their number."""
         poses, ends, count = source
-        copies = ends if copies is None else copies
+        copies = next(one for one in (copies, self._copies, ends) if one is not None)
         return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends, copies=copies,
                                 settings=self.settings, state=self.state, pool=self.pool, target=target,
                                 after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
@@ -163,8 +163,7 @@ class Cloud:
         if self._copies is not None:
             given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
             weights += self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage)
-        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage,
-                            self._copies)
+        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage)
         return self.scoring(self._sensors) + find + weights + draw
 
     # ---- steps

@@ -23,6 +23,7 @@ from gpusense.interface.constants import (
     SETTINGS,
     STAGE,
     STATE,
+    WIDE_HEADINGS,
 )
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
@@ -181,7 +182,7 @@ class Cloud:
             self.backend.upload(self._read(self.before, self.count), self.weight)
         )
 
-    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int], None]) -> int:
+    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int, Program], None]) -> int:
         """Run a step whose log-likelihoods are computed by calls between the launches.
 
         Args:
@@ -189,20 +190,19 @@ class Cloud:
             stages: Most stages.
             drawn: Particles of the next step.
             sensors: Sensors that are used, the first ones of ``log_p``.
-            score: Writes the log-likelihoods of the poses of a buffer into ``log_p``.
+            score: Writes the log-likelihoods of the poses of a buffer, once a program has written them, into ``log_p``.
 
         Returns:
             The number of particles drawn.
         """
-        run = self.backend.run
         self.use(sensors)
-        run(self.motion(kind))
-        source = self.next
+        source, before = self.next, self.motion(kind)
         for stage in range(stages):
             last = stage + 1 == stages
-            score(source)
+            score(source, before)
+            before = ()
             # A stage that leaves nothing draws for the next step, so every stage may be the last one.
-            run(self.weighing(source, stage, stages, self.count if not last else drawn))
+            self.backend.run(self.weighing(source, stage, stages, self.count if not last else drawn))
             self.shown, self.next = source, 1 - source
             if last or self._read(self.state, STATE)[stage * STAGE + LEFT] == 0.0:
                 return drawn if last else self.count
@@ -274,13 +274,17 @@ class Cloud:
         return self.backend.lend(out, (count,), _DOUBLE)
 
     def estimate(self, count: int) -> np.ndarray:
-        """Return the kernel's estimate of the shown particles: mean, covariance, sum of weights, best particle."""
-        poses = self.poses[self.shown]
-        key = self.shown, count
+        """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
+        numbers = self._estimate(count, 0)
+        return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
+
+    def _estimate(self, count: int, again: int) -> np.ndarray:
+        """Return the numbers after a pass of the estimate."""
+        key = self.shown, count, again
         if recording := self._estimates.get(key):
             recording()
         else:
-            program = self.sums.estimate(poses, self.weight, self.estimated, count)
+            program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, again)
             self.backend.run(program)
             # Clouds that change their size seldom ask twice for the same.
             kept = self.backend.record(program) if key in self._estimates else None

@@ -80,7 +80,7 @@ class Sums:
         blocks = numbers["blocks"]
         weigh = self.launch("weigh_particles", blocks, largest=largest, groups=groups, sums=self.rows, stage=stage,
                             **numbers)  # fmt: skip
-        return weigh + self._join("join_weights", WEIGHT_SUMS, blocks, self.totals)
+        return weigh + self._join(WEIGHT_SUMS, blocks, self.totals)
 
     def set_weights(
         self, numbers: dict[str, Any], scored: tuple[Buffer, int], place: tuple[int, int], out: tuple[Buffer, Buffer]
@@ -110,32 +110,30 @@ class Sums:
         blocks = numbers["blocks"]
         return (
             *self.launch("count_copies", blocks, sums=self.rows, drawn=drawn, stage=stage, **numbers),
-            *self._join("join_weights", WEIGHT_SUMS, blocks, self.totals),
+            *self._join(WEIGHT_SUMS, blocks, self.totals),
             *self.launch("set_copies", blocks, sums=self.rows, joined=self._joined, copies=copies,
                          fan=fans_of(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
-    def estimate(
-        self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, block: int | None = None
-    ) -> Program:
-        """Return the launches that write the estimate of a cloud, by blocks of its own number of particles."""
-        program: Program = ()
-        block = block or block_of(count)
-        for again in (0, 1):
-            program += self.launch("sum_poses", -(-count // block), poses=poses, weight=weight, estimate=estimate,
-                                   sums=self.rows, particles=count, block=block, again=again)  # fmt: skip
-            program += self._join("join_poses", ESTIMATE_SUMS, -(-count // block), self._moments)
-            program += self.launch("finish_estimate", 1, poses=poses, sums=self._moments, estimate=estimate,
-                                   again=again)  # fmt: skip
-        return program
+    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
+        """Return the launches that write the estimate of a cloud, or those of its second pass."""
+        block = block_of(count)
+        blocks = -(-count // block)
+        return (
+            *self.launch("sum_poses", blocks, poses=poses, weight=weight, estimate=estimate, sums=self.rows,
+                         particles=count, block=block, again=again),
+            *self._join(ESTIMATE_SUMS, blocks, self._moments),
+            *self.launch("finish_estimate", 1, poses=poses, sums=self._moments, estimate=estimate, again=again),
+        )  # fmt: skip
 
-    def _join(self, kernel: str, columns: int, blocks: int, total: Buffer) -> Program:
+    def _join(self, columns: int, blocks: int, total: Buffer) -> Program:
         """Return the launches that add up the rows of groups, and of all groups."""
         program: Program = ()
         source, fans = self.rows, fans_of(blocks)
         for level, fan in enumerate(fans):
             last = level + 1 == len(fans)
             joined, groups = total if last else self._joined, -(-blocks // fan)
-            program += self.launch(kernel, groups * columns, sums=source, joined=joined, rows=blocks, fan=fan)
+            program += self.launch("join_rows", groups * columns, sums=source, joined=joined, rows=blocks,
+                                   columns=columns, fan=fan)  # fmt: skip
             source, blocks = joined, groups
         return program

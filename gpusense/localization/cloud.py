@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.recording import Recording
+from gpusense.backends.recording import Recording, Repeated
 from gpusense.interface.constants import (
     DEGENERATE,
     ESTIMATE,
@@ -84,7 +84,7 @@ class Cloud:
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
-        self._estimates: dict[Hashable, Recording | None] = {}
+        self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
         self._uploads: list[np.ndarray] = []
 
     @property
@@ -106,6 +106,7 @@ class Cloud:
         """Upload the poses from which recovery injects particles."""
         self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
         self._recordings.clear()
+        self._stages.clear()
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the numbers of a step to the device."""
@@ -202,12 +203,17 @@ class Cloud:
             score(source, before)
             before = ()
             # A stage that leaves nothing draws for the next step, so every stage may be the last one.
-            self.backend.run(self.weighing(source, stage, stages, self.count if not last else drawn))
+            self._weigh(source, stage, stages, self.count if not last else drawn)
             self.shown, self.next = source, 1 - source
             if last or self._read(self.state, STATE)[stage * STAGE + LEFT] == 0.0:
                 return drawn if last else self.count
             source = 1 - source
         raise AssertionError(stages)
+
+    def _weigh(self, source: int, stage: int, stages: int, drawn: int) -> None:
+        """Run the launches of a stage after its scores."""
+        key = source, stage, stages, drawn, self.count, self._sensors
+        self._stages.run(key, lambda: self.weighing(source, stage, stages, drawn))
 
     def replay(
         self, kind: int, stages: int, drawn: int, key: Hashable, programs: Callable[[int], tuple[Program, object]]
@@ -280,15 +286,11 @@ class Cloud:
 
     def _estimate(self, count: int, again: int) -> np.ndarray:
         """Return the numbers after a pass of the estimate."""
-        key = self.shown, count, again
-        if recording := self._estimates.get(key):
-            recording()
-        else:
-            program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, again)
-            self.backend.run(program)
-            # Clouds that change their size seldom ask twice for the same.
-            kept = self.backend.record(program) if key in self._estimates else None
-            self._estimates = dict([*self._estimates.items()][-7:]) | {key: kept}
+        # Clouds that change their size seldom ask twice for the same.
+        self._estimates.run(
+            (self.shown, count, again),
+            lambda: self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, again),
+        )
         return self._read(self.estimated, ESTIMATE)
 
     def host_poses(self, index: int, count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from gpusense.interface.constants import (
 )
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
-from gpusense.localization.sums import Sums, block_of
+from gpusense.localization.sums import Sums, weight_block
 
 _DOUBLE = np.dtype(np.float64)
 
@@ -71,7 +71,7 @@ class Cloud:
     ) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.shown, self.next = capacity, 0, 0
-        self.block = block_of(capacity)
+        self.block = weight_block(backend, capacity)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(2)]
@@ -95,7 +95,7 @@ class Cloud:
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
         self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = block_of(self.count)
+        self.block = weight_block(self.backend, self.count)
         w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
         self.backend.synchronize()
         self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
@@ -253,7 +253,7 @@ class Cloud:
     def resized(self, drawn: int) -> None:
         """Set the number of particles, after a step that has drawn that number."""
         self.count = drawn
-        self.block = block_of(drawn)
+        self.block = weight_block(self.backend, drawn)
 
     # ---- what crosses to the host
 

@@ -1,7 +1,8 @@
 """Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
 
 A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group.
+number of particles. Small clouds have one group. GPUs have work-items to spare and take smaller blocks of weights, whose
+sums are exact; sums of poses have the same blocks everywhere.
 """
 
 from __future__ import annotations
@@ -19,12 +20,17 @@ from gpusense.interface.launches import Program, launch
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
 # Particles of a vector of float64, the fewest of a block, and the most blocks that one work-item adds up.
-_VECTOR, _LEAST, MOST_BLOCKS = 8, 16, 128
+_VECTOR, _LEAST, MOST_BLOCKS = 8, 8, 128
 
 
 def block_of(count: int) -> int:
     """Return the particles of a block, in whole vectors."""
-    return max(math.ceil(round(count ** (1 / 3), 6) / _VECTOR) * _VECTOR, _LEAST)
+    return max(math.ceil(round(count ** (1 / 3), 6) / _VECTOR) * _VECTOR, 2 * _LEAST)
+
+
+def weight_block(backend: Backend, count: int) -> int:
+    """Return the particles of a block of weights."""
+    return block_of(count) if backend.info.kind == "cpu" else block_of(count) // 2
 
 
 def fans_of(blocks: int) -> tuple[int, ...]:

@@ -24,6 +24,8 @@ def on_device(array: object) -> bool:
     """Return whether an object is an array in the memory of a device other than the processor."""
     if isinstance(array, (np.ndarray, list, tuple)):
         return False
+    if isinstance(array, Adopted):
+        return True
     if hasattr(array, "__dlpack_device__"):
         return array.__dlpack_device__()[0] not in _HOST
     return hasattr(array, "__cuda_array_interface__") or entry_of_array(array) is not None
@@ -58,6 +60,8 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
         TypeError: the backend cannot read it.
         ValueError: see Backend.adopt.
     """
+    if isinstance(array, Adopted):
+        return array
     if backend.reads(array):
         return backend.adopt(array, name, in_place=in_place)
     raise TypeError(

@@ -29,7 +29,7 @@ class Launcher(Protocol):
 
 @dataclass(frozen=True)
 class Adopted:
-    """An array of another library in a device's memory, without a copy.
+    """An array in a device's memory: one of another library without a copy, or the head of a buffer.
 
     Attributes:
         buffer: Its numbers; only of a C-contiguous array.
@@ -165,6 +165,15 @@ class Backend(ABC):
             ValueError: it must be used in place, and cannot.
         """
         raise TypeError(f"{name}: must be in host memory for {self.info.selection}, got an array on a device")
+
+    def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:
+        """Return the head of a buffer of this device as an array that models take."""
+        strides = np.cumprod([dtype.itemsize, *shape[:0:-1]])[::-1].tolist()
+
+        def to_host() -> np.ndarray:
+            return self.download(buffer, np.empty(shape, dtype))
+
+        return Adopted(buffer, shape, dtype, tuple(strides), True, to_host, buffer)
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
         """Allocate a buffer of ``count`` numbers, 0 included, that can be lent: not memory shared with the host."""

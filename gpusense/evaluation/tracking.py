@@ -152,6 +152,7 @@ def start(pf: ParticleFilter, steps: Sequence[Step], *, everywhere: bool) -> Non
 
 def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[Step]:
     """Run a filter along a log; yield each step once the track has it."""
+    pf.time_scoring()
     for step in steps:
         times = [time.perf_counter()]
         if track.steps:

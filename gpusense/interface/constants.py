@@ -61,11 +61,14 @@ STRAIGHT, VELOCITY_MODEL = 0, 1
 # Rungs of the ladder of temperatures; columns of a block's sums: weights, their squares, and the weights before.
 RUNGS = 8
 WEIGHT_SUMS = 2 * RUNGS + 1
+# Share of the temperature on the last rung.
+LOWEST = 0.5 ** (RUNGS - 1)
 # The state of a filter: numbers of each stage of a correction, and those that last.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = range(6)
 STAGE = 8
 EVIDENCE, SLOW, FAST, INJECTED = 48, 49, 50, 51
 STATE = 64
 # Kernel file estimate: sums of a block, numbers of an estimate (pose, covariance by rows of its upper half, the sum of
-# weights, the best particle), and lanes of a block.
-ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 12, 8
+# weights, and 1 where headings are too far apart for one pass), and lanes of a block.
+ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 11, 8
+WIDE_HEADINGS = 10

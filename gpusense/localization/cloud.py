@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.recording import Recording
+from gpusense.backends.recording import Recording, Repeated
 from gpusense.interface.constants import (
     DEGENERATE,
     ESTIMATE,
@@ -23,10 +23,11 @@ from gpusense.interface.constants import (
     SETTINGS,
     STAGE,
     STATE,
+    WIDE_HEADINGS,
 )
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
-from gpusense.localization.sums import Sums, block_of
+from gpusense.localization.sums import Sums, weight_block
 
 _DOUBLE = np.dtype(np.float64)
 
@@ -70,7 +71,7 @@ class Cloud:
     ) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.shown, self.next = capacity, 0, 0
-        self.block = block_of(capacity)
+        self.block = weight_block(backend, capacity)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(2)]
@@ -83,7 +84,7 @@ class Cloud:
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
-        self._estimates: dict[Hashable, Recording | None] = {}
+        self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
         self._uploads: list[np.ndarray] = []
 
     @property
@@ -94,7 +95,7 @@ class Cloud:
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
         self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = block_of(self.count)
+        self.block = weight_block(self.backend, self.count)
         w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
         self.backend.synchronize()
         self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
@@ -105,6 +106,7 @@ class Cloud:
         """Upload the poses from which recovery injects particles."""
         self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
         self._recordings.clear()
+        self._stages.clear()
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the numbers of a step to the device."""
@@ -183,7 +185,7 @@ class Cloud:
             self.backend.upload(self._read(self.before, self.count), self.weight)
         )
 
-    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int], None]) -> int:
+    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int, Program], None]) -> int:
         """Run a step whose log-likelihoods are computed by calls between the launches.
 
         Args:
@@ -191,25 +193,29 @@ class Cloud:
             stages: Most stages.
             drawn: Particles of the next step.
             sensors: Sensors that are used, the first ones of ``log_p``.
-            score: Writes the log-likelihoods of the poses of a buffer into ``log_p``.
+            score: Writes the log-likelihoods of the poses of a buffer, once a program has written them, into ``log_p``.
 
         Returns:
             The number of particles drawn.
         """
-        run = self.backend.run
         self.use(sensors)
-        run(self.motion(kind))
-        source = self.next
+        source, before = self.next, self.motion(kind)
         for stage in range(stages):
             last = stage + 1 == stages
-            score(source)
+            score(source, before)
+            before = ()
             # A stage that leaves nothing draws for the next step, so every stage may be the last one.
-            run(self.weighing(source, stage, stages, self.count if not last else drawn))
+            self._weigh(source, stage, stages, self.count if not last else drawn)
             self.shown, self.next = source, 1 - source
             if last or self._read(self.state, STATE)[stage * STAGE + LEFT] == 0.0:
                 return drawn if last else self.count
             source = 1 - source
         raise AssertionError(stages)
+
+    def _weigh(self, source: int, stage: int, stages: int, drawn: int) -> None:
+        """Run the launches of a stage after its scores."""
+        key = source, stage, stages, drawn, self.count, self._sensors
+        self._stages.run(key, lambda: self.weighing(source, stage, stages, drawn))
 
     def replay(
         self, kind: int, stages: int, drawn: int, key: Hashable, programs: Callable[[int], tuple[Program, object]]
@@ -249,7 +255,7 @@ class Cloud:
     def resized(self, drawn: int) -> None:
         """Set the number of particles, after a step that has drawn that number."""
         self.count = drawn
-        self.block = block_of(drawn)
+        self.block = weight_block(self.backend, drawn)
 
     # ---- what crosses to the host
 
@@ -276,17 +282,17 @@ class Cloud:
         return self.backend.lend(out, (count,), _DOUBLE)
 
     def estimate(self, count: int) -> np.ndarray:
-        """Return the kernel's estimate of the shown particles: mean, covariance, sum of weights, best particle."""
-        poses = self.poses[self.shown]
-        key = self.shown, count
-        if recording := self._estimates.get(key):
-            recording()
-        else:
-            program = self.sums.estimate(poses, self.weight, self.estimated, count)
-            self.backend.run(program)
-            # Clouds that change their size seldom ask twice for the same.
-            kept = self.backend.record(program) if key in self._estimates else None
-            self._estimates = dict([*self._estimates.items()][-7:]) | {key: kept}
+        """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
+        numbers = self._estimate(count, 0)
+        return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
+
+    def _estimate(self, count: int, again: int) -> np.ndarray:
+        """Return the numbers after a pass of the estimate."""
+        # Clouds that change their size seldom ask twice for the same.
+        self._estimates.run(
+            (self.shown, count, again),
+            lambda: self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, again),
+        )
         return self._read(self.estimated, ESTIMATE)
 
     def host_poses(self, index: int, count: int) -> np.ndarray:

@@ -366,7 +366,7 @@ class ParticleFilter:
         if method != "mean":
             poses = self._cloud.host_poses(self._cloud.shown, self._shown)
             if method == "best":
-                pose = poses[int(numbers[10])]
+                pose = poses[int(np.argmax(self._cloud.host_weights(self._shown)))]
             else:
                 pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
         explained = self._verdict.explained(pose, self._last) if self._last else math.nan
@@ -398,8 +398,15 @@ class ParticleFilter:
 
     @property
     def scoring_seconds(self) -> float:
-        """Seconds that the models' log-likelihoods have taken; 0 where a step is one recorded program."""
+        """Seconds that the models' log-likelihoods have taken, if ``time_scoring`` was called before.
+
+        Without it they are the seconds in which they were started; 0 where a step is one recorded program.
+        """
         return sum(sensor.seconds for sensor in self._sensors)
+
+    def time_scoring(self) -> None:
+        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
+        self._scoring.timed = True
 
     @property
     def grid(self) -> OccupancyGrid:

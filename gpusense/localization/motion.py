@@ -16,7 +16,6 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.pose_algebra import pose_difference
 
 # Below this translation [m] no direction can be read from it.
 _SHORTEST = 0.01
@@ -45,6 +44,13 @@ class MotionModel(Protocol):
         """Return the numbers of one step."""
 
 
+def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+    """Return one pose in the frame of another, without the cost of arrays."""
+    (x0, y0, theta0), (x1, y1, theta1) = before.tolist(), after.tolist()
+    x, y, cosine, sine = x1 - x0, y1 - y0, math.cos(theta0), math.sin(theta0)
+    return cosine * x + sine * y, cosine * y - sine * x, math.remainder(theta1 - theta0, math.tau)
+
+
 def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
     """Return an odometer's motion as a first turn, a translation and a second turn [rad, m, rad].
 
@@ -64,7 +70,7 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
         (0.0, -1.0, 0.0)
     """
     one, two = checks.array("before", before, (3,)), checks.array("after", after, (3,))
-    x, y, turn = (float(value) for value in pose_difference(one, two))
+    x, y, turn = _difference(one, two)
     trans = math.hypot(x, y)
     first = math.atan2(y, x) if trans >= _SHORTEST else 0.0
     if abs(first) > math.pi / 2:
@@ -178,7 +184,7 @@ class OmniMotion:
         if len(arguments) != 2:
             raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
         before, after = (checks.array(n, v, (3,)) for n, v in zip(("before", "after"), arguments, strict=True))
-        x, y, turn = (float(value) for value in pose_difference(before, after))
+        x, y, turn = _difference(before, after)
         trans = math.hypot(x, y)
         direction = math.atan2(y, x) if trans > 0 else 0.0
         a1, a2, a3, a4, a5 = self.alpha

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from gpusense._util import checks
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
@@ -44,7 +46,12 @@ class Scoring:
     Args:
         cloud: The particles.
         sensors: The sensors of the filter.
+
+    Attributes:
+        timed: Whether to wait for the log-likelihoods of each stage, so that their time is known.
     """
+
+    timed = False
 
     def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
         self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
@@ -63,25 +70,23 @@ class Scoring:
             stages: Most stages.
             drawn: Particles of the next step.
         """
-        cloud, gpu = self._cloud, self._backend.info.kind == "gpu"
+        cloud = self._cloud
         if self.records(given):
             for index, reading in given:
                 self._sensors[index].upload(reading)
             key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)
             cloud.replay(kind, stages, drawn, key, lambda source: self._program(source, given))
             return drawn
-        score = self._score_on_device if gpu else self._score_on_host
-        return cloud.correct(kind, stages, drawn, len(given), lambda source: score(source, given))
+        return cloud.correct(
+            kind, stages, drawn, len(given), lambda source, before: self._score(source, before, given)
+        )
 
-    def _score_on_device(self, source: int, given: Sequence[Given]) -> None:
+    def _score(self, source: int, before: Program, given: Sequence[Given]) -> None:
+        """Start the log-likelihoods of poses that launches write."""
         poses = self._poses(source)
         for place, (index, reading) in enumerate(given):
-            self._sensors[index].log_likelihood(poses, reading, self._log_p(place))
-
-    def _score_on_host(self, source: int, given: Sequence[Given]) -> None:
-        poses = self._cloud.host_poses(source, self._cloud.count)
-        for place, (index, reading) in enumerate(given):
-            self._backend.upload(self._sensors[index].log_likelihood(poses, reading), self._cloud.log_p[place])
+            self._sensors[index].score(poses, reading, self._log_p(place), before, timed=self.timed)
+            before = ()
 
     def _program(self, source: int, given: Sequence[Given]) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
@@ -97,10 +102,8 @@ class Scoring:
         return program, owners
 
     def _poses(self, source: int) -> Any:
-        return self._cloud.lent(self._cloud.poses[source], (self._cloud.count, 3))
+        return self._backend.view(self._cloud.poses[source], (self._cloud.count, 3), np.dtype(np.float64))
 
     def _log_p(self, place: int) -> Any:
-        """Return the array for a sensor's log-likelihoods as one of the device's library."""
-        cloud = self._cloud
-        part = self._backend.part(cloud.log_p[place], 0, cloud.count, cloud.precision)
-        return self._backend.lend(part, (cloud.count,), cloud.precision)
+        """Return the array for a sensor's log-likelihoods."""
+        return self._backend.view(self._cloud.log_p[place], (self._cloud.count,), self._cloud.precision)

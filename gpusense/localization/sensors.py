@@ -18,6 +18,8 @@ from gpusense.models.scan.bound import DeviceCall
 from gpusense.models.scan.model import ScanModel
 
 _DOUBLE = np.dtype(np.float64)
+# Calls that are started before one waits.
+_MOST_STARTED = 64
 
 
 class Sensor:
@@ -31,7 +33,7 @@ class Sensor:
         backend: Its device.
         precision: Precision of its log-likelihoods.
         beams: Beams that a scan uses; 0 for other models.
-        seconds: Time of all calls of ``log_likelihood``.
+        seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from it.
 
     Raises:
@@ -48,7 +50,7 @@ class Sensor:
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()
         self._ranges: Any = None
-        self.seconds = 0.0
+        self.seconds, self._started = 0.0, 0
 
     def temperature(self, chosen: float | str, reading: object = None) -> float:
         """Return the temperature of the log-likelihood now."""
@@ -64,12 +66,32 @@ class Sensor:
         """Return (N, K) log-likelihoods of the beams of a scan, in float64."""
         return np.asarray(self.model.log_likelihood(poses, *reading, per_beam=True)[1], np.float64)
 
-    def log_likelihood(self, poses: Any, reading: tuple[Any, ...], out: Any = None) -> Any:
+    def log_likelihood(self, poses: Any, reading: tuple[Any, ...]) -> Any:
         """Return the log-likelihoods of poses."""
+        return self.model.log_likelihood(poses, *reading)
+
+    def score(self, poses: Any, reading: tuple[Any, ...], out: Any, before: Program, *, timed: bool) -> None:
+        """Write the log-likelihoods of poses on the device; those of scans are there once its work has ended.
+
+        Args:
+            poses: (N, 3) poses on the device.
+            reading: The reading.
+            out: (N,) array on the device.
+            before: Launches that write the poses.
+            timed: Wait for them, and add their time to ``seconds``.
+        """
         begin = time.perf_counter()
-        result = self.model.log_likelihood(poses, *reading, out=out)
+        if self.calibrates:
+            self.model.start(poses, *reading, out=out, before=before)
+            self._started += 1
+            # Arrays that it reads stay alive until then.
+            if timed or self._started >= _MOST_STARTED:
+                self.model.finish()
+                self._started = 0
+        else:
+            self.backend.run(before)
+            self.model.log_likelihood(poses, *reading, out=out)
         self.seconds += time.perf_counter() - begin
-        return result
 
     # ---- recorded steps
 
@@ -99,7 +121,7 @@ class Sensor:
 
     def program(self, poses: Any, out: Any) -> tuple[Program, object]:
         """Return the launches that score poses on the device, and the owner of their memory."""
-        ranges = self.backend.lend(self._ranges, (self.model.scanner.count,), _DOUBLE)
+        ranges = self.backend.view(self._ranges, (self.model.scanner.count,), _DOUBLE)
         call = self.model.bind(poses, ranges, out=out)
         if not isinstance(call, DeviceCall):
             raise RuntimeError(f"the model's call cannot be recorded: {call.explain()}")

@@ -1,7 +1,8 @@
 """Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
 
 A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group.
+number of particles. Small clouds have one group. GPUs have work-items to spare and take smaller blocks of weights, whose
+sums are exact; sums of poses have the same blocks everywhere.
 """
 
 from __future__ import annotations
@@ -19,12 +20,17 @@ from gpusense.interface.launches import Program, launch
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
 # Particles of a vector of float64, the fewest of a block, and the most blocks that one work-item adds up.
-_VECTOR, _LEAST, MOST_BLOCKS = 8, 16, 128
+_VECTOR, _LEAST, MOST_BLOCKS = 8, 8, 128
 
 
 def block_of(count: int) -> int:
     """Return the particles of a block, in whole vectors."""
-    return max(math.ceil(round(count ** (1 / 3), 6) / _VECTOR) * _VECTOR, _LEAST)
+    return max(math.ceil(round(count ** (1 / 3), 6) / _VECTOR) * _VECTOR, 2 * _LEAST)
+
+
+def weight_block(backend: Backend, count: int) -> int:
+    """Return the particles of a block of weights."""
+    return block_of(count) if backend.info.kind == "cpu" else block_of(count) // 2
 
 
 def fans_of(blocks: int) -> tuple[int, ...]:
@@ -80,7 +86,7 @@ class Sums:
         blocks = numbers["blocks"]
         weigh = self.launch("weigh_particles", blocks, largest=largest, groups=groups, sums=self.rows, stage=stage,
                             **numbers)  # fmt: skip
-        return weigh + self._join("join_weights", WEIGHT_SUMS, blocks, self.totals)
+        return weigh + self._join(WEIGHT_SUMS, blocks, self.totals)
 
     def set_weights(
         self, numbers: dict[str, Any], scored: tuple[Buffer, int], place: tuple[int, int], out: tuple[Buffer, Buffer]
@@ -110,32 +116,30 @@ class Sums:
         blocks = numbers["blocks"]
         return (
             *self.launch("count_copies", blocks, sums=self.rows, drawn=drawn, stage=stage, **numbers),
-            *self._join("join_weights", WEIGHT_SUMS, blocks, self.totals),
+            *self._join(WEIGHT_SUMS, blocks, self.totals),
             *self.launch("set_copies", blocks, sums=self.rows, joined=self._joined, copies=copies,
                          fan=fans_of(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
-    def estimate(
-        self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, block: int | None = None
-    ) -> Program:
-        """Return the launches that write the estimate of a cloud, by blocks of its own number of particles."""
-        program: Program = ()
-        block = block or block_of(count)
-        for again in (0, 1):
-            program += self.launch("sum_poses", -(-count // block), poses=poses, weight=weight, estimate=estimate,
-                                   sums=self.rows, particles=count, block=block, again=again)  # fmt: skip
-            program += self._join("join_poses", ESTIMATE_SUMS, -(-count // block), self._moments)
-            program += self.launch("finish_estimate", 1, poses=poses, sums=self._moments, estimate=estimate,
-                                   again=again)  # fmt: skip
-        return program
+    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
+        """Return the launches that write the estimate of a cloud, or those of its second pass."""
+        block = block_of(count)
+        blocks = -(-count // block)
+        return (
+            *self.launch("sum_poses", blocks, poses=poses, weight=weight, estimate=estimate, sums=self.rows,
+                         particles=count, block=block, again=again),
+            *self._join(ESTIMATE_SUMS, blocks, self._moments),
+            *self.launch("finish_estimate", 1, poses=poses, sums=self._moments, estimate=estimate, again=again),
+        )  # fmt: skip
 
-    def _join(self, kernel: str, columns: int, blocks: int, total: Buffer) -> Program:
+    def _join(self, columns: int, blocks: int, total: Buffer) -> Program:
         """Return the launches that add up the rows of groups, and of all groups."""
         program: Program = ()
         source, fans = self.rows, fans_of(blocks)
         for level, fan in enumerate(fans):
             last = level + 1 == len(fans)
             joined, groups = total if last else self._joined, -(-blocks // fan)
-            program += self.launch(kernel, groups * columns, sums=source, joined=joined, rows=blocks, fan=fan)
+            program += self.launch("join_rows", groups * columns, sums=source, joined=joined, rows=blocks,
+                                   columns=columns, fan=fan)  # fmt: skip
             source, blocks = joined, groups
         return program

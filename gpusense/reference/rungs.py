@@ -16,6 +16,7 @@ from gpusense.interface.constants import (
     FAST_RATE,
     INJECTED,
     LEFT,
+    LOWEST,
     MOST_INJECTED,
     PER_BEAM_SCALE,
     RESAMPLED,
@@ -38,10 +39,14 @@ def largest_of(largest: np.ndarray, groups: int) -> float:
 
 
 def tempered(score: np.ndarray, largest: float, left: float) -> np.ndarray:
-    """Return the likelihoods of scores relative to the largest; 1 for all where none is possible or nothing is left."""
+    """Return the likelihoods of scores relative to the largest on the last rung.
+
+    They are 1 for all where none is possible or nothing is left. Their squares belong to the rung before: an error of
+    2^-53 grows to 2^-46 on the first rung.
+    """
     if largest == -np.inf or left == 0.0:
         return np.ones_like(score)
-    return exp_of(left * (score - largest))
+    return exp_of(LOWEST * left * (score - largest))
 
 
 def left_of(state: np.ndarray, stage: int) -> float:

@@ -62,18 +62,20 @@ def weigh_particles(
     likelihood = tempered(score[:particles], largest_of(largest, groups), left_of(state, stage))
     table, starts = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS), np.arange(0, particles, block)
     table[:, 2 * RUNGS] = np.add.reduceat(np.floor(old * scale), starts)
-    for rung in range(RUNGS):
+    for rung in reversed(range(RUNGS)):
         weight = old * likelihood
         table[:, rung] = np.add.reduceat(np.floor(weight * scale), starts)
         table[:, RUNGS + rung] = np.add.reduceat(np.floor(weight * weight * scale), starts)
-        likelihood = np.sqrt(likelihood)
+        likelihood = likelihood * likelihood
 
 
-def join_weights(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, fan: int) -> None:
-    """Add up each ``fan`` rows of sums."""
-    starts = np.arange(0, rows, fan)
-    table = np.add.reduceat(sums[: rows * WEIGHT_SUMS].reshape(rows, WEIGHT_SUMS), starts)
-    joined[: table.size] = table.reshape(-1)
+def join_rows(
+    flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, columns: int, fan: int
+) -> None:
+    """Add up each ``fan`` rows of sums, one after the other."""
+    table = sums[: rows * columns].reshape(rows, columns)
+    for group, begin in enumerate(range(0, rows, fan)):
+        joined[group * columns : (group + 1) * columns] = np.cumsum(table[begin : begin + fan], axis=0)[-1]
 
 
 def set_weights(
@@ -100,8 +102,8 @@ def set_weights(
     scale, left, high = settings[SCALE], left_of(state, stage), largest_of(largest, groups)
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0
     likelihood = tempered(score[:particles], high, left)
-    for _ in range(rung):
-        likelihood = np.sqrt(likelihood)
+    for _ in range(rung, RUNGS - 1):
+        likelihood = likelihood * likelihood
     weight[:particles] = before[:particles] * likelihood
     ends[:particles] = np.cumsum(np.floor(weight[:particles] * scale))
     set_stage(totals, settings, state, high, left, rung, particles, stage, stages)

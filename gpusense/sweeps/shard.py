@@ -116,12 +116,8 @@ class Shard:
                 self._sensors[index].upload(reading)
             self._recorded(source, given)()
         else:
-            poses: Any = self._lent_poses(source) if self._gpu else cloud.host_poses(source, part.size)
             for place, (index, reading) in enumerate(given):
-                if self._gpu:
-                    self._sensors[index].log_likelihood(poses, reading, self._lent_scores(place))
-                else:
-                    self._backend.upload(self._sensors[index].log_likelihood(poses, reading), cloud.log_p[place])
+                self._sensors[index].score(self._poses(source), reading, self._scores(place), (), timed=False)
             self._backend.run(cloud.scoring(len(given)))
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())
@@ -134,9 +130,9 @@ class Shard:
             if len(self._recordings) > 8:
                 self._recordings.clear()
             program: Program = ()
-            poses, owners = self._lent_poses(source), []
+            poses, owners = self._poses(source), []
             for place, (index, _) in enumerate(given):
-                out = self._lent_scores(place)
+                out = self._scores(place)
                 launches, owner = self._sensors[index].program(poses, out)
                 program += launches
                 owners.append((out, owner))
@@ -144,13 +140,11 @@ class Shard:
             self._recordings[key] = self._backend.record(program), (poses, owners)
         return self._recordings[key][0]
 
-    def _lent_poses(self, source: int) -> Any:
-        return self._cloud.lent(self._cloud.poses[source], (self._part.size, 3))
+    def _poses(self, source: int) -> Any:
+        return self._backend.view(self._cloud.poses[source], (self._part.size, 3), _DOUBLE)
 
-    def _lent_scores(self, place: int) -> Any:
-        cloud, shape = self._cloud, (self._part.size,)
-        part = self._backend.part(cloud.log_p[place], 0, self._part.size, cloud.precision)
-        return self._backend.lend(part, shape, cloud.precision)
+    def _scores(self, place: int) -> Any:
+        return self._backend.view(self._cloud.log_p[place], (self._part.size,), self._cloud.precision)
 
     def weigh(self, high: float, stage: int) -> Step:
         """Return the sums of integer weights, given the largest score of the whole filter."""

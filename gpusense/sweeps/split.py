@@ -19,13 +19,14 @@ from gpusense.interface.constants import (
     STATE,
     TOTAL,
     WEIGHT_SUMS,
+    WIDE_HEADINGS,
 )
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.sums import fans_of
 from gpusense.reference.draws import mark_of
-from gpusense.reference.estimate import finish_estimate, join_poses
+from gpusense.reference.estimate import finish_estimate
 from gpusense.reference.rungs import rung_of
-from gpusense.reference.weighing import join_weights, set_weights
+from gpusense.reference.weighing import join_rows, set_weights
 from gpusense.sweeps.parts import Given, Part, parts_of
 from gpusense.sweeps.teams import Here, There
 
@@ -136,7 +137,7 @@ class SplitCloud(Cloud):
         high = max(self._all("score", source, given))
         each = self._all("weigh", high, stage)
         totals, largest = np.zeros(WEIGHT_SUMS), np.array([high])
-        join_weights(_PLAIN, np.concatenate(each), totals, self._size, self._size)
+        join_rows(_PLAIN, np.concatenate(each), totals, self._size, WEIGHT_SUMS, self._size)
         left = state[(stage - 1) * STAGE + LEFT] if stage else 1.0
         rung = rung_of(totals, self._settings, self._settings[SHARE] * self.count) if left > 0.0 else 0
         set_weights(
@@ -203,23 +204,22 @@ class SplitCloud(Cloud):
     # ---- what crosses to the host
 
     def estimate(self, count: int) -> np.ndarray:
-        """Return the estimate of the shown particles: mean, covariance, sum of weights, best particle."""
+        """Return the estimate of the shown particles: mean, covariance, sum of weights."""
         parts, result = parts_of(count, self._size), np.zeros(ESTIMATE)
         holder = next(index for index, part in enumerate(parts) if part.size)
         asked = [(self.shown, 1 if index == holder else 0) for index in range(self._size)]
         first = self._team.each("poses", asked)[holder][0]
-        reference = first
         for again in (0, 1):
-            own = [(self.shown, part.size, part.block, reference) for part in parts]
-            rows = self._team.each("sum_poses", own)
-            for part, sums in zip(parts, rows, strict=True):
-                sums[:, 12] += part.first
-            table = np.concatenate(rows)
+            reference = result[:3].copy() if again else first
+            table = np.concatenate(
+                self._team.each("sum_poses", [(self.shown, part.size, part.block, reference) for part in parts])
+            )
             for fan in fans_of(len(table)):
                 sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
-                join_poses(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, fan)
+                join_rows(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, ESTIMATE_SUMS, fan)
             finish_estimate(_PLAIN, first, table.reshape(-1), result, again)
-            reference = result[:3].copy()
+            if not result[WIDE_HEADINGS]:
+                break
         return result
 
     def host_poses(self, index: int, count: int) -> np.ndarray:

@@ -12,6 +12,8 @@
 #define MOST_INJECTED 25
 #define TEMPERATURE 27
 #define RUNGS 8
+// 2^-(RUNGS - 1).
+#define LOWEST 0.0078125
 #define WEIGHT_SUMS (2 * RUNGS + 1)
 // Places in the state: of a stage, and of what lasts.
 #define LEFT 0
@@ -33,9 +35,10 @@ double largest_of(global const double *largest, const int groups) {
     return high;
 }
 
-// Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
+// Return the likelihood of a score relative to the largest on the last rung; 1 where none is possible or nothing is left.
+// Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
 double tempered(const double score, const double largest, const double left) {
-    return largest == -INFINITY || left == 0.0 ? 1.0 : exp_of(left * (score - largest));
+    return largest == -INFINITY || left == 0.0 ? 1.0 : exp_of(LOWEST * left * (score - largest));
 }
 
 // Return the part of the temperature that earlier stages have left.

@@ -44,14 +44,14 @@ kernel void weigh_particles(global const double *score, global const double *bef
     double old = 0.0;
     for (int n = begin; n < end; n++) {
         double8 likelihood;
-        likelihood.s0 = tempered(score[n], high, left);
-        likelihood.s1 = sqrt(likelihood.s0);
-        likelihood.s2 = sqrt(likelihood.s1);
-        likelihood.s3 = sqrt(likelihood.s2);
-        likelihood.s4 = sqrt(likelihood.s3);
-        likelihood.s5 = sqrt(likelihood.s4);
-        likelihood.s6 = sqrt(likelihood.s5);
-        likelihood.s7 = sqrt(likelihood.s6);
+        likelihood.s7 = tempered(score[n], high, left);
+        likelihood.s6 = likelihood.s7 * likelihood.s7;
+        likelihood.s5 = likelihood.s6 * likelihood.s6;
+        likelihood.s4 = likelihood.s5 * likelihood.s5;
+        likelihood.s3 = likelihood.s4 * likelihood.s4;
+        likelihood.s2 = likelihood.s3 * likelihood.s3;
+        likelihood.s1 = likelihood.s2 * likelihood.s2;
+        likelihood.s0 = likelihood.s1 * likelihood.s1;
         old += floor(before[n] * scale);
         const double8 weight = before[n] * likelihood;
         weights += floor(weight * scale);
@@ -63,12 +63,13 @@ kernel void weigh_particles(global const double *score, global const double *bef
     row[2 * RUNGS] = old;
 }
 
-// Add up each fan rows of sums: one work-item takes a column of a group of rows.
-kernel void join_weights(global const double *sums, global double *joined, const int rows, const int fan) {
-    const int i = get_global_id(0), g = i / WEIGHT_SUMS, begin = g * fan, end = min(begin + fan, rows);
+// Add up each fan rows of sums, one after the other: one work-item takes a column of a group of rows.
+kernel void join_rows(global const double *sums, global double *joined, const int rows, const int columns,
+                      const int fan) {
+    const int i = get_global_id(0), begin = i / columns * fan, end = min(begin + fan, rows);
     if (begin >= rows) return;
     double total = 0.0;
-    for (int row = begin; row < end; row++) total += sums[(long)row * WEIGHT_SUMS + i % WEIGHT_SUMS];
+    for (int row = begin; row < end; row++) total += sums[(long)row * columns + i % columns];
     joined[i] = total;
 }
 
@@ -89,7 +90,7 @@ kernel void set_weights(global const double *score, global const double *before,
     for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
     for (int n = begin; n < end; n++) {
         double likelihood = tempered(score[n], high, left);
-        for (int k = 0; k < rung; k++) likelihood = sqrt(likelihood);
+        for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
         const double chosen = before[n] * likelihood;
         weight[n] = chosen;
         sum += floor(chosen * scale);

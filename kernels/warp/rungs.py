@@ -15,6 +15,8 @@ RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
 # Places in the state: of a stage, and of what lasts.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
 STAGE = wp.constant(8)
+# 2^-(RUNGS - 1).
+LOWEST = wp.constant(wp.float64(0.0078125))
 EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 51))
 LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
 ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
@@ -29,12 +31,13 @@ def largest_of(largest: wp.array(dtype=wp.float64), groups: wp.int32):
     return high
 
 
-# Return the likelihood of a score relative to the largest; 1 where none is possible or nothing is left.
+# Return the likelihood of a score relative to the largest on the last rung; 1 where none is possible or nothing is left.
+# Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
 @wp.func
 def tempered(score: wp.float64, largest: wp.float64, left: wp.float64):
     value = ONE
     if not wp.isinf(largest) and left > ZERO:
-        value = exp_of(left * (score - largest))
+        value = exp_of(LOWEST * left * (score - largest))
     return value
 
 

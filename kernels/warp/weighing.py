@@ -98,31 +98,32 @@ def make(name, flags):
             likelihood = tempered(score[n], high, left)
             prior = before[n]
             old += wp.floor(prior * scale)
-            for k in range(8):
+            for k in range(7, -1, -1):
                 weight = prior * likelihood
                 weights[k] += wp.floor(weight * scale)
                 squares[k] += wp.floor(weight * weight * scale)
-                likelihood = wp.sqrt(likelihood)
+                likelihood = likelihood * likelihood
         for k in range(8):
             sums[b * WEIGHT_SUMS + k] = weights[k]
             sums[b * WEIGHT_SUMS + RUNGS + k] = squares[k]
         sums[b * WEIGHT_SUMS + 2 * RUNGS] = old
 
-    # Add up each fan rows of sums: one work-item takes a column of a group of rows.
+    # Add up each fan rows of sums, one after the other: one work-item takes a column of a group of rows.
     @kernel
-    def join_weights(
+    def join_rows(
         sums: wp.array(dtype=wp.float64),
         joined: wp.array(dtype=wp.float64),
         rows: wp.int32,
+        columns: wp.int32,
         fan: wp.int32,
     ):
         i = wp.tid()
-        begin = i / WEIGHT_SUMS * fan
+        begin = i / columns * fan
         if begin >= rows:
             return
         total = ZERO + ZERO
         for row in range(begin, wp.min(begin + fan, rows)):
-            total += sums[row * WEIGHT_SUMS + i % WEIGHT_SUMS]
+            total += sums[row * columns + i % columns]
         joined[i] = total
 
     # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
@@ -164,8 +165,8 @@ def make(name, flags):
             total += sums[i * WEIGHT_SUMS + rung]
         for n in range(begin, wp.min(begin + block, particles)):
             likelihood = tempered(score[n], high, left)
-            for _k in range(rung):
-                likelihood = wp.sqrt(likelihood)
+            for _k in range(rung, RUNGS - 1):
+                likelihood = likelihood * likelihood
             chosen = before[n] * likelihood
             weight[n] = chosen
             total += wp.floor(chosen * scale)
@@ -174,4 +175,4 @@ def make(name, flags):
             set_stage(totals, settings, state, high, left, rung, particles, stage, stages)
 
     kernels = {"add_scores": add_scores, "join_scores": join_scores, "weigh_particles": weigh_particles}
-    return (kernels | {"join_weights": join_weights, "set_weights": set_weights})[name]
+    return (kernels | {"join_rows": join_rows, "set_weights": set_weights})[name]

@@ -168,7 +168,8 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC):
         program += sums.launch("draw_particles", count, source=on[source], target=on[target], weight=on["weight"],
                                ends=on["ends"], copies=on["copies"], state=on["state"], pool=on["pool"],
                                after=on["before"], particles=count, drawn=count, stage=stage, **step)  # fmt: skip
-    program += sums.estimate(on["a"], on["weight"], on["estimate"], count, block)
+    for again in (0, 1):
+        program += sums.estimate(on["a"], on["weight"], on["estimate"], count, again)
     program += sums.launch("normalize_weights", count, weight=on["weight"], estimate=on["estimate"], share=on["share"],
                            particles=count)  # fmt: skip
     if not lanes:

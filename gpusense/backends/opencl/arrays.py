@@ -11,7 +11,7 @@ import pyopencl.array
 
 from gpusense._util.checks import show
 from gpusense.backends.base import Adopted, Buffer
-from gpusense.backends.opencl.memory import driver_errors
+from gpusense.backends.opencl.memory import SHARED, SharedPart, driver_errors
 
 
 def check_in_order(queue: cl.CommandQueue, name: str) -> None:
@@ -42,6 +42,8 @@ def part_of(buffer: cl.Buffer, first: int, size: int, alignment: int) -> cl.Buff
     """
     if first == 0 or size == 0:
         return buffer
+    if isinstance(buffer, SHARED):
+        return SharedPart(buffer, first, size)
     # A part has no parts of its own.
     whole: Any = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
     if whole is not None:

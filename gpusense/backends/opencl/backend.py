@@ -19,7 +19,7 @@ from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.devices import shares_memory
 from gpusense.backends.opencl.launch import Launch
-from gpusense.backends.opencl.memory import DeviceBuffer, SharedBuffer, driver_errors
+from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors
 from gpusense.backends.opencl.replay import OpenCLRecording
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS
@@ -87,7 +87,7 @@ class OpenCLBackend(ProcessBound, Backend):
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             array = np.ascontiguousarray(array)
-            if isinstance(buffer, SharedBuffer):
+            if isinstance(buffer, SHARED):
                 self._settle()
                 buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
                 return buffer
@@ -135,7 +135,7 @@ class OpenCLBackend(ProcessBound, Backend):
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
-            if isinstance(buffer, SharedBuffer):
+            if isinstance(buffer, SHARED):
                 self._settle()
                 out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
                 return out
@@ -168,7 +168,7 @@ class OpenCLBackend(ProcessBound, Backend):
         if not size:
             return
         with driver_errors():
-            if isinstance(target, SharedBuffer):
+            if isinstance(target, SHARED):
                 self._settle()
                 cl.enqueue_copy(self._queue, target.bytes[to : to + size], source, src_offset=begin)
             else:

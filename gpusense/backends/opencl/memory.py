@@ -19,7 +19,11 @@ class DeviceBuffer(cl.Buffer):
 
 
 class SharedBuffer(cl.SVMAllocation):
-    """Memory that host and device share."""
+    """Memory that host and device share.
+
+    Attributes:
+        bytes: It as an array of the host.
+    """
 
     def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
         flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
@@ -33,6 +37,22 @@ class SharedBuffer(cl.SVMAllocation):
         # pyopencl can also do, it ended in a corrupted heap with PoCL 3. Without an allocation there is no attribute.
         if (settle := getattr(self, "_settle", None)) is not None:
             settle()
+
+
+class SharedPart(cl.SVM):
+    """A part of memory that host and device share.
+
+    Attributes:
+        bytes: It as an array of the host.
+    """
+
+    def __init__(self, whole: SharedBuffer | SharedPart, first: int, size: int) -> None:
+        self.bytes = whole.bytes[first : first + size]
+        super().__init__(self.bytes)
+        self._whole = whole
+
+
+SHARED = (SharedBuffer, SharedPart)
 
 
 class driver_errors:

@@ -24,8 +24,9 @@ KERNELS: dict[str, Kernel] = {
         "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SETTINGS, _STATE, f"out {_SUMS}", "int particles",
         "int block", "int blocks", "int groups", "int stage", group=16,
     ),
-    "join_weights": kernel(
-        "weighing", "column", "double sums [17 * rows]", "out double joined [17]", "int rows", "int fan", group=16,
+    "join_rows": kernel(
+        "weighing", "column", "double sums [columns * rows]", "out double joined [columns]", "int rows", "int columns",
+        "int fan", group=16,
     ),
     "set_weights": kernel(
         "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SUMS, "double joined [17]", "double totals [17]", _SETTINGS,
@@ -47,17 +48,14 @@ KERNELS: dict[str, Kernel] = {
         "out double after [drawn]", "int particles", "int drawn", "int stage", wide=True,
     ),
     "sum_poses": kernel(
-        "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [12]",
+        "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [11]",
         "out double sums [particles]", "int particles", "int block", "int again", group=16,
     ),
-    "join_poses": kernel(
-        "estimate", "column", "double sums [13 * rows]", "out double joined [13]", "int rows", "int fan", group=16,
-    ),
     "finish_estimate": kernel(
-        "estimate", "whole", "double poses [3]", "double sums [13]", "out double estimate [12]", "int again", group=1,
+        "estimate", "whole", "double poses [3]", "double sums [13]", "out double estimate [11]", "int again", group=1,
     ),
     "normalize_weights": kernel(
-        "estimate", "pose", "double weight [particles]", "double estimate [12]", "out double share [particles]",
+        "estimate", "pose", "double weight [particles]", "double estimate [11]", "out double share [particles]",
         "int particles",
     ),
 }  # fmt: skip

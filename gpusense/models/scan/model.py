@@ -12,6 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.launches import Program
 from gpusense.interface.plan import Omission, Plan, share
 from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
@@ -182,6 +183,31 @@ class ScanModel(ABC):
             finish(self._workspace, request.poses.on_device)
         log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p
+
+    def start(self, poses: Any, ranges: AnyArray, *, out: Any, before: Program = ()) -> None:
+        """Start to score poses on the device; ``finish`` waits, or whatever waits for the device.
+
+        Args:
+            poses: (N, 3) poses on the device.
+            ranges: (K,) readings [m].
+            out: (N,) array on the device for the log-likelihoods.
+            before: Launches that write the poses.
+
+        Raises:
+            TypeError, ValueError, MemoryError: see ``log_likelihood``.
+        """
+        request = self._request(poses, ranges, out)._replace(before=before)
+        with self._lock, self._workspace:
+            run(self._pipeline, request, self._workspace, self._last)
+
+    def finish(self) -> None:
+        """Wait for calls that ``start`` has begun.
+
+        Raises:
+            ValueError: a pose was not finite.
+        """
+        with self._lock:
+            finish(self._workspace, on_device=True)
 
     def _differentiable(self, ranges: AnyArray) -> Differentiable | None:
         """Return the calls by which log-likelihoods are differentiated; None for a model without a gradient."""

@@ -10,6 +10,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Backend, arrays
 from gpusense.backends.results import Result
+from gpusense.interface.launches import Program
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.world.scanner import Scanner
@@ -27,6 +28,7 @@ class Request(NamedTuple):
         shape: Shape of the result, (N,) or (S, N).
         result: Memory of the result.
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
+        before: Launches that write the poses, once readings are on the device.
     """
 
     ranges: np.ndarray
@@ -34,6 +36,7 @@ class Request(NamedTuple):
     shape: tuple[int, ...]
     result: Result
     parts: np.ndarray
+    before: Program = ()
 
     @property
     def scans(self) -> int:

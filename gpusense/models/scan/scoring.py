@@ -67,18 +67,22 @@ class _Scorer:
         last: LastCall,
     ) -> None:  # fmt: skip
         self._pipeline, self._request, self._space, self._last = pipeline, request, space, last
-        self._first, self._scans = particles.scans[0], scans
+        self._first, self._scans, self._before = particles.scans[0], scans, request.before
         self._uploaded: tuple[Part, Readings] | None = None
 
     def __call__(self, piece: Piece) -> None:
         first, last = piece.scans
         scans = self._scans.part(first - self._first, last - self._first)
-        if (value := self._pipeline.value(scans)) is not None:
-            self._fill(piece, scans, value)
-            return
-        if self._uploaded is None or self._uploaded[0] != piece.scans:
+        value = self._pipeline.value(scans)
+        if value is None and (self._uploaded is None or self._uploaded[0] != piece.scans):
             self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
-        self._score(piece, scans, self._uploaded[1])
+        # Once, also where a piece is tried again.
+        before, self._before = self._before, ()
+        self._pipeline.backend.run(before)
+        if value is not None:
+            self._fill(piece, scans, value)
+        elif self._uploaded is not None:
+            self._score(piece, scans, self._uploaded[1])
 
     def _score(self, piece: Piece, scans: ClassedScans, readings: Readings) -> None:
         """Score a piece; log-likelihoods of readings are complete on return."""

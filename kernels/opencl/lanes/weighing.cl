@@ -1,9 +1,9 @@
 // Weights of 8 particles at once: weighing.cl. Sums of integer weights are exact in any order.
 // requires: rungs lanes/elementary
 
-// Return the likelihoods of scores relative to the largest; 1 where none is possible or nothing is left.
+// Return the likelihoods of scores relative to the largest on the last rung; 1 where none is possible or nothing is left.
 doubles tempered_lanes(const doubles score, const double largest, const double left) {
-    return largest == -INFINITY || left == 0.0 ? (doubles)1.0 : exp_of_lanes(left * (score - largest));
+    return largest == -INFINITY || left == 0.0 ? (doubles)1.0 : exp_of_lanes(LOWEST * left * (score - largest));
 }
 
 // A work-item takes a block.
@@ -24,11 +24,11 @@ kernel void weigh_particles(global const double *score, global const double *bef
         const choices there = (choices)(0, 1, 2, 3, 4, 5, 6, 7) < (long)count;
         const doubles prior = there ? load_doubles(before, n, count) : (doubles)0.0;
         old += floor_lanes(prior * scale);
-        for (int k = 0; k < RUNGS; k++) {
+        for (int k = RUNGS - 1; k >= 0; k--) {
             const doubles weight = prior * likelihood;
             weights[k] += floor_lanes(weight * scale);
             squares[k] += floor_lanes(weight * weight * scale);
-            likelihood = sqrt(likelihood);
+            likelihood *= likelihood;
         }
     }
     global double *row = sums + (long)b * WEIGHT_SUMS;
@@ -53,7 +53,7 @@ kernel void set_weights(global const double *score, global const double *before,
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
         doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, left);
-        for (int k = 0; k < rung; k++) likelihood = sqrt(likelihood);
+        for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
         const doubles chosen = load_doubles(before, n, count) * likelihood, whole = floor_lanes(chosen * scale);
         store_doubles(chosen, weight, n, count);
         doubles upto;

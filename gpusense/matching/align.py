@@ -14,13 +14,15 @@ import numpy as np
 from gpusense.world.grid import OccupancyGrid
 
 # Deviation of the smoothing [cells of the global map], its reach in deviations, and least share of known cells.
-_SIGMA, _REACH, _KNOWN = 1.0, 3.0, 1e-3
+_SIGMA, _REACH, _KNOWN = 0.7, 3.0, 1e-3
+# Difference of the shares of known cells around a cell of both maps from which it does not count: one map ends there.
+_UNLIKE = 0.15
 # Most cells of the local map, iterations, and the step that ends them [cells, and cells at the mean lever].
 _MOST, _ITERATIONS, _SMALL = 20_000, 20, 1e-4
 
 
-def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the shares of occupied cells among the known ones around each cell; 0 where none is known.
+def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shares of occupied cells among the known ones around each cell, 0 where none is, and of known cells.
 
     Args:
         occupied: (H, W) bool.
@@ -29,8 +31,9 @@ def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarra
     """
     offsets = np.arange(-math.ceil(_REACH * sigma), math.ceil(_REACH * sigma) + 1)
     weights = np.exp(-0.5 * (offsets / sigma) ** 2)
+    weights /= weights.sum()
     top, bottom = (_convolved(_convolved(image, weights).T, weights).T for image in (occupied & known, known))
-    return np.divide(top, bottom, out=np.zeros_like(top), where=bottom > _KNOWN * weights.sum() ** 2)
+    return np.divide(top, bottom, out=np.zeros_like(top), where=bottom > _KNOWN), bottom
 
 
 def _convolved(image: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -58,10 +61,10 @@ class Alignment:
         self, local: OccupancyGrid, xy: np.ndarray, grid: OccupancyGrid, poses: np.ndarray, farthest: float
     ) -> None:
         ratio = grid.resolution / local.resolution
-        values = smoothed(local.occupied, ~local.unknown, _SIGMA * ratio)[~local.unknown]
+        values, shares = (image[~local.unknown] for image in smoothed(local.occupied, ~local.unknown, _SIGMA * ratio))
         near = np.flatnonzero(values)
         near = near if len(near) <= _MOST else near[np.arange(_MOST) * len(near) // _MOST]
-        self._xy, self._values = xy[near], values[near]
+        self._xy, self._values, self._shares = xy[near], values[near], shares[near]
         self._lever = max(float(np.sqrt(np.mean(self._xy**2))), 1.0)
         self._farthest = farthest
         # Only the part of the map that the cells reach.
@@ -71,7 +74,8 @@ class Alignment:
         part = slice(first[1], end[1]), slice(first[0], end[0])
         # A margin, so that cells at the border of the map have neighbours on all sides.
         occupied, self._known = (np.pad(image[part], 1) for image in (grid.occupied, ~grid.unknown))
-        self._corner, self._map = first - 1, smoothed(occupied, self._known, _SIGMA)
+        self._corner = first - 1
+        self._map, self._share = smoothed(occupied, self._known, _SIGMA)
 
     def refined(self, pose: np.ndarray, most: float) -> np.ndarray:
         """Return the best pose near a pose, or that pose itself if the other is too far away.
@@ -106,7 +110,8 @@ class Alignment:
         col, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
         inside = np.flatnonzero((col >= 0) & (col + 1 < cols) & (row >= 0) & (row + 1 < rows))
         nearest = np.floor(v[inside] + 0.5).astype(np.int64), np.floor(u[inside] + 0.5).astype(np.int64)
-        inside = inside[self._known[nearest]]
+        weight = self._known[nearest] * np.maximum(1 - np.abs(self._share[nearest] - self._shares[inside]) / _UNLIKE, 0)
+        weight, inside = weight[weight > 0], inside[weight > 0]
         if len(inside) < 3:
             return math.inf, np.zeros(3), np.zeros((3, 3))
         col, row = col[inside], row[inside]
@@ -116,5 +121,5 @@ class Alignment:
         along = (1 - b) * (m01 - m00) + b * (m11 - m10)
         up = (1 - a) * (m10 - m00) + a * (m11 - m01)
         jacobian = np.stack([along, up, up * turned[0, inside] - along * turned[1, inside]], axis=1)
-        count = len(inside)
-        return float(error @ error) / count, jacobian.T @ error / count, jacobian.T @ jacobian / count
+        weighted, total = jacobian.T * weight, float(weight.sum())
+        return float(weight @ error**2) / total, weighted @ error / total, weighted @ jacobian / total

@@ -6,6 +6,7 @@ import math
 import numbers
 import os
 import reprlib
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -111,8 +112,10 @@ def as_array(name: str, value: object) -> NDArray[Any]:
     """Return ``numpy.asarray(value)`` of any dtype.
 
     Raises:
+        TypeError: The value has no values, because JAX traces it.
         ValueError: The value is a ragged sequence.
     """
+    check_values(name, value)
     try:
         return np.asarray(cast("ArrayLike", value))
     except ValueError:
@@ -157,6 +160,19 @@ def array(
         position = "" if values.ndim == 0 else f" at index {_index_text(index)}"
         raise ValueError(f"{name}: every value must be finite, got {show(values[index])}{position}")
     return values.astype(dtype, copy=False)
+
+
+def check_values(name: str, array: object) -> None:
+    """Refuse an array without values, which JAX traces.
+
+    Raises:
+        TypeError: JAX traces the array.
+    """
+    if type(array).__module__.partition(".")[0] == "jax" and isinstance(array, sys.modules["jax"].core.Tracer):
+        raise TypeError(
+            f"{name}: must have values, got an array that JAX traces (jit, grad, vmap); only the poses of "
+            "log_likelihood of an interpolated likelihood field may be traced"
+        )
 
 
 def check_gradients(array: object, name: str, error: Exception) -> None:

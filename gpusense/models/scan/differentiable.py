@@ -36,8 +36,14 @@ def is_recorded(poses: object) -> bool:
     return name == "jax" and isinstance(poses, sys.modules["jax"].core.Tracer)
 
 
-def log_likelihood_of(poses: Any, calls: Differentiable) -> Any:
-    """Return the log-likelihoods of recorded poses as an operation of their library."""
+def log_likelihood_of(poses: Any, ranges: object, calls: Differentiable) -> Any:
+    """Return the log-likelihoods of recorded poses as an operation of their library.
+
+    Raises:
+        TypeError: ranges that JAX traces, too.
+        ValueError: poses of another shape.
+    """
+    checks.check_values("ranges", ranges)
     if type(poses).__module__.partition(".")[0] == "torch":
         return _torch_log_likelihood(sys.modules["torch"], poses, calls)
     return _jax_log_likelihood(sys.modules["jax"], poses, calls)
@@ -75,18 +81,42 @@ def _jax_log_likelihood(jax: Any, poses: Any, calls: Differentiable) -> Any:
     slopes = jax.ShapeDtypeStruct(poses.shape, real)
 
     def plain(at: Any) -> np.ndarray:
-        return np.asarray(calls.log_p(np.asarray(at)), real)
+        joined, split = _batches(np.asarray(at), poses.ndim)
+        return split(np.asarray(calls.log_p(joined), real))
 
     def both(at: Any) -> tuple[np.ndarray, np.ndarray]:
-        log_p, gradient = calls.gradient(np.asarray(at))
-        return log_p.astype(real), gradient.astype(real)
+        joined, split = _batches(np.asarray(at), poses.ndim)
+        log_p, gradient = calls.gradient(joined)
+        return split(log_p.astype(real)), split(gradient.astype(real))
 
+    # vmap adds axes in front of those of the poses: one call scores all batches.
     def forward(at: Any) -> tuple[Any, Any]:
-        return jax.pure_callback(both, (values, slopes), at)
+        return jax.pure_callback(both, (values, slopes), at, vmap_method="expand_dims")
 
     def backward(gradient: Any, pull: Any) -> tuple[Any]:
         return ((pull[..., None] * gradient).astype(poses.dtype),)
 
-    operation = jax.custom_vjp(lambda at: jax.pure_callback(plain, values, at))
+    operation = jax.custom_vjp(lambda at: jax.pure_callback(plain, values, at, vmap_method="expand_dims"))
     operation.defvjp(forward, backward)
     return operation(poses)
+
+
+def _batches(poses: np.ndarray, axes: int) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Join batches of (N, 3) or (S, N, 3) poses to one of more poses.
+
+    Args:
+        poses: (..., N, 3) or (..., S, N, 3).
+        axes: Axes of a batch, 2 or 3.
+
+    Returns:
+        (M, 3) or (S, M, 3) poses, and a function that splits results of this leading shape into the batches.
+    """
+    outer, inner = poses.shape[: poses.ndim - axes], poses.shape[poses.ndim - axes :]
+    # The scans come first, the batches of a scan after them.
+    flat = np.moveaxis(poses.reshape(-1, *inner), 0, axes - 2)
+
+    def split(results: np.ndarray) -> np.ndarray:
+        rest = results.shape[axes - 1 :]
+        return np.moveaxis(results.reshape(*flat.shape[:-1], *rest), axes - 2, 0).reshape(*outer, *inner[:-1], *rest)
+
+    return flat.reshape(*inner[:-2], -1, 3), split

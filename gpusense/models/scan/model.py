@@ -151,8 +151,8 @@ class ScanModel(ABC):
         Arrays of other libraries (PyTorch, CuPy, JAX, Warp) are used without a copy, in host memory or, for
         ``warp:cuda`` backends, on the model's device; arrays of pyopencl, if the model's backend is their queue. The
         result is then an array of the same library in the same memory. For an interpolated likelihood field, poses may
-        be a tensor of PyTorch that requires gradients, or be traced by ``jax.grad`` or ``jax.jit``: the result is then
-        differentiable with respect to them, once, by the analytic gradient.
+        be a tensor of PyTorch that requires gradients, or be traced by ``jax.grad``, ``jax.jit`` or ``jax.vmap``: the
+        result is then differentiable with respect to them, once, by the analytic gradient.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], or (S, N, 3) for S scans. On a device:
@@ -176,7 +176,7 @@ class ScanModel(ABC):
         if out is None and not per_beam and is_recorded(poses):
             calls = self._differentiable(ranges)
             if calls is not None:
-                return cast(np.ndarray, log_likelihood_of(poses, calls))
+                return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
         request = self._request(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import types
 
@@ -105,4 +106,30 @@ def test_jax_differentiates():
     log_p, expected, _ = model.gradient(POSES.astype(np.float32), RANGES)
     assert float(value) == pytest.approx(2 * log_p.sum(), rel=1e-6)
     np.testing.assert_allclose(np.asarray(gradient), 2 * expected, rtol=1e-6)
-    np.testing.assert_allclose(loss(POSES.astype(np.float32)), value)
+    # JAX may add up in another order.
+    np.testing.assert_allclose(loss(POSES.astype(np.float32)), value, rtol=1e-6)
+
+
+def test_jax_maps_over_batches_of_poses():
+    jax = pytest.importorskip("jax", reason="JAX is not installed")
+    model, poses = field(precision="float32", backend="opencl"), POSES.astype(np.float32)
+    single = jax.vmap(jax.value_and_grad(lambda pose: model.log_likelihood(pose[None], RANGES)[0]))
+    log_p, gradient, _ = model.gradient(poses, RANGES)
+    for found, expected in zip(single(poses), (log_p, gradient), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    with pytest.raises(TypeError, match="ranges: must have values, got an array that JAX traces"):
+        jax.vmap(model.log_likelihood)(np.stack([poses] * 2), np.stack([RANGES] * 2))
+    with pytest.raises(TypeError, match="poses: must have values"):
+        jax.vmap(lambda at: field("nearest").log_likelihood(at, RANGES))(np.stack([poses] * 2))
+
+
+@pytest.mark.parametrize(("shape", "axes"), [((4, 3), 2), ((5, 4, 3), 2), ((5, 4, 3), 3), ((2, 5, 4, 3), 3)])
+def test_batches_of_poses_are_joined_and_split(shape, axes):
+    poses = np.arange(np.prod(shape), dtype=float).reshape(shape)
+    joined, split = differentiable._batches(poses, axes)
+    # Poses of a scan stay with their scan.
+    assert joined.shape == (*shape[-axes:-2], poses[..., 0].size // math.prod(shape[-axes:-2]), 3)
+    if axes == 3:
+        np.testing.assert_array_equal(joined[1][: shape[-2]], poses.reshape(-1, *shape[-3:])[0, 1])
+    np.testing.assert_array_equal(split(joined[..., 0]), poses[..., 0])
+    np.testing.assert_array_equal(split(joined), poses)

@@ -14,7 +14,8 @@ from gpusense.interface.constants import GRADIENT_NUMBERS
 from gpusense.reference.beam import sum_terms
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, block_sums
-from gpusense.reference.field import BLOCK, bilinear, field_exponent, log_field
+from gpusense.reference.field import BLOCK
+from gpusense.reference.field_term import bilinear, field_exponent, log_field
 from gpusense.reference.scans import particles_of_scans
 
 

@@ -3,8 +3,8 @@
 The points of a scan are sorted by bearing. Kernels search from the bearing of a place outwards, until no point farther
 in bearing can be nearer; the reference compares all points.
 
-Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
-Geman and McClure's, ``(1 / (1 + (e / c)^2))^2``.
+Lines: see lines.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale
+shrinks, then Geman and McClure's, ``(1 / (1 + (e / c)^2))^2``.
 """
 
 from __future__ import annotations
@@ -75,58 +75,6 @@ def agreement(
     agreements = np.where(paired, 1 / (1 + ratio * ratio), 0).sum()
     counts = [np.count_nonzero(mask) for mask in (paired, ~paired & through, ~paired & ~through)]
     return np.array([agreements, *counts], point.dtype)
-
-
-def fit_lines(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    line: np.ndarray,
-    scans: int,
-    points: int,
-    reach: int,
-    most: int,
-    ratio: float,
-    slack: float,
-    width: float,
-) -> None:
-    """Fit a line to each point and ``reach`` neighbours on either side, up to ``most`` within a distance of ``width``.
-
-    None of them is farther from the last one than ``slack`` plus ``ratio`` times its range. A line is a unit normal, an
-    offset, and 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam,
-    -1 in place of that sum, and no pairs.
-    """
-    for scan in range(scans):
-        mine = point[start[scan] : start[scan + 1]]
-        count = len(mine)
-        sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)
-        for direction in (-1, 1):
-            last, joined = mine, np.ones(count, bool)
-            for j in range(1, most + 1):
-                if 2 * j >= count:
-                    break
-                following = mine[(np.arange(count) + direction * j) % count]
-                between = following[:, :2] - last[:, :2]
-                joined = joined & ((between**2).sum(axis=1) <= (slack + ratio * last[:, 3]) ** 2)
-                if j > reach:
-                    joined = joined & (((following[:, :2] - mine[:, :2]) ** 2).sum(axis=1) <= width * width)
-                x, y = (np.where(joined, following[:, i] - mine[:, i], 0) for i in (0, 1))
-                sums += np.stack([x, y, x * x, x * y, y * y])
-                size += joined
-                last = following
-        mean_x, mean_y = sums[0] / size, sums[1] / size
-        a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
-        d = sums[4] - size * mean_y * mean_y
-        middle = (a - d) / 2
-        root = np.sqrt(middle * middle + b * b)
-        length = (a + d) / 2 + root
-        along = np.where(middle >= 0, [middle + root, b], [b, root - middle])
-        is_line = (length > 0) & ((along**2).sum(axis=0) > 0)
-        along = np.where(is_line, along, [-mine[:, 1], mine[:, 0]])
-        along = along / np.where(is_line, np.hypot(*along), mine[:, 3])
-        offset = -along[1] * (mine[:, 0] + mean_x) + along[0] * (mine[:, 1] + mean_y)
-        doubt = np.where(is_line, 1 / np.where(is_line, length, 1), -1)
-        line[start[scan] : start[scan + 1]] = np.stack([-along[1], along[0], offset, doubt], axis=1)
 
 
 def match_scans(

@@ -2,7 +2,7 @@
 // distance of an end point, r = z_hit N(d) / p its share of the hit density, and J the derivatives of d:
 // d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which leaves out second
 // derivatives of d and of r.
-// requires: field
+// requires: field_term
 
 #define GRADIENT_NUMBERS 13
 

@@ -1,7 +1,7 @@
 // Scan matching by point-to-line ICP. The nearest point is exact: the points of a scan are sorted by bearing, and a
 // search from the bearing of a place outwards ends where no point farther in bearing can be nearer.
-// Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
-// Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+// Lines: see lines.cl, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the
+// scale shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
 // requires: icp_step
 
 // Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
@@ -100,53 +100,6 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
         }
     }
     return sum;
-}
-
-// Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
-// farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
-// distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and no
-// pairs. One work-item takes a point of a scan.
-kernel void fit_lines(global const real4 *point, global const int *start, global real4 *line, const int scans,
-                      const int points, const int reach, const int most, const real ratio, const real slack,
-                      const real width) {
-    const int k = get_global_id(0), scan = get_global_id(1);
-    const int first = start[scan], count = start[scan + 1] - first;
-    if (k >= count) return;
-    const real4 centre = point[first + k];
-    real2 sum = (real2)(0);
-    real xx = 0, xy = 0, yy = 0;
-    int size = 1;
-    for (int direction = -1; direction <= 1; direction += 2) {
-        real4 last = centre;
-        for (int j = 1; j <= most && 2 * j < count; ++j) {
-            int i = k + direction * j;
-            i = i >= count ? i - count : i < 0 ? i + count : i;
-            const real4 next = point[first + i];
-            const real2 between = next.xy - last.xy, d = next.xy - centre.xy;
-            const real farthest = slack + ratio * last.w;
-            if (between.x * between.x + between.y * between.y > farthest * farthest) break;
-            if (j > reach && d.x * d.x + d.y * d.y > width * width) break;
-            sum += d;
-            xx += d.x * d.x;
-            xy += d.x * d.y;
-            yy += d.y * d.y;
-            size += 1;
-            last = next;
-        }
-    }
-    const real2 mean = sum / (real)size;
-    const real a = xx - size * mean.x * mean.x, b = xy - size * mean.x * mean.y, d = yy - size * mean.y * mean.y;
-    const real middle = (real)0.5 * (a - d), root = sqrt(middle * middle + b * b), length = (real)0.5 * (a + d) + root;
-    real2 along = middle >= 0 ? (real2)(middle + root, b) : (real2)(b, root - middle);
-    real size_along = sqrt(along.x * along.x + along.y * along.y);
-    const int is_line = length > 0 && size_along > 0;
-    if (!is_line) {
-        along = (real2)(-centre.y, centre.x);
-        size_along = centre.w;
-    }
-    const real2 normal = (real2)(-along.y / size_along, along.x / size_along);
-    const real offset = normal.x * (centre.x + mean.x) + normal.y * (centre.y + mean.y);
-    line[first + k] = (real4)(normal.x, normal.y, offset, is_line ? 1 / length : -1);
 }
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import end_point as end_points
-from . import error_free, field
+from . import error_free, field_term
 from .end_point import field_cell
 from .prelude import kernel, precision, reader, work_item
 
@@ -23,7 +23,7 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    made = field.functions(flags)
+    made = field_term.functions(flags)
     bilinear, field_exponent = made.bilinear, made.field_exponent
     EndPoint = end_points.functions(flags).EndPoint
     number_at = reader(real)
@@ -69,7 +69,7 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    log_field = field.functions(flags).log_field
+    log_field = field_term.functions(flags).log_field
     made = functions(flags)
     hit_share, distance_slope = made.hit_share, made.distance_slope
     end_point = end_points.functions(flags).end_point

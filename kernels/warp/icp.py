@@ -3,8 +3,8 @@
 The nearest point is exact: the points of a scan are sorted by bearing, and a search from the bearing of a place
 outwards ends where no point farther in bearing can be nearer.
 
-Lines: Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks, then
-Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+Lines: see lines.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale
+shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
 """
 
 import functools
@@ -161,11 +161,7 @@ def functions(flags):
             i += stride
         return total
 
-    return SimpleNamespace(
-        Sums=Sums, Blocks=step.Blocks, bearing_of=bearing_of, points_before=points_before,
-        nearest_point=nearest_point, add_pairing=add_pairing, solve=step.solve, agreement=agreement,
-        add_to_blocks=step.add_to_blocks, close_blocks=step.close_blocks,
-    )  # fmt: skip
+    return SimpleNamespace(nearest_point=nearest_point, add_pairing=add_pairing, agreement=agreement)
 
 
 @functools.cache
@@ -173,101 +169,14 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    made = functions(flags)
-    Sums, bearing_of, points_before, nearest_point = (
-        made.Sums, made.bearing_of, made.points_before, made.nearest_point,
-    )  # fmt: skip
-    add_pairing, solve, agreement = made.add_pairing, made.solve, made.agreement
-    Blocks, add_to_blocks, close_blocks = made.Blocks, made.add_to_blocks, made.close_blocks
-    ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
+    made, step = functions(flags), icp_step.functions(flags)
+    nearest_point, add_pairing, agreement = made.nearest_point, made.add_pairing, made.agreement
+    Sums, bearing_of, points_before, solve = step.Sums, step.bearing_of, step.points_before, step.solve
+    Blocks, add_to_blocks, close_blocks = step.Blocks, step.add_to_blocks, step.close_blocks
+    ZERO, ONE, HALF = real(0.0), real(1.0), real(0.5)
     TENTH, TEN, LARGEST_TURN, QUIET_TURN = real(0.1), real(10.0), real(0.3), real(0.03)
     # Weight in the score of a point that the other scan did not see; one that disagrees has 1.
     UNSEEN = real(0.13)
-
-    # Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
-    # farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
-    # distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and
-    # no pairs. One work-item takes a point of a scan.
-    @kernel
-    def fit_lines(
-        point: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        line: wp.array(dtype=vec4),
-        scans: wp.int32,
-        points: wp.int32,
-        reach: wp.int32,
-        most: wp.int32,
-        ratio: real,
-        slack: real,
-        width: real,
-    ):
-        scan, k = wp.tid()
-        if scan >= scans:
-            return
-        first = start[scan]
-        count = start[scan + 1] - first
-        if k >= count:
-            return
-        centre = point[first + k]
-        sum_x = real(0.0)
-        sum_y = real(0.0)
-        xx = real(0.0)
-        xy = real(0.0)
-        yy = real(0.0)
-        size = int(1)
-        for side in range(2):
-            direction = 2 * side - 1
-            last = centre
-            j = int(1)
-            while j <= most and 2 * j < count:
-                i = k + direction * j
-                if i >= count:
-                    i -= count
-                if i < 0:
-                    i += count
-                following = point[first + i]
-                x = following.x - last.x
-                y = following.y - last.y
-                farthest = slack + ratio * last.w
-                dx = following.x - centre.x
-                dy = following.y - centre.y
-                if x * x + y * y > farthest * farthest or (j > reach and dx * dx + dy * dy > width * width):
-                    j = count
-                else:
-                    sum_x += dx
-                    sum_y += dy
-                    xx += dx * dx
-                    xy += dx * dy
-                    yy += dy * dy
-                    size += 1
-                    last = following
-                j += 1
-        weight = real(size)
-        mean_x = sum_x / weight
-        mean_y = sum_y / weight
-        a = xx - weight * mean_x * mean_x
-        b = xy - weight * mean_x * mean_y
-        d = yy - weight * mean_y * mean_y
-        middle = HALF * (a - d)
-        root = wp.sqrt(middle * middle + b * b)
-        length = HALF * (a + d) + root
-        along_x = b
-        along_y = root - middle
-        if middle >= ZERO:
-            along_x = middle + root
-            along_y = b
-        size_along = wp.sqrt(along_x * along_x + along_y * along_y)
-        doubt = MISSING
-        if length > ZERO and size_along > ZERO:
-            doubt = ONE / length
-        else:
-            along_x = -centre.y
-            along_y = centre.x
-            size_along = centre.w
-        normal_x = -along_y / size_along
-        normal_y = along_x / size_along
-        offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
-        line[first + k] = vec4(normal_x, normal_y, offset, doubt)
 
     # Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
     # scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with
@@ -388,4 +297,4 @@ def make(name, flags):
         for i in range(MATCH_BLOCKS):
             result[out + 24 + i] = blocks[i]
 
-    return {"fit_lines": fit_lines, "match_scans": match_scans}[name]
+    return {"match_scans": match_scans}[name]

@@ -57,7 +57,7 @@ ON_PURPOSE = [
     Purpose("error_free", "floor_int", (OPENCL,), FLOOR),
     Purpose("error_free", "add_strands", KERNELS_ONLY, "the reference adds the terms of strand_sums"),
     Purpose("error_free", "where_pair strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
-    Purpose("field", "quick_value careful_value", KERNELS_ONLY, QUICK),
+    Purpose("field_term", "quick_value careful_value", KERNELS_ONLY, QUICK),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("icp", "_refine", REFERENCE_ONLY, "the kernel's loop, with the variables that the kernel keeps"),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),

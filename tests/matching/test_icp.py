@@ -11,6 +11,7 @@ from gpusense.interface.structs import MatchRules
 from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.points import scan_points
 from gpusense.reference import icp as reference
+from gpusense.reference.lines import fit_lines
 
 RULES = MatchRules(40, 2, 3, 1, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4)
 # Sums are added in another order than by NumPy: information is compared relative to its largest number.
@@ -63,7 +64,7 @@ def test_lines_are_total_least_squares():
     z = 2 + 0.02 * rng.normal(size=(1, 360))
     points = scan_points(z, RING, np.dtype(np.float64))
     line = np.empty((360, 4))
-    reference.fit_lines(frozenset(), points.point, points.start, line, 1, 360, 2, 16, 0.1, 0.05, 0.0)
+    fit_lines(frozenset(), points.point, points.start, line, 1, 360, 2, 16, 0.1, 0.05, 0.0)
     for k in (0, 1, 100, 359):
         near = points.point[(k + np.arange(-2, 3)) % 360, :2]
         centre = near.mean(axis=0)

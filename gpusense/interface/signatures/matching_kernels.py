@@ -17,7 +17,7 @@ KERNELS: dict[str, Kernel] = {
         "Score score", "ScanBatch batch", wide=True,
     ),
     "fit_lines": kernel(
-        "icp", "beam scan", *_POINTS, "out real4 line [points]", "int scans", "int points", "int reach", "int most",
+        "lines", "beam scan", *_POINTS, "out real4 line [points]", "int scans", "int points", "int reach", "int most",
         "real ratio", "real slack", "real width", wide=True, wide_group=8,
     ),
     "match_scans": kernel(

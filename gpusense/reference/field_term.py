@@ -1,0 +1,86 @@
+"""Term of one reading in the likelihood field (book table 6.3).
+
+log p of the distance from an end point to the nearest obstacle, looked up in the cell of the end point or interpolated
+between four cells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface import structs
+from gpusense.reference.end_point import EndPoint, end_point, field_cell
+from gpusense.reference.error_free import Pair, pair_product, pair_sum
+
+
+def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
+    """Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits."""
+    if "SHARP" in flags:
+        return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
+    return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
+
+
+def bilinear(
+    flags: frozenset[str],
+    table: np.ndarray,
+    col: np.ndarray,
+    row: np.ndarray,
+    end: EndPoint,
+    window: structs.Window,
+) -> Pair:
+    """Interpolate the distance between the four cell centres around an end point, in two parts."""
+    zero = np.zeros_like(end.rest_x[0])
+    a = table[field_cell(col, row, window)], zero
+    b = table[field_cell(col + 1, row, window)], zero
+    c = table[field_cell(col, row + 1, window)], zero
+    d = table[field_cell(col + 1, row + 1, window)], zero
+    low = between(flags, end.to_next_x, a, end.rest_x, b)
+    high = between(flags, end.to_next_x, c, end.rest_x, d)
+    return between(flags, end.to_next_y, low, end.rest_y, high)
+
+
+def field_exponent(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
+    """Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+
+    ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1). hit is z_hit / (sigma
+    sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
+    """
+    if "SHARP" in flags:
+        return pair_product(pair_product(distance, distance), (terms[1], terms[5]))
+    return distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
+
+
+def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:
+    """Return log p of distances from end points to the nearest obstacle."""
+    exponent, low = field_exponent(flags, distance, terms)
+    if "LINEAR" not in flags:
+        return np.logaddexp((terms[0] - exponent) + (terms[4] - low), terms[2])
+    p = np.full(exponent.shape, terms[2])
+    if "HIT" in flags:
+        p += terms[0] * np.exp(-exponent) * (1 - low)
+    return np.log(p)
+
+
+def reading_value(
+    flags: frozenset[str],
+    table: np.ndarray,
+    origin: np.ndarray,
+    pose: np.ndarray,
+    pose_low: np.ndarray,
+    point: np.ndarray,
+    point_low: np.ndarray,
+    terms: np.ndarray,
+    window: structs.Window,
+) -> np.ndarray:
+    """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
+    end = end_point(flags, pose, pose_low, point, point_low)
+    col, row = end.col + origin[..., 0], end.row + origin[..., 1]
+    if "BILINEAR" in flags:
+        term = log_field(flags, bilinear(flags, table, col, row, end, window), terms)
+    else:
+        term = table[field_cell(col, row, window)]
+        term = term if "LOG_TABLE" in flags else log_field(flags, (term, np.zeros_like(term)), terms)
+    if "ALL_READINGS" in flags:
+        x = point[..., 0]
+        term = np.where(np.isnan(x), 0, np.where(np.isinf(x), terms[3], term)).astype(terms.dtype)
+    return term

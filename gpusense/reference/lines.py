@@ -1,0 +1,57 @@
+"""Lines through the points of a scan and their neighbours, for point-to-line ICP: total least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def fit_lines(
+    flags: frozenset[str],
+    point: np.ndarray,
+    start: np.ndarray,
+    line: np.ndarray,
+    scans: int,
+    points: int,
+    reach: int,
+    most: int,
+    ratio: float,
+    slack: float,
+    width: float,
+) -> None:
+    """Fit a line to each point and ``reach`` neighbours on either side, up to ``most`` within a distance of ``width``.
+
+    None of them is farther from the last one than ``slack`` plus ``ratio`` times its range. A line is a unit normal, an
+    offset, and 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam,
+    -1 in place of that sum, and no pairs.
+    """
+    for scan in range(scans):
+        mine = point[start[scan] : start[scan + 1]]
+        count = len(mine)
+        sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)
+        for direction in (-1, 1):
+            last, joined = mine, np.ones(count, bool)
+            for j in range(1, most + 1):
+                if 2 * j >= count:
+                    break
+                following = mine[(np.arange(count) + direction * j) % count]
+                between = following[:, :2] - last[:, :2]
+                joined = joined & ((between**2).sum(axis=1) <= (slack + ratio * last[:, 3]) ** 2)
+                if j > reach:
+                    joined = joined & (((following[:, :2] - mine[:, :2]) ** 2).sum(axis=1) <= width * width)
+                x, y = (np.where(joined, following[:, i] - mine[:, i], 0) for i in (0, 1))
+                sums += np.stack([x, y, x * x, x * y, y * y])
+                size += joined
+                last = following
+        mean_x, mean_y = sums[0] / size, sums[1] / size
+        a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
+        d = sums[4] - size * mean_y * mean_y
+        middle = (a - d) / 2
+        root = np.sqrt(middle * middle + b * b)
+        length = (a + d) / 2 + root
+        along = np.where(middle >= 0, [middle + root, b], [b, root - middle])
+        is_line = (length > 0) & ((along**2).sum(axis=0) > 0)
+        along = np.where(is_line, along, [-mine[:, 1], mine[:, 0]])
+        along = along / np.where(is_line, np.hypot(*along), mine[:, 3])
+        offset = -along[1] * (mine[:, 0] + mean_x) + along[0] * (mine[:, 1] + mean_y)
+        doubt = np.where(is_line, 1 / np.where(is_line, length, 1), -1)
+        line[start[scan] : start[scan + 1]] = np.stack([-along[1], along[0], offset, doubt], axis=1)

@@ -1,0 +1,110 @@
+// Term of one reading in the likelihood field (book table 6.3): log p of the distance from an end point to the nearest
+// obstacle, looked up in the cell of the end point or interpolated between four cells.
+// requires: end_point
+
+#if BILINEAR
+// Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
+real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const real2 b) {
+#if SHARP
+    return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b));
+#else
+    return (real2)(weight_a.x * a.x + weight_b.x * b.x, 0);
+#endif
+}
+
+// Interpolate the distance between the four cell centres around an end point, in two parts.
+real2 bilinear(global const real *table, const int2 cell, const EndPoint end, const Window window) {
+    const real2 a = (real2)(table[field_cell(cell.x, cell.y, window)], 0);
+    const real2 b = (real2)(table[field_cell(cell.x + 1, cell.y, window)], 0);
+    const real2 c = (real2)(table[field_cell(cell.x, cell.y + 1, window)], 0);
+    const real2 d = (real2)(table[field_cell(cell.x + 1, cell.y + 1, window)], 0);
+    const real2 low = between(end.to_next_x, a, end.rest_x, b), high = between(end.to_next_x, c, end.rest_x, d);
+    return between(end.to_next_y, low, end.rest_y, high);
+}
+#endif
+
+#if !LOG_TABLE
+// Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel. terms[6]
+// = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma sqrt(2 pi)) and
+// rand is z_rand / range_max, or their logarithms in the log domain.
+real2 field_exponent(const real2 distance, global const real *terms) {
+#if SHARP
+    return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
+#else
+    return (real2)(distance.x * (distance.x * terms[1]), 0);
+#endif
+}
+
+// Return log p of the distance from an end point to the nearest obstacle.
+real log_field(const real2 distance, global const real *terms) {
+    const real2 exponent = field_exponent(distance, terms);
+#if LINEAR
+    real p = terms[2];
+#if HIT
+    p += terms[0] * exp(-exponent.x) * (1 - exponent.y);
+#endif
+    return log(p);
+#else
+    const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
+    const real largest = fmax(hit, terms[2]);
+    return largest + log(exp(hit - largest) + exp(terms[2] - largest));
+#endif
+}
+#endif
+
+// Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
+// interpolated, capped distances in metres.
+real reading_value(global const real *table, const int2 origin, const real4 pose, const real4 low, const real2 point,
+                   const real2 point_low, global const real *terms, const Window window, const real guard) {
+#if ALL_READINGS
+    if (isnan(point.x)) return 0;
+    if (isinf(point.x)) return terms[3];
+#endif
+#if BILINEAR
+    const EndPoint end = end_point(pose, low, point, point_low, (real)0.5, guard);
+    return log_field(bilinear(table, origin + end.cell, end, window), terms);
+#else
+    const EndPoint end = end_point(pose, low, point, point_low, 0, guard);
+    const real value = table[field_cell(origin.x + end.cell.x, origin.y + end.cell.y, window)];
+#if LOG_TABLE
+    return value;
+#else
+    return log_field((real2)(value, 0), terms);
+#endif
+#endif
+}
+
+#if QUICK
+// Return the term of a reading by rounding alone. worst becomes the distance of the end point from the cell's centre,
+// if that is larger. A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max
+// reading is far.
+real quick_value(global const real *table, const int2 from, const real4 lowered, const real2 point, const real far,
+                 const Window window, real *worst) {
+    real off;
+#if ALL_READINGS
+    const int is_range = isfinite(point.x);
+    const int2 near = rounded_cell(lowered, is_range ? point : (real2)(0), &off);
+    const real value = table[table_cell(near, from, window)];
+    *worst = is_range ? fmax(*worst, off) : *worst;
+    return is_range ? value : isinf(point.x) ? far : 0;
+#else
+    const int2 near = rounded_cell(lowered, point, &off);
+    *worst = fmax(*worst, off);
+    return table[table_cell(near, from, window)];
+#endif
+}
+
+// Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
+real careful_value(global const real *table, const int2 origin, const real4 lowered, const real4 pose, const real4 low,
+                   const real2 point, const real2 point_low, const real far, const Window window, const real guard,
+                   const real sure) {
+#if ALL_READINGS
+    if (isnan(point.x)) return 0;
+    if (isinf(point.x)) return far;
+#endif
+    real off;
+    int2 cell = rounded_cell(lowered, point, &off) - ROUNDING_BITS;
+    if (off > sure) cell = end_point(pose, low, point, point_low, 0, guard).cell;
+    return table[field_cell(origin.x + cell.x, origin.y + cell.y, window)];
+}
+#endif

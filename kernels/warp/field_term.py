@@ -1,0 +1,170 @@
+"""Term of one reading in the likelihood field (book table 6.3).
+
+log p of the distance from an end point to the nearest obstacle, looked up in the cell of the end point or interpolated
+between four cells.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import end_point as end_points
+from . import error_free
+from .end_point import field_cell
+from .prelude import precision, reader
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    exact = error_free.functions(flags)
+    pair_sum, pair_product = exact.pair_sum, exact.pair_product
+    ends = end_points.functions(flags)
+    EndPoint, end_point, rounded_cell = ends.EndPoint, ends.end_point, ends.rounded_cell
+    table_cell, ROUNDING_BITS = ends.table_cell, ends.ROUNDING_BITS
+    number_at = reader(real)
+    ALL_READINGS = "ALL_READINGS" in flags
+    BILINEAR = "BILINEAR" in flags
+    HIT = "HIT" in flags
+    LINEAR = "LINEAR" in flags
+    LOG_TABLE = "LOG_TABLE" in flags
+    SHARP = "SHARP" in flags
+    ZERO, ONE = real(0.0), real(1.0)
+    SHIFT = real(0.5 if BILINEAR else 0.0)
+
+    # Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
+    @wp.func
+    def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
+        if SHARP:
+            return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
+        else:
+            return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
+
+    # Interpolate the distance between the four cell centres around an end point, in two parts.
+    @wp.func
+    def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
+        a = vec2(number_at(table, field_cell(cell.x, cell.y, window)), ZERO)
+        b = vec2(number_at(table, field_cell(cell.x + 1, cell.y, window)), ZERO)
+        c = vec2(number_at(table, field_cell(cell.x, cell.y + 1, window)), ZERO)
+        d = vec2(number_at(table, field_cell(cell.x + 1, cell.y + 1, window)), ZERO)
+        low = between(end.to_next_x, a, end.rest_x, b)
+        high = between(end.to_next_x, c, end.rest_x, d)
+        return between(end.to_next_y, low, end.rest_y, high)
+
+    # Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+    # terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma
+    # sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
+    @wp.func
+    def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
+        if SHARP:
+            return pair_product(pair_product(distance, distance), vec2(terms[1], terms[5]))
+        else:
+            return vec2(distance.x * (distance.x * terms[1]), ZERO)
+
+    # Return log p of the distance from an end point to the nearest obstacle.
+    if LINEAR:
+
+        @wp.func
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+            p = terms[2]
+            if HIT:
+                exponent = field_exponent(distance, terms)
+                p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
+            return wp.log(p)
+
+    else:
+
+        @wp.func
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+            exponent = field_exponent(distance, terms)
+            hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
+            largest = wp.max(hit, terms[2])
+            return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+
+    # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
+    # interpolated, capped distances in metres.
+    @wp.func
+    def reading_value(
+        table: wp.array(dtype=real),
+        origin: wp.vec2i,
+        pose: vec4,
+        low: vec4,
+        point: vec2,
+        point_low: vec2,
+        terms: wp.array(dtype=real),
+        window: types.Window,
+        guard: real,
+    ):
+        if ALL_READINGS:
+            if wp.isnan(point.x):
+                return ZERO
+            if wp.isinf(point.x):
+                return terms[3]
+        end = end_point(pose, low, point, point_low, SHIFT, guard)
+        cell = origin + end.cell
+        if BILINEAR:
+            return log_field(bilinear(table, cell, end, window), terms)
+        else:
+            value = number_at(table, field_cell(cell.x, cell.y, window))
+            if LOG_TABLE:
+                return value
+            else:
+                return log_field(vec2(value, ZERO), terms)
+
+    # Return the term of a reading by rounding alone, and the distance of the end point from the cell's centre. A
+    # missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
+    @wp.func
+    def quick_value(
+        table: wp.array(dtype=real),
+        start_cell: wp.vec2i,
+        lowered: vec4,
+        to: vec2,
+        far: real,
+        window: types.Window,
+    ):
+        if ALL_READINGS:
+            is_range = wp.isfinite(to.x)
+            near, off = rounded_cell(lowered, wp.where(is_range, to, vec2(ZERO, ZERO)))
+            value = number_at(table, table_cell(near, start_cell, window))
+            if not is_range:
+                off = ZERO
+                value = wp.where(wp.isinf(to.x), far, ZERO)
+        else:
+            near, off = rounded_cell(lowered, to)
+            value = number_at(table, table_cell(near, start_cell, window))
+        return value, off
+
+    # Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
+    @wp.func
+    def careful_value(
+        table: wp.array(dtype=real),
+        origin: wp.vec2i,
+        lowered: vec4,
+        sensor_pose: vec4,
+        sensor_low: vec4,
+        to: vec2,
+        to_low: vec2,
+        far: real,
+        window: types.Window,
+        guard: real,
+        sure: real,
+    ):
+        if ALL_READINGS:
+            if wp.isnan(to.x):
+                return ZERO
+            if wp.isinf(to.x):
+                return far
+        near, off = rounded_cell(lowered, to)
+        cell = wp.vec2i(near.x - ROUNDING_BITS, near.y - ROUNDING_BITS)
+        if off > sure:
+            exact = end_point(sensor_pose, sensor_low, to, to_low, ZERO, guard)
+            cell = exact.cell
+        return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, window))
+
+    return SimpleNamespace(
+        between=between, bilinear=bilinear, field_exponent=field_exponent, log_field=log_field,
+        reading_value=reading_value, quick_value=quick_value, careful_value=careful_value,
+    )  # fmt: skip

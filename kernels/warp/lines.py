@@ -1,0 +1,102 @@
+"""Lines through the points of a scan and their neighbours, for point-to-line ICP: total least squares."""
+
+import functools
+
+import warp as wp
+
+from .prelude import kernel, precision
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    types = precision(flags)
+    real, vec4 = types.real, types.vec4
+    ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
+
+    # Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
+    # farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
+    # distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and
+    # no pairs. One work-item takes a point of a scan.
+    @kernel
+    def fit_lines(
+        point: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        line: wp.array(dtype=vec4),
+        scans: wp.int32,
+        points: wp.int32,
+        reach: wp.int32,
+        most: wp.int32,
+        ratio: real,
+        slack: real,
+        width: real,
+    ):
+        scan, k = wp.tid()
+        if scan >= scans:
+            return
+        first = start[scan]
+        count = start[scan + 1] - first
+        if k >= count:
+            return
+        centre = point[first + k]
+        sum_x = real(0.0)
+        sum_y = real(0.0)
+        xx = real(0.0)
+        xy = real(0.0)
+        yy = real(0.0)
+        size = int(1)
+        for side in range(2):
+            direction = 2 * side - 1
+            last = centre
+            j = int(1)
+            while j <= most and 2 * j < count:
+                i = k + direction * j
+                if i >= count:
+                    i -= count
+                if i < 0:
+                    i += count
+                following = point[first + i]
+                x = following.x - last.x
+                y = following.y - last.y
+                farthest = slack + ratio * last.w
+                dx = following.x - centre.x
+                dy = following.y - centre.y
+                if x * x + y * y > farthest * farthest or (j > reach and dx * dx + dy * dy > width * width):
+                    j = count
+                else:
+                    sum_x += dx
+                    sum_y += dy
+                    xx += dx * dx
+                    xy += dx * dy
+                    yy += dy * dy
+                    size += 1
+                    last = following
+                j += 1
+        weight = real(size)
+        mean_x = sum_x / weight
+        mean_y = sum_y / weight
+        a = xx - weight * mean_x * mean_x
+        b = xy - weight * mean_x * mean_y
+        d = yy - weight * mean_y * mean_y
+        middle = HALF * (a - d)
+        root = wp.sqrt(middle * middle + b * b)
+        length = HALF * (a + d) + root
+        along_x = b
+        along_y = root - middle
+        if middle >= ZERO:
+            along_x = middle + root
+            along_y = b
+        size_along = wp.sqrt(along_x * along_x + along_y * along_y)
+        doubt = MISSING
+        if length > ZERO and size_along > ZERO:
+            doubt = ONE / length
+        else:
+            along_x = -centre.y
+            along_y = centre.x
+            size_along = centre.w
+        normal_x = -along_y / size_along
+        normal_y = along_x / size_along
+        offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
+        line[first + k] = vec4(normal_x, normal_y, offset, doubt)
+
+    return {"fit_lines": fit_lines}[name]

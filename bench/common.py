@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.backends.base import Backend, Launcher, Proxy
+from gpusense.backends.base import Backend, Launcher
+from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.scoring import logged_scans
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.interface.launches import Launch

@@ -32,7 +32,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import Backend, BackendInfo, get_backend
-from gpusense.backends.base import Proxy
+from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.fit_scenes import Scene, learning_scenes
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import em_step

@@ -24,7 +24,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
-from gpusense.backends.base import Proxy
+from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.selftest import scipy_squares
 from gpusense.evaluation.worlds import building
 from gpusense.tables.cells import packed

@@ -108,6 +108,17 @@ def choice(name: str, value: object, options: Sequence[str]) -> str:
     return value
 
 
+def boolean(name: str, value: object) -> bool:
+    """Return ``value`` after checking that it is True or False; numbers are neither.
+
+    Raises:
+        TypeError: It is neither.
+    """
+    if not isinstance(value, (bool, np.bool)):
+        raise TypeError(f"{name}: must be True or False, got {show(value)}")
+    return bool(value)
+
+
 def as_array(name: str, value: object) -> NDArray[Any]:
     """Return ``numpy.asarray(value)`` of any dtype.
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +13,28 @@ import numpy as np
 from gpusense import plots
 from gpusense._util.files import check_writable
 from gpusense._util.progress import progress
-from gpusense._util.typing import Precision
-from gpusense.backends import Backend, Selection
+from gpusense.backends import Backend
 from gpusense.commands import arguments, output
+from gpusense.commands.demo_scene import (
+    BEAM,
+    BEAMS,
+    FIELD,
+    FIELD_OF_VIEW,
+    PATIENCE,
+    PRECISION,
+    RANGE_MAX,
+    REPETITIONS,
+    SIGMA_THETA,
+    SIGMA_XY,
+    SIZE,
+    Scene,
+    Score,
+    make_model,
+    make_scene,
+    score_scene,
+)
 from gpusense.commands.output import grouped
-from gpusense.evaluation import worlds
 from gpusense.evaluation.machine import machine
-from gpusense.evaluation.scoring import evaluated_beams
-from gpusense.models.scan.beam import BeamModel
-from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.parameters import BeamParameters
-from gpusense.world.scanner import Scanner
 
 NAME = "demo"
 HELP = "Localise a robot in a generated building with every backend, compare them, and draw the result."
@@ -45,61 +53,8 @@ examples:
 
 Exit codes: 0 success, 1 a device failed (the report has its error), 2 bad input."""
 
-SIZE, BEAMS, FIELD_OF_VIEW, RANGE_MAX, SIGMA_XY, SIGMA_THETA = (30.0, 20.0), 180, 270.0, 15.0, 0.5, 0.3
-BEAM, FIELD = "beam model", "likelihood field"
 LATTICE = 0.1
-PRECISION: Precision = "float32"
-# Largest number of particles of the reference; total time of repeated calls [s]; largest number of repeated calls.
-REFERENCE_PARTICLES, PATIENCE, REPETITIONS = 10_000, 4.0, 3
 NOTE = "Generated building; scan drawn from the beam model's mixture. Colour scales end at the median of the values."
-
-
-Model = BeamModel | LikelihoodFieldModel
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A map, a scan in it, the poses to score with the true pose last, and the number of beams that models use."""
-
-    grid: OccupancyGrid
-    scanner: Scanner
-    ranges: np.ndarray
-    poses: np.ndarray
-    beams: int
-
-    @property
-    def truth(self) -> np.ndarray:
-        """Return (3,) the true pose [m, m, rad]."""
-        return self.poses[-1]
-
-    @property
-    def checked(self) -> slice:
-        """Return the slice of the poses that the float64 reference scores too."""
-        return slice(None, None, -(-len(self.poses) // REFERENCE_PARTICLES))
-
-
-@dataclass(frozen=True)
-class Score:
-    """Scores and times of one model on one device."""
-
-    name: str
-    model: Model
-    log_p: np.ndarray
-    first_s: float
-    steady_s: float
-    repetitions: int
-    evaluated: int
-    errors: np.ndarray
-
-    @property
-    def rate(self) -> float:
-        """Return the particle-beams per second of the steady call."""
-        return len(self.log_p) * self.evaluated / self.steady_s
-
-    @property
-    def rank(self) -> int:
-        """Return the rank of the true pose: 1 if no particle scores better."""
-        return 1 + int((self.log_p[:-1] > self.log_p[-1]).sum())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -167,50 +122,6 @@ def _score_all(
                     raise
                 failures.append(f"{backend.info.selection}: {name}: {type(error).__name__}: {error}")
     return scores, failures
-
-
-def make_scene(seed: int, particles: int, beams: int) -> Scene:
-    """Make a building, a scan drawn from the beam model at a free pose, and a cloud of particles."""
-    rng = np.random.default_rng(seed)
-    grid = worlds.building(seed, SIZE)
-    first, step = -math.radians(FIELD_OF_VIEW) / 2, math.radians(FIELD_OF_VIEW) / (BEAMS - 1)
-    scanner = Scanner.uniform(angle_min=first, angle_increment=step, count=BEAMS, range_max=RANGE_MAX)
-    truth = worlds.free_pose(grid, rng)
-    ranges = worlds.simulate_scan(grid, scanner, truth, BeamParameters(), rng)
-    around = worlds.cloud_around(truth, particles // 2, SIGMA_XY, SIGMA_THETA, rng)
-    anywhere = worlds.cloud_uniform(grid, particles - particles // 2, rng)
-    return Scene(grid, scanner, ranges, np.concatenate([around, anywhere, truth[None]]), beams)
-
-
-def make_model(scene: Scene, name: str, backend: Selection, precision: Precision = PRECISION) -> Model:
-    """Make a model with its default parameters; ``name`` is ``BEAM`` or ``FIELD``."""
-    kind: Any = BeamModel if name == BEAM else LikelihoodFieldModel
-    return kind(scene.grid, scene.scanner, backend=backend, precision=precision, beams=scene.beams)
-
-
-def score_scene(scene: Scene, name: str, backend: Backend, reference: np.ndarray) -> Score:
-    """Time the first call, model included, and up to ``REPETITIONS`` steady calls within ``PATIENCE`` seconds.
-
-    Args:
-        scene: The scene.
-        name: ``BEAM`` or ``FIELD``.
-        backend: The backend.
-        reference: float64 log-likelihoods of the poses ``scene.checked``.
-    """
-    begin = time.perf_counter()
-    model = make_model(scene, name, backend)
-    log_p = np.asarray(model.log_likelihood(scene.poses, scene.ranges))
-    first = time.perf_counter() - begin
-    calls: list[float] = []
-    slow = backend.info.backend == "numpy" and first > PATIENCE
-    while not slow and len(calls) < REPETITIONS and sum(calls) < PATIENCE:
-        begin = time.perf_counter()
-        log_p = np.asarray(model.log_likelihood(scene.poses, scene.ranges))
-        calls.append(time.perf_counter() - begin)
-    # A reading without return has the same probability at every pose, and is not evaluated.
-    evaluated = evaluated_beams(model, scene.ranges)
-    errors = np.abs(log_p[scene.checked] - reference)
-    return Score(name, model, log_p, first, min(calls, default=first), len(calls), evaluated, errors)
 
 
 def draw(scene: Scene, scores: list[Score], path: Path) -> None:

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.backends.base import Launcher, Proxy
+from gpusense.backends.base import Launcher
+from gpusense.backends.proxy import Proxy
 from gpusense.interface import structs
 from gpusense.interface.signatures import KERNELS, Argument
 from gpusense.reference import field as field_kernels

@@ -129,8 +129,7 @@ def read_log(
     if range_max is not None:
         range_max = checks.real("range_max", range_max, above=0)
     for name, flag in (("odometry", odometry), ("rear", rear)):
-        if not isinstance(flag, bool):
-            raise TypeError(f"{name}: must be True or False, got {checks.show(flag)}")
+        checks.boolean(name, flag)
     if not file.is_dir():
         checks.existing_file(file)
     form = next((each for each in FORMATS if each.claims(file)), None)

@@ -112,8 +112,7 @@ class MapBuilder:
         readings = checks.array("scans", scans, (len(placed), scanner.count), finite=False)
         cell = checks.real("resolution", resolution, above=0)
         limit = scanner.range_max if range_limit is None else checks.real("range_limit", range_limit, above=0)
-        if not isinstance(clear_max, bool):
-            raise TypeError(f"clear_max: must be True or False, got {checks.show(clear_max)}")
+        checks.boolean("clear_max", clear_max)
         self._occupancy = _occupancy(p_hit, p_miss, p_prior)
         self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         moved = check_motion("motion", motion, len(placed))

@@ -178,8 +178,7 @@ class Cddt(Caster):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "bins", checks.integer("bins", self.bins, low=4, high=4096))
-        if not isinstance(self.pruned, bool):
-            raise TypeError(f"pruned: must be True or False, got {checks.show(self.pruned)}")
+        checks.boolean("pruned", self.pruned)
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""

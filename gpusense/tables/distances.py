@@ -102,8 +102,7 @@ def distance_transform(
         [[0, 1, 4], [1, 2, 5]]
     """
     side = checks.real("resolution", resolution, above=0)
-    if not isinstance(squared, bool):
-        raise TypeError(f"squared: must be True or False, got {checks.show(squared)}")
+    checks.boolean("squared", squared)
     cells = checks.as_array("obstacles", obstacles)
     if cells.dtype.kind not in "biu":
         raise TypeError(f"obstacles: must hold bool or integers, got dtype {cells.dtype}")

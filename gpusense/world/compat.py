@@ -56,11 +56,6 @@ _OCCUPIED, _UNKNOWN = 100, -1
 OVERLAID = 2
 
 
-def _check_bool(name: str, value: object) -> None:
-    if not isinstance(value, bool):
-        raise TypeError(f"{name}: must be True or False, got {checks.show(value)}")
-
-
 @dataclass(frozen=True)
 class Peer(Likelihood, ABC):
     """A program whose weights ``compat`` reproduces.
@@ -78,7 +73,7 @@ class Peer(Likelihood, ABC):
     is_peer = True
 
     def __post_init__(self) -> None:
-        _check_bool("prob", self.prob)
+        checks.boolean("prob", self.prob)
 
     @property
     def cubes(self) -> bool:
@@ -190,9 +185,9 @@ class Beluga(Peer):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_bool("model_unknown_space", self.model_unknown_space)
+        checks.boolean("model_unknown_space", self.model_unknown_space)
         if self.only_obstacle_boundaries is not None:
-            _check_bool("only_obstacle_boundaries", self.only_obstacle_boundaries)
+            checks.boolean("only_obstacle_boundaries", self.only_obstacle_boundaries)
 
     @property
     def boundaries(self) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpusense.backends import Backend, get_backend
-from gpusense.backends.base import Proxy
+from gpusense.backends.proxy import Proxy
 from gpusense.backends.recording import Recording, counted
 from gpusense.interface.launches import Launch
 

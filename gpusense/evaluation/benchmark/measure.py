@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.backends.base import Buffer, Launcher, Proxy
+from gpusense.backends.base import Buffer, Launcher
+from gpusense.backends.proxy import Proxy
 
 LONG = 2.0
 """Duration of a call above which it is not repeated [s]."""

@@ -114,8 +114,7 @@ def fit_beam_parameters(
     bounds = make_bounds(pairs, sigma_bounds, lambda_bounds)
     if initial is not None and not isinstance(initial, BeamParameters):
         raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
-    if not isinstance(sigma_growth, bool):
-        raise TypeError(f"sigma_growth: must be True or False, got {checks.show(sigma_growth)}")
+    checks.boolean("sigma_growth", sigma_growth)
     if sigma_growth and method == "em-book":
         raise ValueError("sigma_growth: must be False with method 'em-book', which has no growth, got True")
     device = DeviceSums(*open_device(backend, precision), pairs)

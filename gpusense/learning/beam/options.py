@@ -60,8 +60,7 @@ def check_options(
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: must be callable, got {checks.show(callback)}")
     for name, flag in (("range_bias", range_bias), ("progress", progress), ("responsibilities", responsibilities)):
-        if not isinstance(flag, (bool, np.bool)):
-            raise TypeError(f"{name}: must be True or False, got {checks.show(flag)}")
+        checks.boolean(name, flag)
     if method == "em-book" and range_bias:
         raise ValueError("range_bias: must be False with method 'em-book', which has no offset, got True")
     return Options(

@@ -110,8 +110,7 @@ def fit_landmark_parameters(
         raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
     if initial is not None and not isinstance(initial, LandmarkParameters):
         raise TypeError(f"initial: must be LandmarkParameters, got {checks.show(initial)}")
-    if not isinstance(bias, bool):
-        raise TypeError(f"bias: must be True or False, got {checks.show(bias)}")
+    checks.boolean("bias", bias)
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
     base = LandmarkParameters(range_max=range_max, field_of_view=field_of_view, signature_span=signature_span)

@@ -149,8 +149,7 @@ def fit_position_parameters(
         (True, 2.0)
     """
     for name, value in (("correlated", correlated), ("fit_mount", fit_mount)):
-        if not isinstance(value, bool):
-            raise TypeError(f"{name}: must be True or False, got {checks.show(value)}")
+        checks.boolean(name, value)
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
     base = PositionParameters(region=region, mount=mount)

@@ -97,22 +97,17 @@ class LandmarkModel(PointModel):
             raise TypeError(f"parameters: must be LandmarkParameters, got {checks.show(parameters)}")
         p = self.parameters
         if p.sigma_signature is not None and landmarks.signatures is None:
-            rule = "must be None for a map without signatures"
-            raise ValueError(f"sigma_signature: {rule}, got {p.sigma_signature}")
+            raise ValueError(f"sigma_signature: must be None for a map without signatures, got {p.sigma_signature}")
         self.association = checks.choice("association", association, ("nearest", "sum", "joint"))
-        for name, value in (("negative", negative), ("specialize", specialize)):
-            if not isinstance(value, bool):
-                raise TypeError(f"{name}: must be True or False, got {checks.show(value)}")
+        self.negative, self._specialize = checks.boolean("negative", negative), checks.boolean("specialize", specialize)
         if negative and self.association == "sum":
             raise ValueError("association: must be 'nearest' or 'joint' with negative=True, got 'sum'")
         if self.association == "joint" and len(landmarks) > JOINT_LANDMARKS:
-            rule = f"must be at most {JOINT_LANDMARKS} with association='joint'"
-            raise ValueError(f"landmarks: {rule}, got {len(landmarks)}")
-        self.negative = negative
+            got = len(landmarks)
+            raise ValueError(f"landmarks: must be at most {JOINT_LANDMARKS} with association='joint', got {got}")
         x, y, yaw = (float(value) for value in checks.array("mount", mount, (3,)))
         self.mount = (x, y, yaw)
         super().__init__(backend, precision, temperature)
-        self._specialize = specialize
         self._sensor = describe(p, landmarks)
         tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
         if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
@@ -192,8 +187,8 @@ class LandmarkModel(PointModel):
             partner = check_correspondence(correspondence, len(full), len(self.landmarks))[prepared.columns]
             prepared, places, fixed = known_features(prepared, partner, self._buckets)
         elif joint and len(prepared.columns) > JOINT_FEATURES:
-            rule = f"must be at most {JOINT_FEATURES} with association='joint'"
-            raise ValueError(f"features: {rule}, got {len(prepared.columns)}")
+            got = len(prepared.columns)
+            raise ValueError(f"features: must be at most {JOINT_FEATURES} with association='joint', got {got}")
         return Call(prepared, places, fixed, self._code(prepared, known, each or self.negative), joint)
 
     def _evaluate(

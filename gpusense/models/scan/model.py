@@ -62,8 +62,7 @@ class ScanModel(ABC):
         self.outside = checks.choice("outside", "free" if outside is None else outside, ("free", "occupied"))
         self.temperature = checks.real("temperature", temperature, above=0, high=1)
         self.beams = check_beams(beams, scanner.count)
-        if not isinstance(specialize, bool):
-            raise TypeError(f"specialize: must be True or False, got {checks.show(specialize)}")
+        checks.boolean("specialize", specialize)
         device = get_backend(backend)
         rules = Rules(
             scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.is_peer else z_max, self.beams,

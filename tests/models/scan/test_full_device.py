@@ -10,7 +10,7 @@ from support.model_world import BEARINGS, KINDS, RANGE, cloud, make, parts_of_ki
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.backends.base import Proxy
+from gpusense.backends.proxy import Proxy
 from gpusense.models import run
 from gpusense.tables.reachable import ReachableMap
 

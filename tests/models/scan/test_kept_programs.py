@@ -7,7 +7,7 @@ import pytest
 from support.scan_calls import FIELD, GRID, MODELS, NEAR, cloud, mixed
 
 from gpusense.backends import Backend, get_backend
-from gpusense.backends.base import Proxy
+from gpusense.backends.proxy import Proxy
 from gpusense.evaluation.tolerances import differing
 from gpusense.interface.signatures import KERNELS
 

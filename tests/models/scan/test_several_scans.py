@@ -11,7 +11,7 @@ from support.selection import on_every_backend
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.backends.base import Proxy
+from gpusense.backends.proxy import Proxy
 from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import run

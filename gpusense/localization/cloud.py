@@ -1,7 +1,7 @@
 """The particles of a filter on their device, and the programs of its steps.
 
-Two buffers hold poses: a stage of a correction scores and weighs those of one, and draws those of the other. On a GPU a
-step is one recorded program; a processor runs the launches one by one, and stops when no temperature is left.
+Two buffers hold poses: a stage of a correction scores and weighs those of one, and draws those of the other, until no
+temperature is left. On a GPU motion, scores and weights are one recorded program.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from gpusense.interface.launches import Program, launch
 from gpusense.localization.sums import Sums, weight_block
 
 _DOUBLE = np.dtype(np.float64)
+_MOST_RECORDED = 32
 
 
 class Summary(NamedTuple):
@@ -48,6 +49,24 @@ class Summary(NamedTuple):
     degenerate: bool
     stages: int
     numbers: np.ndarray
+
+
+class Stage(NamedTuple):
+    """A stage of a correction.
+
+    Attributes:
+        source: Index of the buffer with its poses.
+        number: Its number, from 0.
+        most: Most stages of the correction.
+        drawn: Particles that it draws; 0 where the number follows from its weights.
+        kind: Kind of the motion before it; None where there is none.
+    """
+
+    source: int
+    number: int
+    most: int
+    drawn: int
+    kind: int | None
 
 
 class Cloud:
@@ -154,17 +173,23 @@ class Cloud:
                                 settings=self.settings, state=self.state, pool=self.pool, target=target,
                                 after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
 
-    def weighing(self, source: int, stage: int, stages: int, drawn: int) -> Program:
-        """Return the launches of a stage after its scores: weights, and the draw into the other buffer."""
+    def weighing(self, stage: Stage) -> Program:
+        """Return the launches of a stage after its scores: weights, and the draw where its size is known."""
         find, *scored = self.sums.highest(self.blocks)
         found, numbers = (scored[0], scored[1]), self.numbers()
-        weights = self.sums.weigh(numbers, found, stage)
-        weights += self.sums.set_weights(numbers, found, (stage, stages), (self.weight, self.ends))
-        if self._copies is not None:
-            given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
-            weights += self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage)
-        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage)
+        weights = self.sums.weigh(numbers, found, stage.number)
+        weights += self.sums.set_weights(numbers, found, (stage.number, stage.most), (self.weight, self.ends))
+        draw = self.draw(stage, stage.drawn) if stage.drawn else ()
         return self.scoring(self._sensors) + find + weights + draw
+
+    def draw(self, stage: Stage, drawn: int) -> Program:
+        """Return the launches that draw into the other buffer."""
+        copies: Program = ()
+        if self._copies is not None:
+            given = {name: self.numbers()[name] for name in ("state", "particles", "block", "blocks")}
+            copies = self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage.number)
+        source, target = self.poses[stage.source], self.poses[1 - stage.source]
+        return copies + self.drawing((source, self.ends, self.count), target, drawn, stage.number)
 
     # ---- steps
 
@@ -183,66 +208,54 @@ class Cloud:
             self.backend.upload(self._read(self.before, self.count), self.weight)
         )
 
-    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int, Program], None]) -> int:
-        """Run a step whose log-likelihoods are computed by calls between the launches.
+    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[Stage], None]) -> None:
+        """Run a step: stages until nothing is left of the temperature.
 
         Args:
             kind: Kind of the motion that begins the step.
             stages: Most stages.
             drawn: Particles of the next step.
             sensors: Sensors that are used, the first ones of ``log_p``.
-            score: Writes the log-likelihoods of the poses of a buffer, once a program has written them, into ``log_p``.
-
-        Returns:
-            The number of particles drawn.
+            score: Runs the launches of a stage: the motion of the first one, the log-likelihoods, and the weighing.
         """
         self.use(sensors)
-        source, before = self.next, self.motion(kind)
-        for stage in range(stages):
-            last = stage + 1 == stages
-            score(source, before)
-            before = ()
-            # A stage that leaves nothing draws for the next step, so every stage may be the last one.
-            self._weigh(source, stage, stages, self.count if not last else drawn)
+        source = self.next
+        for number in range(stages):
+            last = number + 1 == stages
+            stage = Stage(source, number, stages, drawn if last else 0, None if number else kind)
+            score(stage)
+            if not last:
+                last = self._read(self.state, STATE)[number * STAGE + LEFT] == 0.0
+                self._draw(stage, drawn if last else self.count)
             self.shown, self.next = source, 1 - source
-            if last or self._read(self.state, STATE)[stage * STAGE + LEFT] == 0.0:
-                return drawn if last else self.count
+            if last:
+                break
             source = 1 - source
-        raise AssertionError(stages)
 
-    def _weigh(self, source: int, stage: int, stages: int, drawn: int) -> None:
+    def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        key = source, stage, stages, drawn, self.count, self._sensors
-        self._stages.run(key, lambda: self.weighing(source, stage, stages, drawn))
+        self._stages.run((stage[:4], self.count, self._sensors), lambda: self.weighing(stage))
 
-    def replay(
-        self, kind: int, stages: int, drawn: int, key: Hashable, programs: Callable[[int], tuple[Program, object]]
-    ) -> None:
-        """Run a step as one recorded program.
+    def _draw(self, stage: Stage, drawn: int) -> None:
+        """Draw into the other buffer."""
+        self._stages.run((stage[:2], drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
+
+    def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
+        """Run a stage as one recorded program.
 
         Args:
-            kind: Kind of the motion that begins the step.
-            stages: Stages, all of which run.
-            drawn: Particles of the next step.
+            stage: The stage.
             key: All on which the sensors' programs depend.
-            programs: Returns the program that scores the poses of a buffer, and the owners of its memory.
+            scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
-        begin = self.next
-        whole = (key, begin, self.count, drawn, kind, stages)
+        whole = (key, stage, self.count)
         if whole not in self._recordings:
-            if len(self._recordings) > 16:
+            if len(self._recordings) > _MOST_RECORDED:
                 self._recordings.clear()
-            program, owners = self.motion(kind), []
-            for stage in range(stages):
-                source = (begin + stage) % 2
-                scoring, owner = programs(source)
-                owners.append(owner)
-                program += scoring
-                program += self.weighing(source, stage, stages, drawn if stage + 1 == stages else self.count)
-            self._recordings[whole] = self.backend.record(program), owners
+            move = () if stage.kind is None else self.motion(stage.kind)
+            program, owners = scoring(stage.source)
+            self._recordings[whole] = self.backend.record(move + program + self.weighing(stage)), owners
         self._recordings[whole][0]()
-        self.shown = (begin + stages - 1) % 2
-        self.next = 1 - self.shown
 
     def explain(self) -> str:
         """Return how the last recorded step is started."""

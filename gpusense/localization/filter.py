@@ -241,7 +241,7 @@ class ParticleFilter:
         motion, self._pending = self._pending, _STILL
         drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
         self._cloud.upload_settings(self._settings(motion, [index for index, _ in given]))
-        drawn = self._score(given, motion.kind, drawn)
+        self._score(given, motion.kind, drawn)
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
         self._last = whole
@@ -282,9 +282,9 @@ class ParticleFilter:
         self._cloud.move(motion.kind)
         self._shown = self._cloud.count
 
-    def _score(self, given: list[Given], kind: int, drawn: int) -> int:
-        """Run the stages of a correction; return the number of particles drawn."""
-        return self._scoring.correct(given, kind, self.options.stages, drawn)
+    def _score(self, given: list[Given], kind: int, drawn: int) -> None:
+        """Run the stages of a correction, the last of which draws a number of particles."""
+        self._scoring.correct(given, kind, self.options.stages, drawn)
 
     def _without_skipped(self, given: list[Given], share: float) -> list[Given]:
         """Return readings without the beams that too few particles explain."""

@@ -165,10 +165,12 @@ class Cloud:
             for sensor, log_p in enumerate(self.log_p[:sensors])
         )  # fmt: skip
 
-    def drawing(self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int) -> Program:
+    def drawing(
+        self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int, copies: Buffer | None = None
+    ) -> Program:
         """Return the launch that draws from poses with cumulative weights, given with their number."""
         poses, ends, count = source
-        copies = ends if self._copies is None else self._copies
+        copies = next(one for one in (copies, self._copies, ends) if one is not None)
         return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends, copies=copies,
                                 settings=self.settings, state=self.state, pool=self.pool, target=target,
                                 after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip

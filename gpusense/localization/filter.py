@@ -20,6 +20,7 @@ from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.scoring import Given, Scoring, given_of
 from gpusense.localization.sensors import Sensor
+from gpusense.localization.trust import Trust
 from gpusense.localization.verdict import Verdict
 from gpusense.world.grid import OccupancyGrid
 
@@ -46,7 +47,8 @@ class ParticleFilter:
         resampling: "systematic", "stratified" or "residual"; sums are exact in each.
         threshold: Resample where the effective sample size is below this share of the particles.
         stages: Most stages of a correction, 1 to 6; 1 is the plain particle filter with tempered weights.
-        recovery: None, "augmented": inject uniform particles where the scans' likelihood drops (*Probabilistic
+        recovery: None: only a start anywhere on the map is repeated (sensor resetting) where scans contradict the pose
+            that it has found; "augmented": inject uniform particles where the scans' likelihood drops (*Probabilistic
             Robotics* table 8.3), or "sensor": inject them where the scan is likely (sensor resetting, Lenser and
             Veloso 2000) as soon as the filter finds itself lost.
         beam_skip: None, or a share of the particles in (0, 1): a beam that fewer of them explain is left out, such as
@@ -103,6 +105,7 @@ class ParticleFilter:
         self._pool = 0, (0.0, 0.0, 0.0)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
+        self._trust: Trust | None = None
 
     def __repr__(self) -> str:
         one = self.options
@@ -151,6 +154,8 @@ class ParticleFilter:
         pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
         self._place(starts.spread(pool, spread, self._number(particles), self._key()))
         self._wide = DEFAULTS.wide_scans
+        if bounds is None and self.options.recovery is None:
+            self._trust = Trust()
 
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
         """Draw particles from a likelihood over poses.
@@ -174,6 +179,7 @@ class ParticleFilter:
         """Replace all particles, and forget what was learned about the likelihood of scans."""
         self._cloud.place(poses)
         self._shown, self._started, self._pending, self._wide = len(poses), True, _STILL, 0
+        self._trust = None
         self._backend.upload(np.zeros(STATE), self._cloud.state)
         self._verdict.reset()
         if self.options.recovery == "augmented" and not self._pool[0]:
@@ -249,8 +255,14 @@ class ParticleFilter:
         self._verdict.corrected()
         if chosen.temperature == "auto":
             self._calibrate(given)
-        if chosen.recovery == "sensor" and self._verdict.due and self.estimate().lost:
+        if self._verdict.due and self._is_contradicted():
             self.reset()
+
+    def _is_contradicted(self) -> bool:
+        """Tell whether scans contradict the pose so that half of the particles should be replaced."""
+        if self.options.recovery == "sensor":
+            return self.estimate().lost
+        return self._trust is not None and self._trust.contradicted(self.estimate())
 
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
@@ -271,7 +283,9 @@ class ParticleFilter:
         chosen = starts.spread(tries[best], (0.1, 0.1, 0.05), count, self._key(), each=True)
         kept = self._cloud.host_poses(self._cloud.next, self._cloud.count)
         kept[:: max(len(kept) // count, 1)][:count] = chosen[: len(kept[:: max(len(kept) // count, 1)][:count])]
+        trust = self._trust
         self._place(kept)
+        self._trust = trust
 
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.backends import Selection, get_backend
+from gpusense.matching.align import Alignment
 from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
 from gpusense.matching.search import Found, PoseGrid, Search
 from gpusense.tables.distances import distance_transform
@@ -28,6 +29,8 @@ _LEVELS, _DEPTH = 5, 0.02
 _MODE_RADIUS, _MODE_ANGLE, _MODES = 0.5, math.radians(10), 10
 # Least overlap, as a share of the local map's known cells, and share of the best correlation that makes a rival.
 _OVERLAP, _RIVAL = 0.3, 0.95
+# Cells, or angles between headings of the search, by which the alignment moves a pose at most.
+_FARTHEST = 3.0
 # Half widths of the window around a guess [m, m, rad].
 _WINDOW = (1.0, 1.0, 0.35)
 
@@ -86,9 +89,10 @@ def match_map(
     """Find the pose of a local map in a global one, in a window or without a guess.
 
     The search sums scores of the local map's occupied cells in the likelihood field of the global map, and of its free
-    cells in the global map's free cells; branch and bound finds the poses of the largest sums exactly. Among these and
-    their neighbours, the pose has the largest correlation of both maps (*Probabilistic Robotics* equation 6.26), over
-    cells that both know.
+    cells in the global map's free cells; branch and bound finds the poses of the largest sums exactly. Among each of
+    these and its neighbours, the one with the largest correlation of both maps (*Probabilistic Robotics* equation
+    6.26), over cells that both know, is aligned to a fraction of a cell by least squares between the smoothed maps
+    (Lucas and Kanade 1981). The pose is the aligned one with the largest correlation.
 
     Args:
         local_grid: The local map; its resolution may differ.
@@ -129,7 +133,7 @@ def match_map(
     search = Search(ScoreTables(device, _scores(grid, backend=backend), levels=levels))
     slack = math.ceil(_DEPTH * TOP * len(local.points))
     found = search.find([local.points], searched, slack=slack, images=[local.images])
-    return _result(local, grid, searched, found, least)
+    return _result(local_grid, local, grid, searched, found, least)
 
 
 class _Local:
@@ -193,23 +197,26 @@ def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayL
     return PoseGrid.around(center, (int(reach[1]), int(reach[0])), math.ceil(half[2] / angle - 1e-9), angle)
 
 
-def _result(local: _Local, grid: OccupancyGrid, searched: PoseGrid, found: Found, least: float) -> MapMatch:
+def _result(
+    local_grid: OccupancyGrid, local: _Local, grid: OccupancyGrid, searched: PoseGrid, found: Found, least: float
+) -> MapMatch:
     """Return the match among the poses of a search and their neighbours."""
     poses = searched.poses(found, 1)
     chosen = _distinct(poses, grid.resolution)
     angle = float(np.diff(searched.headings[0]).max(initial=0.0))
     # The pose itself comes first and wins ties.
     steps = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1], [0, -1, 1], indexing="ij"), axis=-1).reshape(-1, 3)
-    best, values, overlaps = [], [], []
+    best = []
     for pose in poses[chosen]:
         near = pose + steps * [1, 1, angle]
         measured = np.array([_correlation(local, grid, each) for each in near])
         top = int(measured[:, 0].argmax())
         best.append(near[top])
-        values.append(measured[top, 0])
-        overlaps.append(measured[top, 1])
-    order = np.argsort(-np.array(values), kind="stable")
-    modes, correlations = _to_world(local, grid, np.array(best)[order]), np.array(values)[order]
+    alignment = Alignment(local_grid, local.xy, grid, np.array(best), _FARTHEST)
+    best = [alignment.refined(pose, _FARTHEST * angle) for pose in best]
+    values, overlaps = np.array([_correlation(local, grid, pose) for pose in best]).T
+    order = np.argsort(-values, kind="stable")
+    modes, correlations = _to_world(local, grid, np.array(best)[order]), values[order]
     rivals = correlations[1:] >= max(_RIVAL * correlations[0], least)
     status: Literal["found", "ambiguous", "no match"] = "found"
     if correlations[0] < least:

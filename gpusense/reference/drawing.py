@@ -83,11 +83,11 @@ def draw_particles(
         return
     index = n + int(settings[FIRST])
     start = start_of(settings, stage, index if settings[STRATIFIED] > 0.0 else np.zeros(1, np.uint64))
+    whole = settings[DRAWN] if settings[DRAWN] > 0.0 else float(drawn)
     if settings[STRATIFIED] == RESIDUAL:
-        certain = found_at(copies, n.astype(np.float64), particles)
-        rest = found_residual(ends, copies, start, own[TOTAL], particles, drawn)
-        chosen = np.where(n < copies[particles - 1], certain, rest)
+        certain = found_at(copies, index.astype(np.float64), particles)
+        rest = found_residual(ends, copies, start, own[TOTAL], particles, int(whole))
+        chosen = np.where(index < copies[particles - 1], certain, rest)
     else:
-        whole = settings[DRAWN] if settings[DRAWN] > 0.0 else float(drawn)
         chosen = found_at(ends, mark_of((index + start) / whole, own[TOTAL]), particles)
     draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)

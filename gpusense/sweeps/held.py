@@ -12,7 +12,7 @@ from gpusense.sweeps.worker import device_of
 _HELD: dict[str, Shard] = {}
 
 
-def hold(name: str, make: Callable[[str], Any], device: str, capacity: int) -> str:
+def hold(name: str, make: Callable[[str], Any], device: str, capacity: int, residual: bool) -> str:
     """Make a shard in this process, and return the name of its device.
 
     Args:
@@ -20,9 +20,10 @@ def hold(name: str, make: Callable[[str], Any], device: str, capacity: int) -> s
         make: Returns the models of a device.
         device: Selection string, where the worker has no device of its own.
         capacity: Most particles.
+        residual: Whether draws are those of residual resampling.
     """
     models = models_of(make, device_of(device))
-    _HELD[name] = Shard(models, capacity)
+    _HELD[name] = Shard(models, capacity, residual)
     return str(models[0].device.selection)
 
 

@@ -31,6 +31,7 @@ from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.sensors import Sensor
 from gpusense.reference.rungs import rung_of
+from gpusense.sweeps.gathered import Gathered
 from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
 
 # Units in the last place within which the product of two numbers reaches a neighbour of another product.
@@ -44,16 +45,16 @@ class Shard:
     Args:
         models: The filter's models on this device.
         capacity: Most particles of the shard.
+        residual: Whether draws are those of residual resampling.
     """
 
-    def __init__(self, models: Sequence[Any], capacity: int) -> None:
+    def __init__(self, models: Sequence[Any], capacity: int, residual: bool) -> None:
         self._sensors = [Sensor(model) for model in models]
         self._backend = self._sensors[0].backend
         self._cloud = Cloud(self._backend, max(capacity, 16), len(self._sensors), self._sensors[0].precision)
         self._part = Part(0, 0, 0, 16)
         self._settings = np.zeros(0)
-        # Capacity and buffers of particles that came from other shards.
-        self._gathered: tuple[int, Any, Any] = (0, None, None)
+        self._gathered, self._residual = Gathered(self._backend), residual
         # Ones, and numbers of a step whose only temperature is a sum of weights.
         self._ones: tuple[Any, Any] | None = None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
@@ -76,11 +77,6 @@ class Shard:
     def set_pool(self, poses: np.ndarray) -> Step:
         """Take over the poses from which recovery injects particles."""
         self._cloud.set_pool(poses)
-        yield
-
-    def set_state(self, state: np.ndarray) -> Step:
-        """Take over the state of the filter."""
-        self._backend.upload(state, self._cloud.state)
         yield
 
     # ---- a step
@@ -224,11 +220,9 @@ class Shard:
 
     def take(self, source: int, shards: Sequence[Shard]) -> Step:
         """Copy the particles of all shards from device to device."""
-        poses, ends = self._room(self._part.whole)
+        self._gathered.reserve(self._part.whole, self._part.whole)
         for one in shards:
-            first, count = one._part.first * _DOUBLE.itemsize, one._part.size * _DOUBLE.itemsize
-            self._backend.copy(one._cloud.poses[source], poses, 3 * count, to=3 * first)
-            self._backend.copy(one._cloud.ends, ends, count, to=first)
+            self._gathered.take(one._cloud.poses[source], one._cloud.ends, one._part.first, one._part.size)
         yield
 
     def reaches(self, other: Shard) -> bool:
@@ -245,34 +239,21 @@ class Shard:
             pieces: Poses and cumulative weights of shards in their order; True for those that the device has taken, and
                 False to copy the own ones.
         """
-        cloud, poses, ends, count = self._cloud, self._cloud.poses[source], self._cloud.ends, self._part.size
-        if pieces is True:
-            poses, ends = self._room(self._part.whole)
-            count = self._part.whole
-        elif pieces is not False:
-            gathered, sums = (np.ascontiguousarray(np.concatenate(one)) for one in zip(*pieces, strict=True))
-            poses, ends, count = self._gather(gathered, sums)
+        cloud, found = self._cloud, self._gathered
+        of: tuple[Any, Any, int] = cloud.poses[source], cloud.ends, self._part.size
+        if pieces is not False:
+            if pieces is not True:
+                found.upload(pieces, self._part.whole)
+            of = found.poses, found.ends, found.count
         if drawn.size:
             self._upload_settings(drawn)
-            self._backend.run(cloud.drawing((poses, ends, count), cloud.poses[1 - source], drawn.size, stage))
+            counting: Program = ()
+            copies = None
+            if self._residual and pieces is not False:
+                counting, copies = found.copies(cloud.state, drawn.whole, stage)
+            self._backend.run(counting + cloud.drawing(of, cloud.poses[1 - source], drawn.size, stage, copies))
         self._part, cloud.count, cloud.block = drawn, drawn.size, drawn.block
         yield
-
-    def _gather(self, poses: np.ndarray, ends: np.ndarray) -> tuple[Any, Any, int]:
-        """Return buffers with particles of all shards, and their number."""
-        buffers = self._room(len(ends))
-        for values, buffer in zip((poses, ends), buffers, strict=True):
-            self._backend.upload(values, buffer)
-        return *buffers, len(ends)
-
-    def _room(self, count: int) -> tuple[Any, Any]:
-        """Return buffers for poses and cumulative weights of particles of all shards."""
-        capacity, *buffers = self._gathered
-        if count > capacity:
-            capacity = count if count == self._part.whole else 2 * count
-            buffers = [self._backend.empty(size, _DOUBLE) for size in (3 * capacity, capacity)]
-            self._gathered = (capacity, *buffers)
-        return buffers[0], buffers[1]
 
     # ---- results
 

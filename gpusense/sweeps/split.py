@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,9 +27,8 @@ from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate
 from gpusense.reference.rungs import rung_of
 from gpusense.reference.weighing import join_rows, set_weights
-from gpusense.sweeps import held
-from gpusense.sweeps.parts import Given, Part, finished, parts_of
-from gpusense.sweeps.shard import Shard
+from gpusense.sweeps.parts import Given, Part, parts_of
+from gpusense.sweeps.teams import Here, There
 
 _PLAIN = frozenset[str]()
 _NONE = np.empty(0)
@@ -39,102 +36,29 @@ _NONE = np.empty(0)
 _PARTICLE = 32
 
 
-class Here:
-    """Shards in this process: one thread starts the work of all before it waits for the first.
-
-    Args:
-        models: Models of each shard.
-        capacity: Most particles of a shard.
-
-    Attributes:
-        devices: Selection strings of the devices.
-        direct: Whether particles go from device to device, and not through the host.
-    """
-
-    def __init__(self, models: Sequence[Sequence[Any]], capacity: int) -> None:
-        self._shards = [Shard(each, capacity) for each in models]
-        self.devices = [str(each[0].device.selection) for each in models]
-        self.direct = all(one.reaches(other) for one in self._shards for other in self._shards)
-
-    def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run a method of all shards, each with its own arguments, and return the results."""
-        steps = [getattr(one, method)(*own) for one, own in zip(self._shards, arguments, strict=True)]
-        for one in steps:
-            next(one)
-        return [finished(one) for one in steps]
-
-    def hand_on(self, source: int) -> None:
-        """Copy the particles of all shards to each, from device to device."""
-        self.each("take", [(source, self._shards)] * len(self._shards))
-
-    def close(self) -> None:
-        """Forget the shards."""
-        self._shards = []
-
-
-class There:
-    """Shards in other processes, each behind an executor of one worker.
-
-    Args:
-        executors: One for each shard; each must run all functions in the same process.
-        make: Function of a module that returns the models of a device.
-        devices: Selection strings, for workers that have no device of their own.
-        capacity: Most particles of a shard.
-
-    Attributes:
-        devices: Selection strings of the devices.
-        direct: False: particles go through this process.
-    """
-
-    direct = False
-
-    def __init__(
-        self, executors: Sequence[Executor], make: Callable[[str], Any], devices: Sequence[str], capacity: int
-    ) -> None:
-        self._executors = list(executors)
-        self._names = [secrets.token_hex(8) for _ in executors]
-        made = [
-            executor.submit(held.hold, name, make, device, capacity)
-            for executor, name, device in zip(executors, self._names, devices, strict=True)
-        ]
-        self.devices = [future.result() for future in made]
-
-    def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run a method of all shards, each with its own arguments, and return the results."""
-        running = [
-            executor.submit(held.call, name, method, *own)
-            for executor, name, own in zip(self._executors, self._names, arguments, strict=True)
-        ]
-        return [future.result() for future in running]
-
-    def hand_on(self, source: int) -> None:
-        """Refuse: the shards do not see one another."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Forget the shards."""
-        for executor, name in zip(self._executors, self._names, strict=True):
-            executor.submit(held.release, name).result()
-
-
 class SplitCloud(Cloud):
     """Particles over several shards, with the interface of the cloud of one device.
 
     A stage of a correction has two exchanges, of the largest score and of the sums of integer weights, and a third one
-    of particles where it draws: without jitter each shard gets the parents of its own particles, with jitter all.
+    of particles where it draws: without jitter each shard gets the parents of its own particles; with jitter, and in
+    residual resampling, all.
 
     Args:
         team: The shards.
         backend: Device of the estimates.
         capacity: Most particles of the filter.
         precision: Of log-likelihoods.
+        residual: Whether draws are those of residual resampling.
 
     Attributes:
         exchanged: Bytes of particles that were handed to shards.
     """
 
-    def __init__(self, team: Here | There, backend: Backend, capacity: int, precision: np.dtype) -> None:
+    def __init__(
+        self, team: Here | There, backend: Backend, capacity: int, precision: np.dtype, *, residual: bool = False
+    ) -> None:
         self.backend, self.capacity, self.precision, self._team = backend, capacity, precision, team
+        self._residual = residual
         self.shown, self.next, self.exchanged = 0, 0, 0
         # The filter sets it to zero when it begins; the state itself is on the host.
         self.state = backend.upload(np.zeros(STATE))
@@ -179,36 +103,26 @@ class SplitCloud(Cloud):
         self._all("begin", self._settings, kind, 0)
         self.shown = self.next
 
-    def step(self, kind: int, stages: int, drawn: int, given: Sequence[Given], *, early: bool) -> int:
-        """Run a correction, and return the number of particles drawn.
+    def step(self, kind: int, stages: int, drawn: int, given: Sequence[Given]) -> None:
+        """Run a correction.
 
         Args:
             kind: Kind of the motion that begins the step.
             stages: Most stages.
             drawn: Particles of the next step.
             given: Indices of sensors with their readings.
-            early: Whether the correction ends with the stage that leaves nothing, as where no step is recorded.
         """
         self._all("begin", self._settings, kind, len(given))
-        source, stage = self.next, 0
-        while True:
-            last = stage + 1 == stages
-            self._stage(source, (stage, stages), parts_of(drawn, self._size) if last else self._parts, given)
+        source = self.next
+        for stage in range(stages):
+            self._stage(source, (stage, stages), drawn, given)
             self.shown, self.next = source, 1 - source
-            done = self._numbers[stage * STAGE + LEFT] == 0.0
-            if last or (done and early):
-                return drawn if last else self.count
             source = 1 - source
-            if done:
-                # Stages that have nothing left only copy: one is enough, and it is the last.
-                rows = self._numbers[: stages * STAGE].reshape(stages, STAGE)
-                rows[stage + 1 :] = rows[stage]
-                self._all("set_state", self._numbers)
-                stage = stages - 2
-            stage += 1
+            if self._numbers[stage * STAGE + LEFT] == 0.0:
+                break
 
-    def _stage(self, source: int, place: tuple[int, int], drawn: list[Part], given: Any) -> None:
-        """Score and weigh the particles of a buffer, and draw into the other one."""
+    def _stage(self, source: int, place: tuple[int, int], last: int, given: Any) -> None:
+        """Score and weigh the particles of a buffer, and draw into the other one: ``last`` where nothing is left."""
         stage, state = place[0], self._numbers
         high = max(self._all("score", source, given))
         each = self._all("weigh", high, stage)
@@ -235,6 +149,7 @@ class SplitCloud(Cloud):
             1,
             *place,
         )
+        drawn = self._parts if state[stage * STAGE + LEFT] > 0.0 else parts_of(last, self._size)
         marks = self._marks(stage, drawn)
         offsets = np.cumsum([0.0, *(one[rung] for one in each[:-1])])
         shown = state.copy()
@@ -266,9 +181,9 @@ class SplitCloud(Cloud):
             raise RuntimeError("the weights of all particles are 0, so their number cannot change")
         if (own[RESAMPLED] == 0.0 and whole == self.count) or not total > 0.0:
             return None
-        if own[LEFT] > 0.0:
-            # Jitter takes differences of any two particles.
-            return [(0.0, total)] * self._size
+        if own[LEFT] > 0.0 or self._residual:
+            # Jitter takes differences of any two particles; the last residual draws may be of any particle.
+            return [(-1.0, total)] * self._size
         ends = [(part.first / whole, (part.first + part.size) / whole) for part in drawn]
         return [(float(mark_of(np.array(low), total)), float(mark_of(np.array(high), total))) for low, high in ends]
 

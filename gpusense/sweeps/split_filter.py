@@ -10,7 +10,8 @@ from gpusense._util import checks
 from gpusense.localization.filter import ParticleFilter
 from gpusense.sweeps.held import models_of
 from gpusense.sweeps.parts import parts_of
-from gpusense.sweeps.split import Here, SplitCloud, There
+from gpusense.sweeps.split import SplitCloud
+from gpusense.sweeps.teams import Here, There
 
 
 class SplitParticleFilter(ParticleFilter):
@@ -30,8 +31,7 @@ class SplitParticleFilter(ParticleFilter):
         **options: Options of :class:`ParticleFilter`.
 
     Raises:
-        TypeError, ValueError: an argument breaks its rule; see :class:`ParticleFilter`. Residual resampling cannot be
-            split.
+        TypeError, ValueError: an argument breaks its rule; see :class:`ParticleFilter`.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -65,24 +65,21 @@ class SplitParticleFilter(ParticleFilter):
             raise ValueError(f"executors: must be one for each of {len(devices)} devices, got {len(executors)}")
         models = models_of(make, devices[0])
         super().__init__(models, **options)
-        if self.options.resampling == "residual":
-            raise ValueError("resampling: must be 'systematic' or 'stratified' for a split filter, got 'residual'")
-        most, count = self.options.most, len(devices)
+        most, count, residual = self.options.most, len(devices), self.options.resampling == "residual"
         # Parts are whole blocks, whose number does not always divide by that of the shards.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)
         team: Here | There
         if executors is None:
-            team = Here([models, *(models_of(make, device) for device in devices[1:])], share)
+            team = Here([models, *(models_of(make, device) for device in devices[1:])], share, residual)
         else:
-            team = There(executors, make, devices, share)
-        self._cloud = SplitCloud(team, self._backend, most, self._sensors[0].precision)
+            team = There(executors, make, devices, share, residual)
+        self._cloud = SplitCloud(team, self._backend, most, self._sensors[0].precision, residual=residual)
 
     def __repr__(self) -> str:
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
 
-    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> int:
-        recorded = self._scoring.records(given)
-        return self._cloud.step(kind, self.options.stages, drawn, given, early=not recorded)
+    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> None:
+        self._cloud.step(kind, self.options.stages, drawn, given)
 
     @property
     def particles(self) -> Any:

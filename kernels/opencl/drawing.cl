@@ -53,13 +53,13 @@ kernel void draw_particles(global const double *source, global const double *wei
     }
     const uint index = (uint)settings[FIRST] + (uint)n;
     const double start = start_of(settings, stage, settings[STRATIFIED] > 0.0 ? index : 0);
+    const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn, at = (double)index;
     int chosen;
     if (settings[STRATIFIED] == RESIDUAL) {
-        chosen = (double)n < copies[particles - 1] ? found_at(copies, (double)n, particles)
-                                                   : found_residual(ends, copies, start, own[TOTAL], particles, drawn);
+        chosen = at < copies[particles - 1] ? found_at(copies, at, particles)
+                                            : found_residual(ends, copies, start, own[TOTAL], particles, (int)whole);
     } else {
-        const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
-        chosen = found_at(ends, mark_of(((double)index + start) / whole, own[TOTAL]), particles);
+        chosen = found_at(ends, mark_of((at + start) / whole, own[TOTAL]), particles);
     }
     draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen);
 }

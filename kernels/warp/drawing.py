@@ -106,6 +106,7 @@ def make(name, flags):
             copy_particle(source, weight, settings, total, target, after, particles, n)
             return
         index = wp.uint32(settings[FIRST]) + wp.uint32(n)
+        at = wp.float64(index)
         whole = wp.where(settings[DRAWN] > ZERO, settings[DRAWN], wp.float64(drawn))
         first = wp.uint32(0)
         if settings[STRATIFIED] > ZERO:
@@ -113,12 +114,12 @@ def make(name, flags):
         start = start_of(settings, stage, first)
         chosen = int(0)
         if settings[STRATIFIED] == RESIDUAL:
-            if wp.float64(n) < copies[particles - 1]:
-                chosen = found_at(copies, wp.float64(n), particles)
+            if at < copies[particles - 1]:
+                chosen = found_at(copies, at, particles)
             else:
-                chosen = found_residual(ends, copies, start, total, particles, drawn)
+                chosen = found_residual(ends, copies, start, total, particles, wp.int32(whole))
         else:
-            chosen = found_at(ends, mark_of((wp.float64(index) + start) / whole, total), particles)
+            chosen = found_at(ends, mark_of((at + start) / whole, total), particles)
         draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)
 
     return {"count_copies": count_copies, "set_copies": set_copies, "draw_particles": draw_particles}[name]

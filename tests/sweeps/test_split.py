@@ -22,6 +22,8 @@ OPTIONS = [
     dict(particles=(200, 600), stages=2),
     dict(particles=(300, 9000), stages=2),
     dict(recovery="augmented", particles=401),
+    dict(resampling="residual"),
+    dict(particles=(200, 600), stages=1, resampling="residual", threshold=1.0),
 ]
 
 
@@ -57,10 +59,12 @@ def test_few_particles_leave_a_device_idle():
     assert equal(states(pf), expected) and pf.explain() == "split: 0 on numpy, 16 on numpy, 0 on numpy, 4 on numpy"
 
 
-@pytest.mark.parametrize("stages", [1, 3])
-def test_gpus_have_the_particles_of_one(warp_as_gpu, stages):
-    expected = states(gs.ParticleFilter(field("warp:cpu"), particles=400, seed=5, stages=stages))
-    pf = SplitParticleFilter(field, devices=["warp:cpu"] * 2, particles=400, seed=5, stages=stages)
+@pytest.mark.parametrize(
+    "options", [dict(stages=1), dict(stages=3), dict(stages=2, resampling="residual")], ids=["1", "3", "residual"]
+)
+def test_gpus_have_the_particles_of_one(warp_as_gpu, options):
+    expected = states(gs.ParticleFilter(field("warp:cpu"), particles=400, seed=5, **options))
+    pf = SplitParticleFilter(field, devices=["warp:cpu"] * 2, particles=400, seed=5, **options)
     found = states(pf)
     # Particles went from device to device, and none through the host.
     assert pf._cloud._team.direct and pf.exchanged % (400 * 32) == 0 < pf.exchanged
@@ -72,11 +76,6 @@ def test_gpus_weigh_by_several_sensors(warp_as_gpu):
     expected = states(gs.ParticleFilter(field_and_compass("warp:cpu"), particles=300, seed=5), 2)
     pf = SplitParticleFilter(field_and_compass, devices=["warp:cpu"] * 2, particles=300, seed=5)
     assert equal(states(pf, 2), expected)
-
-
-def test_residual_draws_cannot_be_split():
-    with pytest.raises(ValueError, match="resampling: must be 'systematic' or 'stratified'"):
-        SplitParticleFilter(field, devices=["numpy"] * 2, particles=100, resampling="residual")
 
 
 def test_shares_are_whole_blocks():

@@ -21,12 +21,13 @@ kernel void draw_particles(global const double *source, global const double *wei
         }
         const uint index = (uint)settings[FIRST] + (uint)n;
         if (stratified) start = start_of(settings, stage, index);
+        const double at = (double)index;
         if (residual) {
-            chosen = (double)n < copies[particles - 1]
-                         ? found_at(copies, (double)n, particles)
-                         : found_residual(ends, copies, start, own[TOTAL], particles, drawn);
+            chosen = at < copies[particles - 1]
+                         ? found_at(copies, at, particles)
+                         : found_residual(ends, copies, start, own[TOTAL], particles, (int)whole);
         } else {
-            const double mark = mark_of(((double)index + start) / whole, own[TOTAL]);
+            const double mark = mark_of((at + start) / whole, own[TOTAL]);
             if (n == first) chosen = found_at(ends, mark, particles);
             while (chosen < particles - 1 && !(ends[chosen] > mark)) chosen++;
         }

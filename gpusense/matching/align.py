@@ -1,0 +1,117 @@
+"""Alignment of two maps to a fraction of a cell: least squares between their smoothed cells (Lucas and Kanade 1981).
+
+Both maps are smoothed over the cells that they know, m = (G * occupied) / (G * known) with a normal density G. The pose
+minimises the mean of (m(T p) - m_local(p))^2 over the known cells p of the local map that lie near its obstacles, by
+Levenberg's damped Gauss-Newton steps. m is interpolated between the centres of cells.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gpusense.world.grid import OccupancyGrid
+
+# Deviation of the smoothing [cells of the global map], its reach in deviations, and least share of known cells.
+_SIGMA, _REACH, _KNOWN = 1.0, 3.0, 1e-3
+# Most cells of the local map, iterations, and the step that ends them [cells, and cells at the mean lever].
+_MOST, _ITERATIONS, _SMALL = 20_000, 20, 1e-4
+
+
+def smoothed(occupied: np.ndarray, known: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the shares of occupied cells among the known ones around each cell; 0 where none is known.
+
+    Args:
+        occupied: (H, W) bool.
+        known: (H, W) bool.
+        sigma: Deviation of the weights [cells].
+    """
+    offsets = np.arange(-math.ceil(_REACH * sigma), math.ceil(_REACH * sigma) + 1)
+    weights = np.exp(-0.5 * (offsets / sigma) ** 2)
+    top, bottom = (_convolved(_convolved(image, weights).T, weights).T for image in (occupied & known, known))
+    return np.divide(top, bottom, out=np.zeros_like(top), where=bottom > _KNOWN * weights.sum() ** 2)
+
+
+def _convolved(image: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return weighted sums over the rows near each row, with zeros beyond the image."""
+    reach = len(weights) // 2
+    padded = np.pad(image.astype(np.float64), ((reach, reach), (0, 0)))
+    return sum(weight * padded[k : k + len(image)] for k, weight in enumerate(weights))  # type: ignore[return-value]
+
+
+class Alignment:
+    """A local map that is aligned with a global one.
+
+    Args:
+        local: The local map.
+        xy: (M, 2) centres of the local map's known cells, row by row, around its middle [cells of the global map].
+        grid: The global map.
+        poses: (M, 3) poses of the local map's middle that will be refined [cells, cells, rad].
+        farthest: Largest distance from these [cells].
+    """
+
+    def __init__(
+        self, local: OccupancyGrid, xy: np.ndarray, grid: OccupancyGrid, poses: np.ndarray, farthest: float
+    ) -> None:
+        ratio = grid.resolution / local.resolution
+        values = smoothed(local.occupied, ~local.unknown, _SIGMA * ratio)[~local.unknown]
+        near = np.flatnonzero(values)
+        near = near if len(near) <= _MOST else near[np.arange(_MOST) * len(near) // _MOST]
+        self._xy, self._values = xy[near], values[near]
+        self._lever = max(float(np.sqrt(np.mean(self._xy**2))), 1.0)
+        self._farthest = farthest
+        # Only the part of the map that the cells reach.
+        reach = float(np.hypot(*self._xy.T).max()) + farthest + _REACH * _SIGMA + 2
+        low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
+        first, end = (np.clip(np.round(edge), 0, grid.shape[::-1]).astype(int) for edge in (low, high))
+        part = slice(first[1], end[1]), slice(first[0], end[0])
+        # A margin, so that cells at the border of the map have neighbours on all sides.
+        occupied, self._known = (np.pad(image[part], 1) for image in (grid.occupied, ~grid.unknown))
+        self._corner, self._map = first - 1, smoothed(occupied, self._known, _SIGMA)
+
+    def refined(self, pose: np.ndarray, most: float) -> np.ndarray:
+        """Return the best pose near a pose, or that pose itself if the other is too far away.
+
+        Args:
+            pose: (3,) pose of the local map's middle in the global map's frame [cells, cells, rad].
+            most: Largest turn [rad].
+        """
+        at, damping = pose.astype(np.float64), 1e-3
+        value, gradient, information = self._evaluated(at)
+        for _ in range(_ITERATIONS):
+            diagonal = damping * information.diagonal() + 1e-9 * (1 + information.diagonal().max())
+            step = np.linalg.solve(information + np.diag(diagonal), -gradient)
+            trial = at + step
+            new = self._evaluated(trial)
+            if better := new[0] < value:
+                at, (value, gradient, information) = trial, new
+            damping = min(max(damping / 5 if better else damping * 8, 1e-6), 1e6)
+            if max(np.abs(step[:2]).max(), self._lever * abs(step[2])) < _SMALL:
+                break
+        moved = at - pose
+        return at if math.hypot(*moved[:2]) <= self._farthest and abs(moved[2]) <= most else pose
+
+    def _evaluated(self, pose: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the mean squared difference at a pose, half its gradient, and the mean information."""
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        x, y = self._xy.T
+        turned = np.stack([cos * x - sin * y, sin * x + cos * y])
+        # Cell (row, col) has its centre at (col + 0.5, row + 0.5).
+        u, v = turned + (pose[:2] - self._corner - 0.5)[:, None]
+        rows, cols = self._map.shape
+        col, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+        inside = np.flatnonzero((col >= 0) & (col + 1 < cols) & (row >= 0) & (row + 1 < rows))
+        nearest = np.floor(v[inside] + 0.5).astype(np.int64), np.floor(u[inside] + 0.5).astype(np.int64)
+        inside = inside[self._known[nearest]]
+        if len(inside) < 3:
+            return math.inf, np.zeros(3), np.zeros((3, 3))
+        col, row = col[inside], row[inside]
+        a, b = u[inside] - col, v[inside] - row
+        m00, m01, m10, m11 = (self._map[row + i, col + j] for i in (0, 1) for j in (0, 1))
+        error = (1 - b) * ((1 - a) * m00 + a * m01) + b * ((1 - a) * m10 + a * m11) - self._values[inside]
+        along = (1 - b) * (m01 - m00) + b * (m11 - m10)
+        up = (1 - a) * (m10 - m00) + a * (m11 - m01)
+        jacobian = np.stack([along, up, up * turned[0, inside] - along * turned[1, inside]], axis=1)
+        count = len(inside)
+        return float(error @ error) / count, jacobian.T @ error / count, jacobian.T @ jacobian / count

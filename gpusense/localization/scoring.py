@@ -10,7 +10,8 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.launches import Program
-from gpusense.localization.cloud import Cloud, Stage
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
 # Programs of scores that are kept.

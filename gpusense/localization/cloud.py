@@ -59,7 +59,12 @@ class Cloud(Particles):
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
         residual: Whether draws are those of residual resampling.
+
+    Attributes:
+        moved: Whether the motion of the last correction was started.
     """
+
+    moved = False
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
@@ -111,7 +116,7 @@ class Cloud(Particles):
             score: Runs the launches of a stage: the motion of the first one, the log-likelihoods, and the weighing.
         """
         self.use(sensors)
-        source = self.next
+        self.moved, source = False, self.next
         for number in range(stages):
             last = number + 1 == stages
             stage = Stage(source, number, stages, drawn if last else 0, None if number else kind)
@@ -123,6 +128,11 @@ class Cloud(Particles):
             if last:
                 break
             source = 1 - source
+
+    def begin(self, kind: int) -> None:
+        """Start the motion of a correction."""
+        self.moved = True
+        self.backend.run(self.motion(kind))
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
@@ -147,6 +157,7 @@ class Cloud(Particles):
             move = () if stage.kind is None else self.motion(stage.kind)
             program, owners = scoring(stage.source)
             self._recordings[whole] = self.backend.record(move + program + self.weighing(stage)), owners
+        self.moved = True
         self._recordings[whole][0]()
 
     def explain(self) -> str:

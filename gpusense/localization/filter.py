@@ -247,7 +247,13 @@ class ParticleFilter:
         motion, self._pending = self._pending, _STILL
         drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
         self._cloud.upload_settings(self._settings(motion, [index for index, _ in given]))
-        self._score(given, motion.kind, drawn)
+        self._cloud.moved = False
+        try:
+            self._score(given, motion.kind, drawn)
+        except BaseException:
+            # Readings that a model refuses cost no motion.
+            self._pending = self._pending if self._cloud.moved else motion
+            raise
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
         self._last = whole

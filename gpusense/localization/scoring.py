@@ -85,10 +85,10 @@ class Scoring:
     def _called(self, given: Sequence[Given], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
         poses, cloud = self._poses(stage.source), self._cloud
-        before = () if stage.kind is None else cloud.motion(stage.kind)
+        before = None if stage.kind is None else functools.partial(cloud.begin, stage.kind)
         for place, (index, reading) in enumerate(given):
-            self._sensors[index].score(poses, reading, self._log_p(place), before, timed=self.timed)
-            before = ()
+            self._sensors[index].score(poses, reading, self._log_p(place), before=before, timed=self.timed)
+            before = None
         cloud.weigh(stage)
 
     def _recorded(self, given: Sequence[Given], stage: Stage) -> None:

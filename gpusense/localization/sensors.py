@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -70,26 +71,35 @@ class Sensor:
         """Return the log-likelihoods of poses."""
         return self.model.log_likelihood(poses, *reading)
 
-    def score(self, poses: Any, reading: tuple[Any, ...], out: Any, before: Program, *, timed: bool) -> None:
+    def score(
+        self,
+        poses: Any,
+        reading: tuple[Any, ...],
+        out: Any,
+        *,
+        before: Callable[[], None] | None = None,
+        timed: bool = False,
+    ) -> None:
         """Write the log-likelihoods of poses on the device; those of scans are there once its work has ended.
 
         Args:
             poses: (N, 3) poses on the device.
             reading: The reading.
             out: (N,) array on the device.
-            before: Launches that write the poses.
+            before: Called before poses are read, to start the launches that write them.
             timed: Wait for them, and add their time to ``seconds``.
         """
         begin = time.perf_counter()
         if self.calibrates:
-            self.model.start(poses, *reading, out=out, before=before)
+            self.model.start_scoring(poses, *reading, out=out, before=before)
             self._started += 1
             # Arrays that it reads stay alive until then.
             if timed or self._started >= _MOST_STARTED:
-                self.model.finish()
+                self.model.finish_scoring()
                 self._started = 0
         else:
-            self.backend.run(before)
+            if before is not None:
+                before()
             self.model.log_likelihood(poses, *reading, out=out)
         self.seconds += time.perf_counter() - begin
 

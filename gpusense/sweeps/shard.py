@@ -112,7 +112,7 @@ class Shard:
             self._recorded(source, given)()
         else:
             for place, (index, reading) in enumerate(given):
-                self._sensors[index].score(self._poses(source), reading, self._scores(place), (), timed=False)
+                self._sensors[index].score(self._poses(source), reading, self._scores(place))
             self._backend.run(cloud.scoring(len(given)))
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())

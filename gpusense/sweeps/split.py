@@ -112,6 +112,7 @@ class SplitCloud(Cloud):
             drawn: Particles of the next step.
             given: Indices of sensors with their readings.
         """
+        self.moved = True
         self._all("begin", self._settings, kind, len(given))
         source = self.next
         for stage in range(stages):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
+from gpusense.interface.constants import FIRST, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.temperature import BeamCorrelation
 from gpusense.models.landmark.model import LandmarkModel
@@ -21,6 +22,7 @@ from gpusense.models.scan.model import ScanModel
 _DOUBLE = np.dtype(np.float64)
 # Calls that are started before one waits.
 _MOST_STARTED = 64
+_MOST_SENSORS = FIRST - TEMPERATURE
 
 
 class Sensor:
@@ -136,3 +138,28 @@ class Sensor:
         if not isinstance(call, DeviceCall):
             raise RuntimeError(f"the model's call cannot be recorded: {call.explain()}")
         return call.program, (call, ranges)
+
+
+def sensors_of(models: Any) -> list[Sensor]:
+    """Return the sensors of models, all of one device and one precision.
+
+    Args:
+        models: A measurement model, or several.
+
+    Raises:
+        TypeError: another object.
+        ValueError: none, too many, of several devices or precisions, or of a device without float64.
+    """
+    chosen = list(models) if isinstance(models, Sequence) else [models]
+    if not 0 < len(chosen) <= _MOST_SENSORS:
+        raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
+    sensors = [Sensor(model) for model in chosen]
+    backend = sensors[0].backend
+    if any(sensor.backend is not backend for sensor in sensors):
+        names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))
+        raise ValueError(f"models: must be of one device, got {names}")
+    if len({sensor.precision for sensor in sensors}) > 1:
+        raise ValueError("models: must have one precision, got float32 and float64")
+    if not backend.info.float64:
+        raise ValueError(f"models: must be on a device with float64, got {backend.info.name}")
+    return sensors

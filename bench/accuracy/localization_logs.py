@@ -45,23 +45,28 @@ def makers(kind, backend, beams):
     return make
 
 
-def wean(backend, seeds, scans=300):
+def wean(backend, seeds):
     """Return where starts anywhere on wean_hall's map end, and their verdicts."""
     folder, rows = recordings.data() / "wean_hall", []
     grid = gs.read_map(folder / "wean_10cm.yaml")
     for log in ("robotdata1", "robotdata4", "robotdata5"):
-        steps = read_steps(folder / f"{log}.log.gz", limit=scans)
+        steps = read_steps(folder / f"{log}.log.gz")
         model = recordings.field(backend, beams=60)(grid, steps[0].scan.scanner)
         for seed in range(seeds):
             pf = gs.ParticleFilter(model, particles=DEFAULTS.particles_everywhere, seed=seed)
             pf.initialize_uniform()
+            estimates = []
             for before, step in zip([None, *steps], steps, strict=False):
                 if before is not None:
                     pf.predict(before.odometry, step.odometry)
                 pf.correct(step.scan.ranges)
-            found = pf.estimate()
-            row = dict(log=log, seed=seed, scans=len(steps), pose=found.pose.round(2).tolist(), lost=found.lost,
-                       explained=round(float(found.explained), 3))  # fmt: skip
+                estimates.append(pf.estimate())
+            found, said = estimates[-1], np.array([one.lost for one in estimates])
+            row = dict(
+                log=log, seed=seed, scans=len(steps), pose=found.pose.round(2).tolist(), lost=found.lost,
+                explained=round(float(found.explained), 3), said_lost=round(float(said.mean()), 3),
+                at={k: estimates[k].pose.round(2).tolist() for k in range(100, len(steps), 100)},
+            )  # fmt: skip
             print(row, flush=True)
             rows.append(row)
     return rows

@@ -130,6 +130,9 @@ class ParticleFilter(Results):
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
 
+        Without bounds and another ``recovery``, half of the particles are placed anew, as by :meth:`reset`, where they have
+        converged to a pose that scans contradict.
+
         Args:
             bounds: ((x_min, y_min), (x_max, y_max)) [m]: only there. Needed for models without a grid.
             particles: Their number; the filter's (most) by default.
@@ -161,13 +164,14 @@ class ParticleFilter(Results):
         most = self.options.most
         return most if particles is None else checks.integer("particles", particles, low=1, high=most)
 
-    def _place(self, poses: np.ndarray) -> None:
-        """Replace all particles, and forget what was learned about the likelihood of scans."""
+    def _place(self, poses: np.ndarray, *, again: bool = False) -> None:
+        """Replace all particles, and forget the likelihood of scans; a search again keeps the judgements of poses."""
         self._cloud.place(poses)
         self._shown, self._started, self._pending, self._wide = len(poses), True, _STILL, 0
-        self._trust = None
         self._backend.upload(np.zeros(STATE), self._cloud.state)
-        self._verdict.reset()
+        if not again:
+            self._verdict.reset()
+            self._trust = None
         if self.options.recovery == "augmented" and not self._pool[0]:
             self._set_pool(*starts.free_pool([sensor.model for sensor in self._sensors], None))
 
@@ -275,9 +279,7 @@ class ParticleFilter(Results):
         chosen = starts.spread(tries[best], (0.1, 0.1, 0.05), count, self._key(), each=True)
         kept = self._cloud.host_poses(self._cloud.next, self._cloud.count)
         kept[:: max(len(kept) // count, 1)][:count] = chosen[: len(kept[:: max(len(kept) // count, 1)][:count])]
-        trust = self._trust
-        self._place(kept)
-        self._trust = trust
+        self._place(kept, again=True)
 
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""

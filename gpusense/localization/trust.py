@@ -1,6 +1,6 @@
 """Trust in the pose that a start anywhere on the map has found.
 
-Such a start may end at a wrong place: where the robot begins, the map may have changed, or another place may look alike.
+Such a start may end at a wrong place: another place may look alike, or the map may have changed where the robot begins.
 So a converged pose is trusted as far as the robot has moved with it while the scans agreed. Where they contradict it,
 trust falls as the robot moves, and without trust the search is repeated.
 """

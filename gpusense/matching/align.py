@@ -37,7 +37,10 @@ def _convolved(image: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return weighted sums over the rows near each row, with zeros beyond the image."""
     reach = len(weights) // 2
     padded = np.pad(image.astype(np.float64), ((reach, reach), (0, 0)))
-    return sum(weight * padded[k : k + len(image)] for k, weight in enumerate(weights))  # type: ignore[return-value]
+    total = np.zeros(image.shape)
+    for k, weight in enumerate(weights):
+        total += weight * padded[k : k + len(image)]
+    return total
 
 
 class Alignment:

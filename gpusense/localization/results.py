@@ -93,6 +93,11 @@ class Results(ABC):
         return numbers[:3].copy(), covariance_of(numbers)
 
     @property
+    def models(self) -> tuple[Any, ...]:
+        """The measurement models, in the order of ``temperatures``."""
+        return tuple(sensor.model for sensor in self._sensors)
+
+    @property
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""
         return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)

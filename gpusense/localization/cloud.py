@@ -18,6 +18,7 @@ from gpusense.interface.constants import (
     DEGENERATE,
     ESTIMATE,
     LEFT,
+    MOMENTS,
     RUNG,
     SAMPLE_SIZE,
     STAGE,
@@ -194,6 +195,14 @@ class Cloud(Particles):
                                     particles=count)  # fmt: skip
         self.backend.run(program)
         return self.backend.lend(out, (count,), _DOUBLE)
+
+    def moments(self, count: int) -> Any:
+        """Return mean and covariance of the shown particles as an array of the device's library."""
+        out = self.backend.blank(ESTIMATE, _DOUBLE)
+        for again in (0, 1):
+            # The second pass is right for any headings.
+            self.backend.run(self.sums.estimate(self.poses[self.shown], self.weight, out, count, again))
+        return self.lent(out, (MOMENTS,))
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""

@@ -11,6 +11,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
 from gpusense.backends.base import Backend
+from gpusense.interface.constants import MOMENTS
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.options import Options
@@ -160,6 +161,15 @@ class Results(ABC):
         self._check_started()
         self.flush()
         return self._cloud.shares(self._shown) if self._backend.info.kind == "gpu" else self.host_weights()
+
+    @property
+    def moments(self) -> Any:
+        """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt: on a GPU an array of the device."""
+        self._check_started()
+        self.flush()
+        if self._backend.info.kind == "gpu":
+            return self._cloud.moments(self._shown)
+        return self._cloud.estimate(self._shown)[:MOMENTS]
 
     def _array(self, buffer: Any, shape: tuple[int, ...]) -> Any:
         if self._backend.info.kind == "gpu":

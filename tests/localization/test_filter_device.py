@@ -89,6 +89,11 @@ def test_particles_of_a_gpu_are_arrays_of_the_device(warp_as_gpu):
     assert particles.ptr == pf.particles.ptr
     np.testing.assert_array_equal(particles.numpy(), pf.host_particles())
     np.testing.assert_allclose(weights.numpy(), pf.host_weights(), rtol=1e-14)
+    mean, covariance = pf.mean_and_covariance()
+    assert isinstance(pf.moments, wp.array) and pf.moments.shape == (9,)
+    found = pf.moments.numpy()
+    np.testing.assert_array_equal(found[:3], mean)
+    np.testing.assert_allclose(found[3:], covariance[np.triu_indices(3)], rtol=1e-9, atol=1e-15)
 
 
 def test_a_gpu_tracks_as_a_processor_does(warp_as_gpu, monkeypatch):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from gpusense.backends import Backend, arrays, get_backend
+from gpusense.backends.base import Adopted
 
 # Failed assertions of helpers show their values, as those of tests do.
 pytest.register_assert_rewrite("support")
@@ -129,7 +130,7 @@ def warp_as_gpu(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) ->
     import warp as wp
 
     installed(monkeypatch)
-    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
+    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array, Adopted)))
     found = get_backend("warp:cpu")
     monkeypatch.setattr(found, "info", dataclasses.replace(found.info, kind="gpu", lanes=1))
     return found

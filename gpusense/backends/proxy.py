@@ -91,6 +91,10 @@ class Proxy(Backend):
         """See Backend.adopt."""
         return self._backend.adopt(array, name, in_place=in_place)
 
+    def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:
+        """See Backend.view."""
+        return self._backend.view(buffer, shape, dtype)
+
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.blank."""
         return self._backend.blank(count, dtype)

@@ -64,6 +64,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--parameters", "--params", type=Path, metavar="YAML",
         help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes (default: a likelihood "
         "field, and the noise below)")  # fmt: skip
+    add(
+        "--sensors",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="lasers that correct the filter: topics of a bag, front or rear of a CARMEN log (default: its main laser)",
+    )
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: learned from the scans")
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
@@ -97,7 +104,9 @@ def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C those so far."""
     from gpusense.evaluation.tracking import Track, follow, read_steps, start
 
-    steps = read_steps(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
+    steps = read_steps(
+        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, sensors=args.sensors
+    )
     pf = _filter(args, steps)
     start(pf, steps, everywhere=args.everywhere)
     track, recording = Track(), _recording(args, pf)
@@ -132,7 +141,7 @@ def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None
 
 
 def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
-    """Make the filter and its model.
+    """Make the filter, with a model for each laser.
 
     Raises:
         ValueError: an option breaks its rule, a file its format, or the backend is absent.
@@ -144,18 +153,23 @@ def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
     from gpusense.world.map_files import read_map
     from gpusense.world.parameters import LikelihoodFieldParameters
 
-    grid, scanner = read_map(args.map), steps[0].scan.scanner
+    grid = read_map(args.map)
+    scanners = {step.sensor: step.scan.scanner for step in steps}
+    for sensor, name in enumerate(args.sensors):
+        if sensor not in scanners:
+            raise ValueError(f"--sensors: must have scans that are chosen, got none of {name}")
     beams = DEFAULTS.beams if args.beams is None else args.beams
-    model: Any
     beam, noise = (None, {}) if args.parameters is None else read_localization(args.parameters)
-    if beam is not None:
-        model = BeamModel(grid, scanner, beam, beams=beams, backend=args.backend)
-    else:
-        field = LikelihoodFieldParameters(**DEFAULTS.field)
-        model = LikelihoodFieldModel(grid, scanner, field, beams=beams, backend=args.backend)
+    field = LikelihoodFieldParameters(**DEFAULTS.field)
+    models: list[Any] = [
+        LikelihoodFieldModel(grid, scanners[sensor], field, beams=beams, backend=args.backend)
+        if beam is None
+        else BeamModel(grid, scanners[sensor], beam, beams=beams, backend=args.backend)
+        for sensor in sorted(scanners)
+    ]
     particles = DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles
     return ParticleFilter(
-        model, motion=_motion(args, steps, noise), particles=particles if args.particles is None else args.particles,
+        models, motion=_motion(args, steps, noise), particles=particles if args.particles is None else args.particles,
         seed=args.seed, temperature=args.temperature, recovery=args.recovery, beam_skip=args.beam_skip,
     )  # fmt: skip
 

@@ -18,7 +18,9 @@ from gpusense.evaluation.coverage import REGIONS, coverage_report, rank_of
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
-from gpusense.logs import Odometry, Pose, Scan, read_log
+from gpusense.logs import Odometry, Pose, Scan
+from gpusense.logs.several import read_lasers
+from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 # A track has converged where the next scans are within these of the truth [m, rad].
@@ -35,11 +37,13 @@ class Step:
         index: Index of the scan in the log.
         scan: It.
         odometry: Pose by raw odometry alone [m, m, rad].
+        sensor: Index of its laser.
     """
 
     index: int
     scan: Scan
     odometry: Pose
+    sensor: int = 0
 
 
 def read_steps(
@@ -49,6 +53,7 @@ def read_steps(
     every: int = 1,
     offset: int = 0,
     limit: int | None = None,
+    sensors: Sequence[str] = (),
 ) -> list[Step]:
     """Read scans of a log with raw odometry.
 
@@ -58,18 +63,20 @@ def read_steps(
     Args:
         path: The log.
         range_max: Readings of at least this are "no return" [m]; None for the log's.
-        every: Stride of the scans.
-        offset: Index of the first scan.
+        every: Stride of the scans of each laser.
+        offset: Index of the first scan of each laser.
         limit: Largest number of scans; None for all.
+        sensors: Its lasers: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
 
     Raises:
-        ValueError: the log breaks its format, has no scan of these, or scans of several scanners.
+        ValueError: the log breaks its format, has no scan of these, or a laser changes its geometry.
         FileNotFoundError: the log is missing.
     """
     chained, last, between = np.zeros(3), None, None
     steps: list[Step] = []
-    count = 0
-    for record in read_log(path, range_max=range_max, odometry=True):
+    counts = [0] * max(len(sensors), 1)
+    scanners: dict[int, Scanner] = {}
+    for sensor, record in read_lasers(path, sensors, range_max=range_max):
         if isinstance(record, Odometry):
             between = record.pose
             continue
@@ -78,11 +85,12 @@ def read_steps(
             after = between if copied and between is not None else record.odometry
             chained = compose_poses(chained, pose_difference(last.odometry, after))
         last, between = record, None
+        count = counts[sensor]
         if count >= offset and (count - offset) % every == 0 and (limit is None or len(steps) < limit):
-            if steps and record.scanner != steps[0].scan.scanner:
+            if record.scanner != scanners.setdefault(sensor, record.scanner):
                 raise ValueError(f"log: every scan must come from the same scanner, got another at scan {count}")
-            steps.append(Step(count, record, (float(chained[0]), float(chained[1]), float(chained[2]))))
-        count += 1
+            steps.append(Step(count, record, (float(chained[0]), float(chained[1]), float(chained[2])), sensor))
+        counts[sensor] += 1
     if not steps:
         raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")
     return steps
@@ -160,7 +168,7 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
             pf.flush()
         times.append(time.perf_counter())
         before = pf.scoring_seconds
-        pf.correct(step.scan.ranges)
+        pf.correct({pf.models[step.sensor]: step.scan.ranges})
         times.append(time.perf_counter())
         scoring = pf.scoring_seconds - before
         found = pf.estimate()

@@ -71,4 +71,4 @@ STATE = 64
 # Kernel file estimate: sums of a block, numbers of an estimate (pose, covariance by rows of its upper half, the sum of
 # weights, and 1 where headings are too far apart for one pass), and lanes of a block.
 ESTIMATE_SUMS, ESTIMATE, ESTIMATE_LANES = 13, 11, 8
-WIDE_HEADINGS = 10
+MOMENTS, WIDE_HEADINGS = 9, 10

@@ -1,7 +1,7 @@
-"""The particles of a filter on their device, and the programs of its steps.
+"""The cloud of a filter: its particles, the steps that change them, and what of it crosses to the host.
 
-Two buffers hold poses: a stage of a correction scores and weighs those of one, and draws those of the other. On a GPU a
-step is one recorded program; a processor runs the launches one by one, and stops when no temperature is left.
+A correction has stages until no temperature is left. On a GPU motion, scores and weights of a stage are one recorded
+program.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from gpusense.interface.constants import (
     DEGENERATE,
     ESTIMATE,
     LEFT,
+    MOMENTS,
     RUNG,
     SAMPLE_SIZE,
-    SETTINGS,
     STAGE,
     STATE,
     WIDE_HEADINGS,
 )
-from gpusense.interface.flags import flags_if
-from gpusense.interface.launches import Program, launch
-from gpusense.localization.sums import Sums, weight_block
+from gpusense.interface.launches import Program
+from gpusense.localization.particles import Particles, Stage
+from gpusense.localization.sums import weight_block
 
 _DOUBLE = np.dtype(np.float64)
+_MOST_RECORDED = 32
 
 
 class Summary(NamedTuple):
@@ -50,8 +51,8 @@ class Summary(NamedTuple):
     numbers: np.ndarray
 
 
-class Cloud:
-    """Particles and weights on a device.
+class Cloud(Particles):
+    """Particles whose steps are recorded.
 
     Args:
         backend: The device.
@@ -61,46 +62,18 @@ class Cloud:
         residual: Whether draws are those of residual resampling.
 
     Attributes:
-        count: Particles.
-        shown: Index of the buffer with the weighted poses.
-        next: Index of the buffer with the poses of the next step.
+        moved: Whether the motion of the last correction was started.
     """
+
+    moved = False
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
     ) -> None:
-        self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
-        self.count, self.shown, self.next = capacity, 0, 0
-        self.block = weight_block(backend, capacity)
-        # Memory that a processor shares with the host is not lent.
-        make = backend.blank if backend.info.kind == "gpu" else backend.empty
-        self.poses = [make(3 * capacity, _DOUBLE) for _ in range(2)]
-        self.weight, self.before = make(capacity, _DOUBLE), make(capacity, _DOUBLE)
-        self.log_p = [make(capacity, precision) for _ in range(sensors)]
-        self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
-        self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
-        self.settings, self.state = backend.empty(SETTINGS, _DOUBLE), backend.upload(np.zeros(STATE))
-        self.pool = backend.upload(np.zeros(3))
-        # Cumulative numbers of certain copies.
-        self._copies = backend.empty(capacity, _DOUBLE) if residual else None
+        super().__init__(backend, capacity, sensors, precision, residual=residual)
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
         self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
         self._uploads: list[np.ndarray] = []
-
-    @property
-    def blocks(self) -> int:
-        """Number of blocks of particles."""
-        return -(-self.count // self.block)
-
-    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
-        """Replace all particles."""
-        self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = weight_block(self.backend, self.count)
-        w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
-        self.backend.synchronize()
-        self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
-        self.backend.upload(np.ascontiguousarray(w, np.float64), self.weight)
-        self.backend.upload(np.ascontiguousarray(w, np.float64), self.before)
 
     def set_pool(self, poses: np.ndarray) -> None:
         """Upload the poses from which recovery injects particles."""
@@ -120,59 +93,7 @@ class Cloud:
         self.backend.synchronize()
         self._uploads.clear()
 
-    # ---- programs
-
-    def motion(self, kind: int) -> Program:
-        """Return the launch that moves the particles of the next step."""
-        buffer = self.poses[self.next]
-        return self.sums.launch("move_particles", self.count, source=buffer, settings=self.settings, target=buffer,
-                                particles=self.count, kind=kind)  # fmt: skip
-
-    def sizes(self) -> dict[str, int]:
-        """Return numbers of particles by the names of arguments."""
-        return dict(particles=self.count, block=self.block)
-
-    def numbers(self) -> dict[str, Any]:
-        """Return what weights are made of, by the names of arguments."""
-        return dict(score=self.score, before=self.before, settings=self.settings, state=self.state, blocks=self.blocks,
-                    **self.sizes())  # fmt: skip
-
-    def scoring(self, sensors: int) -> Program:
-        """Return the launches that add up the log-likelihoods of sensors."""
-        flags = flags_if(FLOAT64=self.precision == np.float64)
-        return tuple(
-            launch("add_scores", flags, (self.blocks,), log_p=log_p, settings=self.settings, score=self.score,
-                   largest=self.sums.largest, sensor=sensor, **self.sizes())
-            for sensor, log_p in enumerate(self.log_p[:sensors])
-        )  # fmt: skip
-
-    def drawing(
-        self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int, copies: Buffer | None = None
-    ) -> Program:
-        """Return the launch that draws from poses with cumulative weights, given with their number."""
-        poses, ends, count = source
-        copies = next(one for one in (copies, self._copies, ends) if one is not None)
-        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends, copies=copies,
-                                settings=self.settings, state=self.state, pool=self.pool, target=target,
-                                after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
-
-    def weighing(self, source: int, stage: int, stages: int, drawn: int) -> Program:
-        """Return the launches of a stage after its scores: weights, and the draw into the other buffer."""
-        find, *scored = self.sums.highest(self.blocks)
-        found, numbers = (scored[0], scored[1]), self.numbers()
-        weights = self.sums.weigh(numbers, found, stage)
-        weights += self.sums.set_weights(numbers, found, (stage, stages), (self.weight, self.ends))
-        if self._copies is not None:
-            given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
-            weights += self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage)
-        draw = self.drawing((self.poses[source], self.ends, self.count), self.poses[1 - source], drawn, stage)
-        return self.scoring(self._sensors) + find + weights + draw
-
     # ---- steps
-
-    def use(self, sensors: int) -> None:
-        """Set the number of sensors of the next correction."""
-        self._sensors = sensors
 
     def move(self, kind: int) -> None:
         """Move the particles now."""
@@ -185,66 +106,60 @@ class Cloud:
             self.backend.upload(self._read(self.before, self.count), self.weight)
         )
 
-    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[int, Program], None]) -> int:
-        """Run a step whose log-likelihoods are computed by calls between the launches.
+    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[Stage], None]) -> None:
+        """Run a step: stages until nothing is left of the temperature.
 
         Args:
             kind: Kind of the motion that begins the step.
             stages: Most stages.
             drawn: Particles of the next step.
             sensors: Sensors that are used, the first ones of ``log_p``.
-            score: Writes the log-likelihoods of the poses of a buffer, once a program has written them, into ``log_p``.
-
-        Returns:
-            The number of particles drawn.
+            score: Runs the launches of a stage: the motion of the first one, the log-likelihoods, and the weighing.
         """
         self.use(sensors)
-        source, before = self.next, self.motion(kind)
-        for stage in range(stages):
-            last = stage + 1 == stages
-            score(source, before)
-            before = ()
-            # A stage that leaves nothing draws for the next step, so every stage may be the last one.
-            self._weigh(source, stage, stages, self.count if not last else drawn)
+        self.moved, source = False, self.next
+        for number in range(stages):
+            last = number + 1 == stages
+            stage = Stage(source, number, stages, drawn if last else 0, None if number else kind)
+            score(stage)
+            if not last:
+                last = self._read(self.state, STATE)[number * STAGE + LEFT] == 0.0
+                self._draw(stage, drawn if last else self.count)
             self.shown, self.next = source, 1 - source
-            if last or self._read(self.state, STATE)[stage * STAGE + LEFT] == 0.0:
-                return drawn if last else self.count
+            if last:
+                break
             source = 1 - source
-        raise AssertionError(stages)
 
-    def _weigh(self, source: int, stage: int, stages: int, drawn: int) -> None:
+    def begin(self, kind: int) -> None:
+        """Start the motion of a correction."""
+        self.moved = True
+        self.backend.run(self.motion(kind))
+
+    def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        key = source, stage, stages, drawn, self.count, self._sensors
-        self._stages.run(key, lambda: self.weighing(source, stage, stages, drawn))
+        self._stages.run((stage[:4], self.count, self._sensors), lambda: self.weighing(stage))
 
-    def replay(
-        self, kind: int, stages: int, drawn: int, key: Hashable, programs: Callable[[int], tuple[Program, object]]
-    ) -> None:
-        """Run a step as one recorded program.
+    def _draw(self, stage: Stage, drawn: int) -> None:
+        """Draw into the other buffer."""
+        self._stages.run((stage[:2], drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
+
+    def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
+        """Run a stage as one recorded program.
 
         Args:
-            kind: Kind of the motion that begins the step.
-            stages: Stages, all of which run.
-            drawn: Particles of the next step.
+            stage: The stage.
             key: All on which the sensors' programs depend.
-            programs: Returns the program that scores the poses of a buffer, and the owners of its memory.
+            scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
-        begin = self.next
-        whole = (key, begin, self.count, drawn, kind, stages)
+        whole = (key, stage, self.count)
         if whole not in self._recordings:
-            if len(self._recordings) > 16:
+            if len(self._recordings) > _MOST_RECORDED:
                 self._recordings.clear()
-            program, owners = self.motion(kind), []
-            for stage in range(stages):
-                source = (begin + stage) % 2
-                scoring, owner = programs(source)
-                owners.append(owner)
-                program += scoring
-                program += self.weighing(source, stage, stages, drawn if stage + 1 == stages else self.count)
-            self._recordings[whole] = self.backend.record(program), owners
+            move = () if stage.kind is None else self.motion(stage.kind)
+            program, owners = scoring(stage.source)
+            self._recordings[whole] = self.backend.record(move + program + self.weighing(stage)), owners
+        self.moved = True
         self._recordings[whole][0]()
-        self.shown = (begin + stages - 1) % 2
-        self.next = 1 - self.shown
 
     def explain(self) -> str:
         """Return how the last recorded step is started."""
@@ -280,6 +195,14 @@ class Cloud:
                                     particles=count)  # fmt: skip
         self.backend.run(program)
         return self.backend.lend(out, (count,), _DOUBLE)
+
+    def moments(self, count: int) -> Any:
+        """Return mean and covariance of the shown particles as an array of the device's library."""
+        out = self.backend.blank(ESTIMATE, _DOUBLE)
+        for again in (0, 1):
+            # The second pass is right for any headings.
+            self.backend.run(self.sums.estimate(self.poses[self.shown], self.weight, out, count, again))
+        return self.lent(out, (MOMENTS,))
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""

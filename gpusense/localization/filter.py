@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
-from gpusense.backends import BackendInfo
-from gpusense.interface.constants import FIRST, STATE, TEMPERATURE
+from gpusense.interface.constants import STATE
 from gpusense.localization import options, skipping, starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
+from gpusense.localization.results import Results
 from gpusense.localization.scoring import Given, Scoring, given_of
-from gpusense.localization.sensors import Sensor
+from gpusense.localization.sensors import sensors_of
 from gpusense.localization.trust import Trust
 from gpusense.localization.verdict import Verdict
-from gpusense.world.grid import OccupancyGrid
 
-_MOST_SENSORS = FIRST - TEMPERATURE
 _STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
 
 
-class ParticleFilter:
+class ParticleFilter(Results):
     """Monte Carlo localisation: particles that move with the odometry and are weighed by sensors.
 
     All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed
@@ -87,7 +83,7 @@ class ParticleFilter:
         recovery: str | None = None,
         beam_skip: float | None = None,
     ) -> None:
-        self._sensors = _sensors_of(models)
+        self._sensors = sensors_of(models)
         self._backend = self._sensors[0].backend
         self.motion: MotionModel = OdometryMotion() if motion is None else motion
         if not hasattr(self.motion, "sampled"):
@@ -115,16 +111,6 @@ class ParticleFilter:
             f"ParticleFilter([{sensors}], {self.motion!r}, particles={count}, temperature={one.temperature!r}, "
             f"stages={one.stages}, backend={self.device.selection!r})"
         )
-
-    @property
-    def device(self) -> BackendInfo:
-        """The device of all state."""
-        return self._backend.info
-
-    @property
-    def count(self) -> int:
-        """Number of particles of the next step."""
-        return self._cloud.count
 
     # ---- beginnings
 
@@ -251,7 +237,13 @@ class ParticleFilter:
         motion, self._pending = self._pending, _STILL
         drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
         self._cloud.upload_settings(self._settings(motion, [index for index, _ in given]))
-        drawn = self._score(given, motion.kind, drawn)
+        self._cloud.moved = False
+        try:
+            self._score(given, motion.kind, drawn)
+        except BaseException:
+            # Readings that a model refuses cost no motion.
+            self._pending = self._pending if self._cloud.moved else motion
+            raise
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
         self._last = whole
@@ -298,9 +290,9 @@ class ParticleFilter:
         self._cloud.move(motion.kind)
         self._shown = self._cloud.count
 
-    def _score(self, given: list[Given], kind: int, drawn: int) -> int:
-        """Run the stages of a correction; return the number of particles drawn."""
-        return self._scoring.correct(given, kind, self.options.stages, drawn)
+    def _score(self, given: list[Given], kind: int, drawn: int) -> None:
+        """Run the stages of a correction, the last of which draws a number of particles."""
+        self._scoring.correct(given, kind, self.options.stages, drawn)
 
     def _without_skipped(self, given: list[Given], share: float) -> list[Given]:
         """Return readings without the beams that too few particles explain."""
@@ -342,135 +334,3 @@ class ParticleFilter:
         """Return the particles of the next step by KLD sampling."""
         poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
         return kld_count(poses, self.options.least, self.options.most)
-
-    def _check_started(self) -> None:
-        if not self._started:
-            raise RuntimeError("ParticleFilter: must be initialised first, by initialize or initialize_uniform")
-
-    # ---- results
-
-    def estimate(self, method: str = "mean") -> Estimate:
-        """Return the pose of the robot.
-
-        Args:
-            method: "mean", the weighted mean with the circular mean of headings; "cluster", the mean of the heaviest
-                cluster of particles; "best", the heaviest particle.
-
-        Raises:
-            RuntimeError: the filter is not initialised.
-            ValueError: another method.
-        """
-        self._check_started()
-        checks.choice("method", method, ("mean", "cluster", "best"))
-        self.flush()
-        numbers, summary = self._cloud.estimate(self._shown), self._cloud.summary()
-        pose, covariance = numbers[:3].copy(), covariance_of(numbers)
-        if method != "mean":
-            poses = self._cloud.host_poses(self._cloud.shown, self._shown)
-            if method == "best":
-                pose = poses[int(np.argmax(self._cloud.host_weights(self._shown)))]
-            else:
-                pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
-        explained = self._verdict.explained(pose, self._last) if self._last else math.nan
-        size = summary.effective_sample_size if self._last else float(self._shown)
-        return Estimate(
-            pose, covariance, size, self._verdict.lost, explained, self.temperatures[0], summary.temperature,
-            summary.degenerate, self._shown,
-        )  # fmt: skip
-
-    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
-        self._check_started()
-        self.flush()
-        numbers = self._cloud.estimate(self._shown)
-        return numbers[:3].copy(), covariance_of(numbers)
-
-    @property
-    def temperatures(self) -> tuple[float, ...]:
-        """Temperature of each model now."""
-        return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
-
-    @property
-    def gain(self) -> float:
-        """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
-
-        NaN without a landmark model, and before 20 scans with features.
-        """
-        return self._verdict.gain
-
-    @property
-    def scoring_seconds(self) -> float:
-        """Seconds that the models' log-likelihoods have taken, if ``time_scoring`` was called before.
-
-        Without it they are the seconds in which they were started; 0 where a step is one recorded program.
-        """
-        return sum(sensor.seconds for sensor in self._sensors)
-
-    def time_scoring(self) -> None:
-        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
-        self._scoring.timed = True
-
-    @property
-    def grid(self) -> OccupancyGrid:
-        """The map of the first model that has one.
-
-        Raises:
-            ValueError: none has one.
-        """
-        for sensor in self._sensors:
-            if hasattr(sensor.model, "grid"):
-                return sensor.model.grid
-        raise ValueError("models: must have a map, got none with one")
-
-    def host_particles(self) -> np.ndarray:
-        """Return a copy of the (N, 3) poses after the last step in host memory."""
-        self._check_started()
-        self.flush()
-        return self._cloud.host_poses(self._cloud.shown, self._shown)
-
-    def host_weights(self) -> np.ndarray:
-        """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
-        self._check_started()
-        self.flush()
-        weights = self._cloud.host_weights(self._shown)
-        return weights / weights.sum()
-
-    @property
-    def particles(self) -> Any:
-        """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
-        self._check_started()
-        self.flush()
-        return self._array(self._cloud.poses[self._cloud.shown], (self._shown, 3))
-
-    @property
-    def weights(self) -> Any:
-        """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
-        self._check_started()
-        self.flush()
-        return self._cloud.shares(self._shown) if self._backend.info.kind == "gpu" else self.host_weights()
-
-    def _array(self, buffer: Any, shape: tuple[int, ...]) -> Any:
-        if self._backend.info.kind == "gpu":
-            return self._cloud.lent(buffer, shape)
-        return self._backend.download(buffer, np.empty(shape))
-
-    def explain(self) -> str:
-        """Return in one line how a step is started on the device."""
-        return self._cloud.explain()
-
-
-def _sensors_of(models: Any) -> list[Sensor]:
-    """Return the sensors of models, all of one device and one precision."""
-    chosen = list(models) if isinstance(models, Sequence) else [models]
-    if not 0 < len(chosen) <= _MOST_SENSORS:
-        raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
-    sensors = [Sensor(model) for model in chosen]
-    backend = sensors[0].backend
-    if any(sensor.backend is not backend for sensor in sensors):
-        names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))
-        raise ValueError(f"models: must be of one device, got {names}")
-    if len({sensor.precision for sensor in sensors}) > 1:
-        raise ValueError("models: must have one precision, got float32 and float64")
-    if not backend.info.float64:
-        raise ValueError(f"models: must be on a device with float64, got {backend.info.name}")
-    return sensors

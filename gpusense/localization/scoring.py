@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,11 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
+# Programs of scores that are kept.
+_MOST_PROGRAMS = 8
 # Index of a sensor, and its readings.
 Given = tuple[int, tuple[Any, ...]]
 
@@ -55,14 +59,15 @@ class Scoring:
 
     def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
         self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
+        self._programs: dict[Hashable, tuple[Program, object]] = {}
 
     def records(self, given: Sequence[Given]) -> bool:
-        """Tell whether a step with such readings is one recorded program: on a GPU that can score all of them."""
+        """Tell whether a stage with such readings is one recorded program: on a GPU that can score all of them."""
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in given)
 
-    def correct(self, given: Sequence[Given], kind: int, stages: int, drawn: int) -> int:
-        """Run a step, and return the number of particles drawn.
+    def correct(self, given: Sequence[Given], kind: int, stages: int, drawn: int) -> None:
+        """Run a step.
 
         Args:
             given: Indices of sensors with their readings.
@@ -70,36 +75,42 @@ class Scoring:
             stages: Most stages.
             drawn: Particles of the next step.
         """
-        cloud = self._cloud
+        run = functools.partial(self._called, given)
         if self.records(given):
             for index, reading in given:
                 self._sensors[index].upload(reading)
-            key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)
-            cloud.replay(kind, stages, drawn, key, lambda source: self._program(source, given))
-            return drawn
-        return cloud.correct(
-            kind, stages, drawn, len(given), lambda source, before: self._score(source, before, given)
-        )
+            run = functools.partial(self._recorded, given)
+        self._cloud.correct(kind, stages, drawn, len(given), run)
 
-    def _score(self, source: int, before: Program, given: Sequence[Given]) -> None:
-        """Start the log-likelihoods of poses that launches write."""
-        poses = self._poses(source)
+    def _called(self, given: Sequence[Given], stage: Stage) -> None:
+        """Start the log-likelihoods of a stage call by call, and weigh."""
+        poses, cloud = self._poses(stage.source), self._cloud
+        before = None if stage.kind is None else functools.partial(cloud.begin, stage.kind)
         for place, (index, reading) in enumerate(given):
-            self._sensors[index].score(poses, reading, self._log_p(place), before, timed=self.timed)
-            before = ()
+            self._sensors[index].score(poses, reading, self._log_p(place), before=before, timed=self.timed)
+            before = None
+        cloud.weigh(stage)
 
-    def _program(self, source: int, given: Sequence[Given]) -> tuple[Program, object]:
+    def _recorded(self, given: Sequence[Given], stage: Stage) -> None:
+        """Run a stage as one recorded program."""
+        key = (tuple((index, self._sensors[index].version) for index, _ in given), self._cloud.count)
+        self._cloud.replay(stage, key, lambda source: self._program(key, source, given))
+
+    def _program(self, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
-        program: Program = ()
-        owners: list[object] = []
-        self._cloud.use(len(given))
-        poses = self._poses(source)
-        for place, (index, _) in enumerate(given):
-            out = self._log_p(place)
-            launches, owner = self._sensors[index].program(poses, out)
-            program += launches
-            owners.append((poses, out, owner))
-        return program, owners
+        if (key, source) not in self._programs:
+            if len(self._programs) >= _MOST_PROGRAMS:
+                self._programs.clear()
+            program: Program = ()
+            owners: list[object] = []
+            poses = self._poses(source)
+            for place, (index, _) in enumerate(given):
+                out = self._log_p(place)
+                launches, owner = self._sensors[index].program(poses, out)
+                program += launches
+                owners.append((poses, out, owner))
+            self._programs[key, source] = program, owners
+        return self._programs[key, source]
 
     def _poses(self, source: int) -> Any:
         return self._backend.view(self._cloud.poses[source], (self._cloud.count, 3), np.dtype(np.float64))

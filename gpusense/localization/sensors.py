@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
+from gpusense.interface.constants import FIRST, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.temperature import BeamCorrelation
 from gpusense.models.landmark.model import LandmarkModel
@@ -20,6 +22,7 @@ from gpusense.models.scan.model import ScanModel
 _DOUBLE = np.dtype(np.float64)
 # Calls that are started before one waits.
 _MOST_STARTED = 64
+_MOST_SENSORS = FIRST - TEMPERATURE
 
 
 class Sensor:
@@ -70,26 +73,35 @@ class Sensor:
         """Return the log-likelihoods of poses."""
         return self.model.log_likelihood(poses, *reading)
 
-    def score(self, poses: Any, reading: tuple[Any, ...], out: Any, before: Program, *, timed: bool) -> None:
+    def score(
+        self,
+        poses: Any,
+        reading: tuple[Any, ...],
+        out: Any,
+        *,
+        before: Callable[[], None] | None = None,
+        timed: bool = False,
+    ) -> None:
         """Write the log-likelihoods of poses on the device; those of scans are there once its work has ended.
 
         Args:
             poses: (N, 3) poses on the device.
             reading: The reading.
             out: (N,) array on the device.
-            before: Launches that write the poses.
+            before: Called before poses are read, to start the launches that write them.
             timed: Wait for them, and add their time to ``seconds``.
         """
         begin = time.perf_counter()
         if self.calibrates:
-            self.model.start(poses, *reading, out=out, before=before)
+            self.model.start_scoring(poses, *reading, out=out, before=before)
             self._started += 1
             # Arrays that it reads stay alive until then.
             if timed or self._started >= _MOST_STARTED:
-                self.model.finish()
+                self.model.finish_scoring()
                 self._started = 0
         else:
-            self.backend.run(before)
+            if before is not None:
+                before()
             self.model.log_likelihood(poses, *reading, out=out)
         self.seconds += time.perf_counter() - begin
 
@@ -126,3 +138,28 @@ class Sensor:
         if not isinstance(call, DeviceCall):
             raise RuntimeError(f"the model's call cannot be recorded: {call.explain()}")
         return call.program, (call, ranges)
+
+
+def sensors_of(models: Any) -> list[Sensor]:
+    """Return the sensors of models, all of one device and one precision.
+
+    Args:
+        models: A measurement model, or several.
+
+    Raises:
+        TypeError: another object.
+        ValueError: none, too many, of several devices or precisions, or of a device without float64.
+    """
+    chosen = list(models) if isinstance(models, Sequence) else [models]
+    if not 0 < len(chosen) <= _MOST_SENSORS:
+        raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
+    sensors = [Sensor(model) for model in chosen]
+    backend = sensors[0].backend
+    if any(sensor.backend is not backend for sensor in sensors):
+        names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))
+        raise ValueError(f"models: must be of one device, got {names}")
+    if len({sensor.precision for sensor in sensors}) > 1:
+        raise ValueError("models: must have one precision, got float32 and float64")
+    if not backend.info.float64:
+        raise ValueError(f"models: must be on a device with float64, got {backend.info.name}")
+    return sensors

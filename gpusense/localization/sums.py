@@ -1,8 +1,8 @@
 """Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
 
 A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group. GPUs have work-items to spare and take smaller blocks of weights, whose
-sums are exact; sums of poses have the same blocks everywhere.
+number of particles. Small clouds have one group. GPUs take smaller blocks of weights, whose sums are exact; sums of
+poses have the same blocks everywhere.
 """
 
 from __future__ import annotations

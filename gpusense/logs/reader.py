@@ -130,16 +130,27 @@ def read_log(
         range_max = checks.real("range_max", range_max, above=0)
     for name, flag in (("odometry", odometry), ("rear", rear)):
         checks.boolean(name, flag)
+    form = format_of(file)
+    options: dict[str, object] = dict(range_max=range_max, odometry=odometry, rear=rear)
+    options |= _ros_options(form, topic, mount)
+    records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(file, **options)
+    return records
+
+
+def format_of(file: Path) -> Format:
+    """Return the format of a log.
+
+    Raises:
+        FileNotFoundError: It is missing.
+        ValueError: A folder that is no ROS 2 bag.
+    """
     if not file.is_dir():
         checks.existing_file(file)
     form = next((each for each in FORMATS if each.claims(file)), None)
     if form is None:
         known = " or ".join(each.name for each in FORMATS)
         raise ValueError(f"{file}: must be {known}, got a folder without metadata.yaml")
-    options: dict[str, object] = dict(range_max=range_max, odometry=odometry, rear=rear)
-    options |= _ros_options(form, topic, mount)
-    records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(file, **options)
-    return records
+    return form
 
 
 def _ros_options(form: Format, topic: object, mount: ArrayLike | None) -> dict[str, object]:

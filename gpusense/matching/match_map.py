@@ -56,8 +56,8 @@ class MapMatch:
         >>> cells[1:7, 9] = 100
         >>> grid = gs.OccupancyGrid(cells, resolution=0.1)
         >>> local = gs.OccupancyGrid(cells[:, :14], resolution=0.1)
-        >>> (gs.match_map(local, grid, backend="numpy").pose.round(2) + 0.0).tolist()
-        [0.0, 0.0, 0.0]
+        >>> bool(np.abs(gs.match_map(local, grid, backend="numpy").pose).max() < 0.01)
+        True
     """
 
     pose: Floats

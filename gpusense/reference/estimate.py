@@ -1,9 +1,9 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to the first particle. Covariances follow from them while no heading is farther than a right angle from
-the first one; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, *Directional
-Statistics* (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the
-order of their particles, and then added one after the other.
+Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
+follow from them; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, *Directional Statistics*
+(2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
+their particles, and then added one after the other.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ def sum_poses(
 def finish_estimate(
     flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, again: int
 ) -> None:
-    """Write the mean pose, the covariance about it, and whether headings ask for a second pass; that writes the latter."""
+    """Write the mean pose, the covariance about it, and whether headings ask for a second pass; or the second pass."""
     weight = sums[0] if sums[0] > 0.0 else 1.0
     x, y, angle = sums[1] / weight, sums[2] / weight, sums[5] / weight
-    mean = 0.0 if again else angle_of(sums[3], sums[4])
+    mean = 0.0 if again else float(angle_of(sums[3], sums[4]))
     if not again:
         estimate[0], estimate[1], estimate[2] = poses[0] + x, poses[1] + y, wrap_once(poses[2] + mean)
         estimate[9] = weight

@@ -69,9 +69,7 @@ def weigh_particles(
         likelihood = likelihood * likelihood
 
 
-def join_rows(
-    flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, columns: int, fan: int
-) -> None:
+def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, columns: int, fan: int) -> None:
     """Add up each ``fan`` rows of sums, one after the other."""
     table = sums[: rows * columns].reshape(rows, columns)
     for group, begin in enumerate(range(0, rows, fan)):

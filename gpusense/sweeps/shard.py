@@ -79,11 +79,6 @@ class Shard:
         self._cloud.set_pool(poses)
         yield
 
-    def set_state(self, state: np.ndarray) -> Step:
-        """Take over the state of the filter."""
-        self._backend.upload(state, self._cloud.state)
-        yield
-
     # ---- a step
 
     def begin(self, settings: np.ndarray, kind: int | None, sensors: int) -> Step:
@@ -117,7 +112,7 @@ class Shard:
             self._recorded(source, given)()
         else:
             for place, (index, reading) in enumerate(given):
-                self._sensors[index].score(self._poses(source), reading, self._scores(place), (), timed=False)
+                self._sensors[index].score(self._poses(source), reading, self._scores(place))
             self._backend.run(cloud.scoring(len(given)))
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())

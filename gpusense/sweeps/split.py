@@ -103,36 +103,27 @@ class SplitCloud(Cloud):
         self._all("begin", self._settings, kind, 0)
         self.shown = self.next
 
-    def step(self, kind: int, stages: int, drawn: int, given: Sequence[Given], *, early: bool) -> int:
-        """Run a correction, and return the number of particles drawn.
+    def step(self, kind: int, stages: int, drawn: int, given: Sequence[Given]) -> None:
+        """Run a correction.
 
         Args:
             kind: Kind of the motion that begins the step.
             stages: Most stages.
             drawn: Particles of the next step.
             given: Indices of sensors with their readings.
-            early: Whether the correction ends with the stage that leaves nothing, as where no step is recorded.
         """
+        self.moved = True
         self._all("begin", self._settings, kind, len(given))
-        source, stage = self.next, 0
-        while True:
-            last = stage + 1 == stages
-            self._stage(source, (stage, stages), parts_of(drawn, self._size) if last else self._parts, given)
+        source = self.next
+        for stage in range(stages):
+            self._stage(source, (stage, stages), drawn, given)
             self.shown, self.next = source, 1 - source
-            done = self._numbers[stage * STAGE + LEFT] == 0.0
-            if last or (done and early):
-                return drawn if last else self.count
             source = 1 - source
-            if done:
-                # Stages that have nothing left only copy: one is enough, and it is the last.
-                rows = self._numbers[: stages * STAGE].reshape(stages, STAGE)
-                rows[stage + 1 :] = rows[stage]
-                self._all("set_state", self._numbers)
-                stage = stages - 2
-            stage += 1
+            if self._numbers[stage * STAGE + LEFT] == 0.0:
+                break
 
-    def _stage(self, source: int, place: tuple[int, int], drawn: list[Part], given: Any) -> None:
-        """Score and weigh the particles of a buffer, and draw into the other one."""
+    def _stage(self, source: int, place: tuple[int, int], last: int, given: Any) -> None:
+        """Score and weigh the particles of a buffer, and draw into the other one: ``last`` where nothing is left."""
         stage, state = place[0], self._numbers
         high = max(self._all("score", source, given))
         each = self._all("weigh", high, stage)
@@ -159,6 +150,7 @@ class SplitCloud(Cloud):
             1,
             *place,
         )
+        drawn = self._parts if state[stage * STAGE + LEFT] > 0.0 else parts_of(last, self._size)
         marks = self._marks(stage, drawn)
         offsets = np.cumsum([0.0, *(one[rung] for one in each[:-1])])
         shown = state.copy()

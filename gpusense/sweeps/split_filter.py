@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from typing import Any
 
 from gpusense._util import checks
+from gpusense.interface.constants import MOMENTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.sweeps.held import models_of
 from gpusense.sweeps.parts import parts_of
@@ -78,9 +79,8 @@ class SplitParticleFilter(ParticleFilter):
     def __repr__(self) -> str:
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
 
-    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> int:
-        recorded = self._scoring.records(given)
-        return self._cloud.step(kind, self.options.stages, drawn, given, early=not recorded)
+    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> None:
+        self._cloud.step(kind, self.options.stages, drawn, given)
 
     @property
     def particles(self) -> Any:
@@ -91,6 +91,11 @@ class SplitParticleFilter(ParticleFilter):
     def weights(self) -> Any:
         """(N,) weights of the particles, whose sum is 1, in host memory."""
         return self.host_weights()
+
+    @property
+    def moments(self) -> Any:
+        """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt, in host memory."""
+        return self._cloud.estimate(self._shown)[:MOMENTS]
 
     @property
     def exchanged(self) -> int:

@@ -35,8 +35,8 @@ double largest_of(global const double *largest, const int groups) {
     return high;
 }
 
-// Return the likelihood of a score relative to the largest on the last rung; 1 where none is possible or nothing is left.
-// Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+// Return the likelihood of a score relative to the largest, on the last rung; 1 where none is possible or nothing is
+// left. Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
 double tempered(const double score, const double largest, const double left) {
     return largest == -INFINITY || left == 0.0 ? 1.0 : exp_of(LOWEST * left * (score - largest));
 }

@@ -1,9 +1,9 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to the first particle. Covariances follow from them while no heading is farther than a right angle from
-the first one; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, *Directional
-Statistics* (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the
-order of their particles, and then added one after the other.
+Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
+follow from them; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, *Directional Statistics*
+(2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
+their particles, and then added one after the other.
 """
 
 import functools

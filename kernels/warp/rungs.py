@@ -31,8 +31,8 @@ def largest_of(largest: wp.array(dtype=wp.float64), groups: wp.int32):
     return high
 
 
-# Return the likelihood of a score relative to the largest on the last rung; 1 where none is possible or nothing is left.
-# Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+# Return the likelihood of a score relative to the largest, on the last rung; 1 where none is possible or nothing is
+# left. Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
 @wp.func
 def tempered(score: wp.float64, largest: wp.float64, left: wp.float64):
     value = ONE

@@ -129,9 +129,46 @@ def test_odometry_that_copies_corrected_poses_is_chained_from_wheel_readings(tmp
     np.testing.assert_allclose(found, [0, 0.9, 2.0])
 
 
+def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
+    pytest.importorskip("rosbags", reason="the library rosbags is not installed: pip install 'gpusense[ros]'")
+    from support.bags import BASE, Writer
+
+    grid, bearings = gs.read_map(place / "map.yaml"), np.radians(np.arange(-80, 81, 2.0))
+    caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
+    mounts = {"front": (0.2, 0.0, 0.0), "rear": (-0.2, 0.0, np.pi)}
+    truth = [np.array([3.0, 1.5, 0.2])]
+    with Writer(tmp_path, "mcap") as bag:
+        for name, mount in mounts.items():
+            bag.transform(0.0, BASE, name, mount[:2], mount[2])
+        for step in range(10):
+            bag.odometry(step, *(float(value) for value in truth[-1]))
+            for name, mount in mounts.items():
+                # The rear laser measures a little later.
+                ranges = caster.cast(gs.compose_poses(truth[-1], mount)[None], bearings)[0]
+                bag.scan(step + 0.01 * (name == "rear"), ranges, bearings[0], bearings[1] - bearings[0], f"/{name}",
+                         frame=name, range_max=20.0)  # fmt: skip
+            truth.append(gs.compose_poses(truth[-1], (0.2, 0, 0.1)))
+    tum = tmp_path / "run.tum"
+    both = call(place, "--sensors", "/front", "/rear", "--global", "--particles", "4000", "--tum", str(tum))
+    both[both.index("--log") + 1] = str(bag.path)
+    assert cli.main(both) == 0
+    assert "LikelihoodFieldModel, LikelihoodFieldModel" in capsys.readouterr().out
+    rows = np.loadtxt(tum)
+    assert len(rows) == 20 and np.hypot(*(rows[-2:, 1:3] - truth[-2][:2]).T).max() < 0.1
+    both[both.index("/rear")] = "/top"
+    assert "/top" in error_of(both, capsys)
+    one = call(place, "--sensors", "rear")
+    assert "log" in error_of(one, capsys)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
+        (
+            ["--sensors", "front", "rear"],
+            "'front' and 'rear' for a CARMEN log, got front, rear",
+        ),
+        (["--sensors", "/scan"], "sensors: must be one of 'front' and 'rear' for a CARMEN log, got /scan"),
         (["--temperature", "2"], "temperature: must be"),
         (["--offset", "99"], "log: must have a scan of index 99"),
         (["--motion-noise", "1", "2", "3"], "expected 4 arguments"),

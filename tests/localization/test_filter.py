@@ -291,3 +291,15 @@ def test_the_heaviest_cluster_is_found():
     pose, covariance = clustered(np.vstack([one, two]), np.r_[np.full(300, 1.0), np.full(200, 1.1)])
     np.testing.assert_allclose(pose, (0, 0, 3.1), atol=0.03)
     np.testing.assert_allclose(np.diag(covariance), 0.01, rtol=0.3)
+
+
+def test_readings_that_are_refused_cost_no_motion(backend):
+    scanner = gs.Scanner.uniform(angle_min=-1, angle_increment=0.5, count=5, range_max=10.0)
+    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, backend=backend), particles=200)
+    pf.initialize(mean=(3.0, 3.0, 0.0), covariance=np.diag([1e-4, 1e-4, 1e-6]))
+    pf.predict((0, 0, 0), (1.0, 0, 0))
+    with pytest.raises(ValueError, match="ranges: shape"):
+        pf.correct(np.ones(4))
+    pf.correct(np.full(5, np.nan))
+    assert abs(pf.mean_and_covariance()[0][0] - 4.0) < 0.1

@@ -34,7 +34,7 @@ def alignment_of(device: cl.Device) -> int:
     return max(int(device.mem_base_addr_align) // 8, 1)
 
 
-def part_of(buffer: cl.Buffer, first: int, size: int, alignment: int) -> cl.Buffer:
+def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
     """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy.
 
     Raises:

@@ -29,7 +29,7 @@ class SharedBuffer(cl.SVMAllocation):
         flags = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
         super().__init__(context, size, _ALIGNMENT, flags)
         # By address: an attribute that is a view of this object would be a cycle.
-        self.bytes = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
+        self.bytes: np.ndarray = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
         self._settle = settle
 
     def __del__(self) -> None:
@@ -39,7 +39,7 @@ class SharedBuffer(cl.SVMAllocation):
             settle()
 
 
-class SharedPart(cl.SVM):
+class SharedPart(cl.SVM):  # type: ignore[type-arg]
     """A part of memory that host and device share.
 
     Attributes:
@@ -47,7 +47,7 @@ class SharedPart(cl.SVM):
     """
 
     def __init__(self, whole: SharedBuffer | SharedPart, first: int, size: int) -> None:
-        self.bytes = whole.bytes[first : first + size]
+        self.bytes: np.ndarray = whole.bytes[first : first + size]
         super().__init__(self.bytes)
         self._whole = whole
 

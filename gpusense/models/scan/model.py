@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Literal, cast, overload
 
 import numpy as np
@@ -12,7 +13,6 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.launches import Program
 from gpusense.interface.plan import Omission, Plan, share
 from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.poses import Poses
@@ -183,14 +183,16 @@ class ScanModel(ABC):
         log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p
 
-    def start(self, poses: Any, ranges: AnyArray, *, out: Any, before: Program = ()) -> None:
-        """Start to score poses on the device; ``finish`` waits, or whatever waits for the device.
+    def start_scoring(
+        self, poses: Any, ranges: AnyArray, *, out: Any, before: Callable[[], None] | None = None
+    ) -> None:
+        """Start to score poses on the device; ``finish_scoring`` waits, or whatever waits for the device.
 
         Args:
             poses: (N, 3) poses on the device.
             ranges: (K,) readings [m].
             out: (N,) array on the device for the log-likelihoods.
-            before: Launches that write the poses.
+            before: Called before poses are read, to start the launches that write them.
 
         Raises:
             TypeError, ValueError, MemoryError: see ``log_likelihood``.
@@ -199,8 +201,8 @@ class ScanModel(ABC):
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)
 
-    def finish(self) -> None:
-        """Wait for calls that ``start`` has begun.
+    def finish_scoring(self) -> None:
+        """Wait for calls that ``start_scoring`` has begun.
 
         Raises:
             ValueError: a pose was not finite.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import Backend, arrays
 from gpusense.backends.results import Result
-from gpusense.interface.launches import Program
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.world.scanner import Scanner
@@ -28,7 +27,7 @@ class Request(NamedTuple):
         shape: Shape of the result, (N,) or (S, N).
         result: Memory of the result.
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
-        before: Launches that write the poses, once readings are on the device.
+        before: Called once readings are on the device; it starts the launches that write the poses.
     """
 
     ranges: np.ndarray
@@ -36,7 +35,7 @@ class Request(NamedTuple):
     shape: tuple[int, ...]
     result: Result
     parts: np.ndarray
-    before: Program = ()
+    before: Callable[[], None] | None = None
 
     @property
     def scans(self) -> int:

@@ -77,8 +77,9 @@ class _Scorer:
         if value is None and (self._uploaded is None or self._uploaded[0] != piece.scans):
             self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
         # Once, also where a piece is tried again.
-        before, self._before = self._before, ()
-        self._pipeline.backend.run(before)
+        before, self._before = self._before, None
+        if before is not None:
+            before()
         if value is not None:
             self._fill(piece, scans, value)
         elif self._uploaded is not None:

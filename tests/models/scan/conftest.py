@@ -9,6 +9,7 @@ import pytest
 from support.array_libraries import Array, installed
 
 from gpusense.backends import arrays, get_backend
+from gpusense.backends.base import Adopted
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def gathering(needs, monkeypatch):
     from gpusense.backends.warp.graphs import GraphCache
 
     installed(monkeypatch)
-    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array)))
+    monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array, Adopted)))
     device = get_backend("warp:cpu")
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1, graphs=True))
     monkeypatch.setattr(device, "_graphs", GraphCache(device._device))

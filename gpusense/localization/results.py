@@ -1,0 +1,181 @@
+"""Results of a particle filter: poses, particles, weights, and what it says of itself."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import BackendInfo
+from gpusense.backends.base import Backend
+from gpusense.interface.constants import MOMENTS
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.estimates import Estimate, clustered, covariance_of
+from gpusense.localization.options import Options
+from gpusense.localization.scoring import Scoring
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.verdict import Verdict
+from gpusense.world.grid import OccupancyGrid
+
+
+class Results(ABC):
+    """The part of a particle filter that reads its state.
+
+    Attributes:
+        options: The options, checked.
+    """
+
+    options: Options
+    _backend: Backend
+    _cloud: Cloud
+    _scoring: Scoring
+    _sensors: list[Sensor]
+    _verdict: Verdict
+    # Whether there are particles, the number of those that are shown, and the last readings.
+    _started: bool
+    _shown: int
+    _last: dict[int, tuple[Any, ...]]
+
+    @abstractmethod
+    def flush(self) -> None:
+        """Run the motion of the last ``predict`` now."""
+
+    def _check_started(self) -> None:
+        if not self._started:
+            raise RuntimeError("ParticleFilter: must be initialised first, by initialize or initialize_uniform")
+
+    @property
+    def device(self) -> BackendInfo:
+        """The device of all state."""
+        return self._backend.info
+
+    @property
+    def count(self) -> int:
+        """Number of particles of the next step."""
+        return self._cloud.count
+
+    def estimate(self, method: str = "mean") -> Estimate:
+        """Return the pose of the robot.
+
+        Args:
+            method: "mean", the weighted mean with the circular mean of headings; "cluster", the mean of the heaviest
+                cluster of particles; "best", the heaviest particle.
+
+        Raises:
+            RuntimeError: the filter is not initialised.
+            ValueError: another method.
+        """
+        self._check_started()
+        checks.choice("method", method, ("mean", "cluster", "best"))
+        self.flush()
+        numbers, summary = self._cloud.estimate(self._shown), self._cloud.summary()
+        pose, covariance = numbers[:3].copy(), covariance_of(numbers)
+        if method != "mean":
+            poses = self._cloud.host_poses(self._cloud.shown, self._shown)
+            if method == "best":
+                pose = poses[int(np.argmax(self._cloud.host_weights(self._shown)))]
+            else:
+                pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
+        explained = self._verdict.explained(pose, self._last) if self._last else math.nan
+        size = summary.effective_sample_size if self._last else float(self._shown)
+        return Estimate(
+            pose, covariance, size, self._verdict.lost, explained, self.temperatures[0], summary.temperature,
+            summary.degenerate, self._shown,
+        )  # fmt: skip
+
+    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
+        self._check_started()
+        self.flush()
+        numbers = self._cloud.estimate(self._shown)
+        return numbers[:3].copy(), covariance_of(numbers)
+
+    @property
+    def models(self) -> tuple[Any, ...]:
+        """The measurement models, in the order of ``temperatures``."""
+        return tuple(sensor.model for sensor in self._sensors)
+
+    @property
+    def temperatures(self) -> tuple[float, ...]:
+        """Temperature of each model now."""
+        return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
+
+    @property
+    def gain(self) -> float:
+        """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
+
+        NaN without a landmark model, and before 20 scans with features.
+        """
+        return self._verdict.gain
+
+    @property
+    def scoring_seconds(self) -> float:
+        """Seconds that the models' log-likelihoods have taken, if ``time_scoring`` was called before.
+
+        Without it they are the seconds in which they were started; 0 where a step is one recorded program.
+        """
+        return sum(sensor.seconds for sensor in self._sensors)
+
+    def time_scoring(self) -> None:
+        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
+        self._scoring.timed = True
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map of the first model that has one.
+
+        Raises:
+            ValueError: none has one.
+        """
+        for sensor in self._sensors:
+            if hasattr(sensor.model, "grid"):
+                return sensor.model.grid
+        raise ValueError("models: must have a map, got none with one")
+
+    def host_particles(self) -> np.ndarray:
+        """Return a copy of the (N, 3) poses after the last step in host memory."""
+        self._check_started()
+        self.flush()
+        return self._cloud.host_poses(self._cloud.shown, self._shown)
+
+    def host_weights(self) -> np.ndarray:
+        """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
+        self._check_started()
+        self.flush()
+        weights = self._cloud.host_weights(self._shown)
+        return weights / weights.sum()
+
+    @property
+    def particles(self) -> Any:
+        """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
+        self._check_started()
+        self.flush()
+        return self._array(self._cloud.poses[self._cloud.shown], (self._shown, 3))
+
+    @property
+    def weights(self) -> Any:
+        """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
+        self._check_started()
+        self.flush()
+        return self._cloud.shares(self._shown) if self._backend.info.kind == "gpu" else self.host_weights()
+
+    @property
+    def moments(self) -> Any:
+        """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt: on a GPU an array of the device."""
+        self._check_started()
+        self.flush()
+        if self._backend.info.kind == "gpu":
+            return self._cloud.moments(self._shown)
+        return self._cloud.estimate(self._shown)[:MOMENTS]
+
+    def _array(self, buffer: Any, shape: tuple[int, ...]) -> Any:
+        if self._backend.info.kind == "gpu":
+            return self._cloud.lent(buffer, shape)
+        return self._backend.download(buffer, np.empty(shape))
+
+    def explain(self) -> str:
+        """Return in one line how a step is started on the device."""
+        return self._cloud.explain()

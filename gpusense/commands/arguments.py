@@ -110,6 +110,14 @@ def not_negative_number(text: str) -> float:
     return number
 
 
+def finite_number(text: str) -> float:
+    """Convert an argument to a finite number."""
+    value = _finite(text)
+    if math.isnan(value):
+        raise argparse.ArgumentTypeError(f"must be a finite number, got {text!r}")
+    return value
+
+
 def number(text: str) -> float:
     """Convert an argument to a number."""
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from gpusense.commands.arguments import (
     add_json,
     add_seed,
     add_temperature,
+    finite_number,
     not_negative_number,
     output_path,
     positive_number,
@@ -34,10 +36,11 @@ HELP = "Localise a robot along a recorded log with a particle filter."
 LOST = 1
 
 _EPILOG = """\
-The filter begins around the first logged pose, or with --global anywhere in the free space of the map. It moves with
-the log's odometry and weighs each chosen scan. Errors are those of the weighted mean against the logged poses, where
-the log has them. Coverage is the share of logged poses inside the 50, 80 and 95 % regions of the estimate. A rank is
-the share of particles behind a logged pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence.
+The filter begins around the first logged pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
+--global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
+are those of the weighted mean against the logged poses, where the log has them. Coverage is the share of logged poses
+inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a logged pose, to its right,
+or clockwise of it: many near 0 and 100 % are overconfidence.
 
 The verdict at the end does not need logged poses: it is 'lost' if the estimates of the last tenth of the scans explain
 too few of their beams, as on a wrong map.
@@ -49,6 +52,7 @@ Exit codes: 0 success, 1 lost at the end, 2 bad input, 130 interrupted.
 example:
   gpusense localize --map map.yaml --log run.log.gz
   gpusense localize --map map.yaml --log run.log.gz --global --particles 20000 --tum run.tum --plot run.png
+  gpusense localize --map map.yaml --log run.log.gz --start 1.5 -2 0.3
   gpusense localize --map map.yaml --log run.log.gz --every 2 --offset 1 --parameters fitted/parameters.yaml"""
 
 
@@ -57,10 +61,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add("--log", required=True, type=Path, metavar="FILE", help="a log with odometry, plain or .gz")
+    add(
+        "--log",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help="a log with laser scans and odometry: CARMEN or Wean Hall, plain or .gz, rosbag 1 or 2, MCAP",
+    )
     add("--particles", type=whole_number(low=1), metavar="N",
         help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
-    add("--global", dest="everywhere", action="store_true", help="begin anywhere in the free space of the map")
+    begin = parser.add_mutually_exclusive_group()
+    begin.add_argument("--global", dest="everywhere", action="store_true",
+        help="begin anywhere in the free space of the map")  # fmt: skip
+    begin.add_argument("--start", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
+        help="begin around a pose on the map [m, m, rad] (default: the first logged pose)")  # fmt: skip
     add("--parameters", "--params", type=Path, metavar="YAML",
         help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes (default: a likelihood "
         "field, and the noise below)")  # fmt: skip
@@ -83,7 +97,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--reverse", type=not_negative_number, metavar="P",
         help=f"probability that a translation went the other direction (default: {DEFAULTS.reverse})")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
-    add("--recovery", choices=("augmented", "sensor"), help="inject particles when the filter is lost")
+    add("--recovery", choices=("augmented", "sensor"),
+        help="inject particles when the filter is lost: anywhere, or where the scan is likely (default: only a start "
+        "with --global is repeated)")  # fmt: skip
     add("--beam-skip", type=positive_number, metavar="P",
         help="leave out beams, such as of people, that less than this share of the particles explains")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")
@@ -108,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
         args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, sensors=args.sensors
     )
     pf = _filter(args, steps)
-    start(pf, steps, everywhere=args.everywhere)
+    start(pf, steps, everywhere=args.everywhere, pose=args.start)
     track, recording = Track(), _recording(args, pf)
     try:
         with progress(len(steps)) as step:
@@ -218,20 +234,22 @@ def _report(
         document = {"options": options, "filter": repr(pf), "summary": result, "scans_chosen": chosen}
         print_json(document | {"poses": poses, "machine": machine()})
         return result
-    _print(pf, result, chosen)
+    _print(pf, result, chosen, track)
     for path in (args.tum, args.plot, args.record):
         if path is not None:
             print(f"written: {path}")
     return result
 
 
-def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
+def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
     """Print the summary."""
     s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name != "rank_histogram"}
     print(f"{pf!r}\n")
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
     print(f"scans                 {s['scans']}, temperature {s['temperature']}")
+    deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
+    print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
     if result["error_median"] is not None:
         at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
         print(
@@ -251,6 +269,10 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int) -> None:
         f"verdict: {_verdict(result)}\n\n{machine_line()}",
     )
     sys.stdout.flush()
+
+
+def _three(values: Any) -> str:
+    return "{:.3f} m, {:.3f} m, {:.3f} rad".format(*values)
 
 
 def _ranks(histogram: list[float]) -> str:

@@ -143,17 +143,18 @@ class Track:
         return difference
 
 
-def start(pf: ParticleFilter, steps: Sequence[Step], *, everywhere: bool) -> None:
-    """Initialise a filter: everywhere, or around the first logged pose.
+def start(pf: ParticleFilter, steps: Sequence[Step], *, everywhere: bool, pose: Sequence[float] | None = None) -> None:
+    """Initialise a filter: everywhere, or around a pose, by default the first logged one.
 
     Raises:
         ValueError: the first scan has no pose, and the start is not everywhere.
     """
-    first = steps[0].scan.pose
+    first = steps[0].scan.pose if pose is None else pose
     if everywhere:
         pf.initialize_uniform()
     elif first is None:
-        raise ValueError("log: must have a pose at the first scan, or a global start (--global), got none")
+        rule = "must have a pose at the first scan, unless --start gives one or --global begins anywhere"
+        raise ValueError(f"log: {rule}, got none")
     else:
         pf.initialize(mean=first, covariance=np.diag(np.square(START)))
 

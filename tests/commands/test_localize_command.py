@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from types import SimpleNamespace
 
@@ -62,6 +63,17 @@ def test_a_log_is_tracked_and_written(place, capsys):
     truth = [scan.pose for scan in gs.read_log(place / "run.log", range_max=20.0)]
     assert np.median(np.hypot(*(rows[:, 1:3] - np.array(truth)[:, :2]).T)) < 0.1
     np.testing.assert_allclose(np.hypot(rows[:, 6], rows[:, 7]), 1, atol=1e-8)
+
+
+def test_a_start_around_a_pose(place, capsys):
+    assert cli.main(call(place, "--start", "3.2", "1.4", "0.1")) == 0
+    out = capsys.readouterr().out
+    last = list(gs.read_log(place / "run.log", range_max=20.0))[-1].pose
+    line = next(line for line in out.splitlines() if line.startswith("last pose"))
+    numbers = [float(value) for value in re.findall(r"-?[0-9]+[.][0-9]+", line)]
+    assert np.abs(np.array(numbers[:3]) - last).max() < 0.15 and 0 < max(numbers[3:]) < 0.3
+    assert "must be a finite number, got 'north'" in error_of(call(place, "--start", "1", "2", "north"), capsys)
+    assert "not allowed with argument --start" in error_of(call(place, "--start", "1", "-2", "0", "--global"), capsys)
 
 
 def test_figures_come_as_json(place, capsys):

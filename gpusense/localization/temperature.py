@@ -11,11 +11,17 @@ J is measured. B, the sum of s_k s_k', is that of independent beams. Blocks of n
 have the variance B_b under independence. A fit to the scan takes B_b B^-1 of the sum of all scores away from each, and
 leaves B_b - B_b B^-1 B_b. The ratio of the measured variance to this one, F_n for n blocks, is 1 for independent beams
 at any n, and the inflation of the variance for beams whose correlation is shorter than a block. Four blocks are the
-longest that leave a degree of freedom. Errors of maps are correlated over any length, so the variance grows from a
-quarter to the whole scan as it does from a sixteenth to a quarter (method of aggregated variance: Beran, *Statistics
-for Long-Memory Processes* (1994), section 4.4):
+longest that leave a degree of freedom.
 
-    J = B F_4 max(F_4 / F_16, 1).
+Errors of maps are correlated over any length, so the variance still grows from blocks to the whole scan. Let it grow by
+x each time that blocks are four times as long (method of aggregated variance: Beran, *Statistics for Long-Memory
+Processes* (1994), section 4.4). The fit takes away what is common to all blocks, so that of the inflations V, x V and
+x^2 V of sixteenths, quarters and the whole
+
+    F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V - x^2 V / 4) / (1 - 1 / 4) are seen.
+
+With R = F_4 / F_16, x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1. R
+counts up to 5/3, where sums over n beams have the variance n^1.5; beyond, the fit hides most of the errors.
 
 Errors that repeat from scan to scan add up in a filter. With a correlation r of the blocks' scores at the same
 direction in consecutive scans, and a filter that keeps the share f of what it knew, errors have the variance
@@ -33,14 +39,17 @@ from gpusense._util.typing import AnyArray
 
 # Independent beams of a scan before there is data.
 INDEPENDENT_AT_FIRST = 10.0
-# Fewest independent beams of a scan, and largest correlation of consecutive scans.
-INDEPENDENT_AT_LEAST, _LARGEST_REPEAT = 4.0, 0.9
+# Fewest independent beams of a scan, largest correlation of consecutive scans, and largest growth R.
+INDEPENDENT_AT_LEAST, _LARGEST_REPEAT, _LARGEST_GROWTH = 1.0, 0.9, 5 / 3
 # Scans whose weight has fallen to 1 / e; least scans from which to judge; least beams of a scan.
 _MEMORY, _LEAST_SCANS, _FEWEST = 40, 5, 8
 # Blocks of a scan: long ones, short ones, and those that are compared from scan to scan.
 _LONG, _SHORT, _SECTORS = 4, 16, 8
 # Least and largest steps [m], and radians that count as a metre.
 _STEPS, _TURN = (1e-4, 0.1), 0.25
+# Deviations from the pose to the points of a cubature of degree 3 in 3 dimensions (Arasaratnam and Haykin, "Cubature
+# Kalman filters" (2009)): differences are means of derivatives over the normal density of the pose.
+_FAR = 3**0.5
 # Steps at first where no covariance is known, ahead, to the side [m] and in heading [rad].
 _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
@@ -59,7 +68,7 @@ def axes_of(covariance: np.ndarray) -> np.ndarray:
 
 def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Return the (7, 3) poses at which scores are measured: the pose, and a step forth and back along each axis."""
-    return np.vstack([pose, pose + axes.T, pose - axes.T])
+    return np.vstack([pose, pose + _FAR * axes.T, pose - _FAR * axes.T])
 
 
 class _Scores(NamedTuple):
@@ -81,8 +90,8 @@ class _Scores(NamedTuple):
 
 def _scores_of(parts: np.ndarray) -> _Scores:
     """Return the scores of (7, K) log-likelihoods at the poses of ``poses_around``."""
-    each = (parts[1:4] - parts[4:7]) / 2
-    curvature = float(np.sum(2 * parts[0] - parts[1:4] - parts[4:7]))
+    each = (parts[1:4] - parts[4:7]) / (2 * _FAR)
+    curvature = float(np.sum(2 * parts[0] - parts[1:4] - parts[4:7])) / _FAR**2
     outer = each @ each.T
     regular = outer + 1e-9 * max(float(np.trace(outer)), 1e-30) * np.eye(3)
     return _Scores(each, curvature, np.linalg.solve(regular, each.sum(axis=1)), regular)
@@ -104,9 +113,7 @@ class BeamCorrelation:
         self._products, self._pairs, self._gain = np.zeros(2), 0, 0.0
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
 
-    def add(
-        self, parts: AnyArray, axes: AnyArray, directions: AnyArray | None = None, *, follows: bool = True
-    ) -> None:
+    def add(self, parts: AnyArray, axes: AnyArray, directions: AnyArray | None = None, *, follows: bool = True) -> None:
         """Add a scan.
 
         Args:
@@ -179,8 +186,9 @@ class BeamCorrelation:
         _, _, long, long_wanted, short, short_wanted = self._sums
         if not (long_wanted > 0 and short_wanted > 0 and short > 0):
             return 1.0
-        growth = max((long / long_wanted) / (short / short_wanted), 1.0)
-        return float(max(long / long_wanted * growth, 1.0))
+        quarters = long / long_wanted
+        growth = min(max(quarters / (short / short_wanted), 1.0), _LARGEST_GROWTH)
+        return float(max(quarters * 3 * growth / (5 - 2 * growth), 1.0))
 
     def temperature(self, beams: int) -> float:
         """Return the temperature of a sensor of ``beams`` beams: that of the data, or a first one before there is any.
@@ -222,7 +230,7 @@ def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, 
     first = np.array(_FIRST_STEPS)
     parts = _parts(model, poses_around(at, turn * first), ranges)
     parts = np.where(np.isfinite(parts).all(axis=0), parts, 0.0)
-    curvature = np.maximum((2 * parts[0] - parts[1:4] - parts[4:7]).sum(axis=1), 0.0) / first**2
+    curvature = np.maximum((2 * parts[0] - parts[1:4] - parts[4:7]).sum(axis=1), 0.0) / (_FAR * first) ** 2
     information = correlation.temperature(count) * curvature + (np.array([1.0, 1.0, 1 / _TURN]) / _STEPS[1]) ** 2
     axes = axes_of((turn / information) @ turn.T)
     correlation.add(_parts(model, poses_around(at, axes), ranges), axes)

@@ -53,9 +53,10 @@ def table(results):
     for r in results:
         outer = r["rank_histogram"][0] + r["rank_histogram"][-1]
         coverage = ", ".join(f"{r[f'coverage_{k}']:.2f}" for k in (50, 80, 95))
+        errors, width = f"{r['median_cm']:.1f}, {r['p95_cm']:.1f}", f"{100 * r['width_95']:.0f}"
         lines.append(
-            f"| {r['log']} | {r['model']} | {r['beams']} | {r['weights']} | {r['temperature']:.3f} "
-            f"| {r['median_cm']:.1f}, {r['p95_cm']:.1f} | {coverage} | {100 * r['width_95']:.0f} | {r['nees_median']:.2f} | {outer:.2f} |"
+            f"| {r['log']} | {r['model']} | {r['beams']} | {r['weights']} | {r['temperature']:.3f} | {errors} "
+            f"| {coverage} | {width} | {r['nees_median']:.2f} | {outer:.2f} |"
         )
     return "\n".join(lines)
 

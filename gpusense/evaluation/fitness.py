@@ -86,5 +86,5 @@ def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most:
     """
     correlation = BeamCorrelation()
     for _, scan in scans[:most]:
-        learn_from_scan(correlation, model, scan.ranges, scan.pose)
+        learn_from_scan(correlation, model, scan.ranges, np.array(scan.pose))
     return correlation.temperature(model.used_beams)

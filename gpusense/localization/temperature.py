@@ -224,7 +224,7 @@ def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, 
         ranges: (K,) ranges [m].
         pose: (3,) pose of the robot [m, m, rad].
     """
-    at, count = np.asarray(pose, np.float64), model.used_beams
+    at, count = checks.array("pose", pose, (3,)), model.used_beams
     sine, cosine = np.sin(at[2]), np.cos(at[2])
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     first = np.array(_FIRST_STEPS)
@@ -256,11 +256,13 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]]), gs.Scanner.uniform(
-        ...     angle_min=-0.1, angle_increment=0.01, count=21, range_max=4.0)
+        >>> grid = gs.OccupancyGrid(np.pad(np.zeros((30, 40), int), 1, constant_values=100), resolution=0.1)
+        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.05, count=120, range_max=9.0)
         >>> model = gs.BeamModel(grid, scanner, backend="numpy")
-        >>> scans = 1.5 + np.random.default_rng(0).normal(0, 0.05, (20, 21))
-        >>> 0.1 < gs.calibrate_temperature(model, scans, np.tile((0.5, 0.05, 0.0), (20, 1))) <= 1
+        >>> poses = np.tile((2.0, 1.5, 0.3), (20, 1))
+        >>> scans = gs.RayCaster(grid, range_max=9.0, backend="numpy").cast(poses, scanner.bearings)
+        >>> scans += np.random.default_rng(0).normal(0, 0.05, scans.shape)
+        >>> 0.3 < gs.calibrate_temperature(model, scans, poses) <= 1
         True
     """
     at = checks.array("poses", poses, ("S", 3))

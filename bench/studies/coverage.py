@@ -66,7 +66,9 @@ def main() -> None:
     parser.add_argument("--backend", default="opencl")
     parser.add_argument("--logs", nargs="+", default=["intel", "csail", "fr079"], choices=recordings.NAMES)
     parser.add_argument("--models", nargs="+", default=["field"], choices=("field", "beam", "discrete"))
-    parser.add_argument("--weights", nargs="+", default=list(WEIGHTS), choices=list(WEIGHTS))
+    parser.add_argument(
+        "--weights", nargs="+", default=list(WEIGHTS), help='names of weights, or "temperature T" for a fixed one'
+    )
     parser.add_argument("--beams", nargs="+", type=int, default=[10, 30, 90, 180])
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=1)
@@ -77,7 +79,7 @@ def main() -> None:
     for name in args.logs:
         recording = recordings.load(name)
         for kind, beams, words in itertools.product(args.models, args.beams, args.weights):
-            temperature, peer = WEIGHTS[words]
+            temperature, peer = WEIGHTS.get(words) or (float(words.removeprefix("temperature ")), None)
             models = recording.models(maker(kind, args.backend, beams, peer))
             options = dict(limit=args.limit, particles=args.particles, temperature=temperature)
             runs = [recordings.follow(recording, models, seed=seed, **options) for seed in range(args.seeds)]

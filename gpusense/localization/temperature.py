@@ -219,7 +219,7 @@ def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, 
     """Add a scan at a pose whose covariance is unknown: of one scan with the temperature so far.
 
     Args:
-        correlation: What is known from other scans.
+        correlation: The variance of the scores of other scans.
         model: A model of scans.
         ranges: (K,) ranges [m].
         pose: (3,) pose of the robot [m, m, rad].
@@ -257,11 +257,9 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
     Example:
         >>> import gpusense as gs, numpy as np
         >>> grid = gs.OccupancyGrid(np.pad(np.zeros((30, 40), int), 1, constant_values=100), resolution=0.1)
-        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.05, count=120, range_max=9.0)
-        >>> model = gs.BeamModel(grid, scanner, backend="numpy")
-        >>> poses = np.tile((2.0, 1.5, 0.3), (20, 1))
-        >>> scans = gs.RayCaster(grid, range_max=9.0, backend="numpy").cast(poses, scanner.bearings)
-        >>> scans += np.random.default_rng(0).normal(0, 0.05, scans.shape)
+        >>> model = gs.BeamModel(grid, gs.Scanner(np.arange(-3.1, 3.1, 0.05), range_max=9.0), backend="numpy")
+        >>> poses, noise = np.tile((2.0, 1.5, 0.3), (20, 1)), np.random.default_rng(0).normal(0, 0.05, (20, 124))
+        >>> scans = gs.RayCaster(grid, range_max=9.0, backend="numpy").cast(poses, model.scanner.bearings) + noise
         >>> 0.3 < gs.calibrate_temperature(model, scans, poses) <= 1
         True
     """

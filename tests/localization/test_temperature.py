@@ -125,3 +125,23 @@ def test_models_of_scans_are_calibrated():
     assert LEAST / 6 < found[1] < 1.6 / 6
     with pytest.raises(ValueError, match="scans: must be at least 5"):
         gs.calibrate_temperature(model, white[:4], poses[:4])
+
+
+def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
+    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+    scanner = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
+    models = [gs.LikelihoodFieldModel(grid, scanner, backend="numpy") for _ in range(2)]
+    pose = np.array([3.0, 2.5, 0.4])
+    ranges = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+    pf = gs.ParticleFilter(models, particles=100, seed=1)
+    pf.initialize(mean=pose, covariance=np.diag([1e-3, 1e-3, 1e-4]))
+    first = pf.temperatures
+    for step in range(16):
+        pf.correct({models[step % 2]: ranges})
+        pf.predict((0, 0, 0), (0, 0, 0))
+    assert first == (10 / 60, 10 / 60) and all(0 < value != 10 / 60 for value in pf.temperatures)
+    for sensor in pf._sensors:
+        assert sensor._correlation.scans == 8 and sensor._correlation.repeat > 0.5
+    pf.initialize_uniform()
+    pf.correct({models[0]: np.full(60, 20.0)})
+    assert pf._sensors[0]._correlation.scans == 8

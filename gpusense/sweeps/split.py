@@ -198,8 +198,9 @@ class SplitCloud(Cloud):
             if last or (done and early):
                 return drawn if last else self.count
             source = 1 - source
-            if done:
-                # Stages that have nothing left only copy: one is enough, and it is the last.
+            if done and self._numbers[stage * STAGE + RESAMPLED] != 0.0:
+                # Stages that have nothing left only copy drawn particles: one is enough, and it is the last. Weights
+                # that no draw has made equal are rounded by each of them.
                 rows = self._numbers[: stages * STAGE].reshape(stages, STAGE)
                 rows[stage + 1 :] = rows[stage]
                 self._all("set_state", self._numbers)

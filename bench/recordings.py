@@ -113,6 +113,26 @@ def field(backend, **options):
     return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, parameters, backend=backend, **options)
 
 
+# Of a beam model: a scanner with a deviation of a few centimetres among people.
+BEAM = dict(z_hit=0.7, z_short=0.1, z_max=0.05, z_rand=0.15, sigma_hit=0.07, lambda_short=0.5)
+
+
+def makers(kind, backend, beams):
+    """Return a maker of models of a kind: ``make(grid, scanner)``."""
+    if kind == "field":
+        return field(backend, beams=beams)
+    parameters = gs.BeamParameters(**BEAM)
+
+    def make(grid, scanner):
+        chosen = parameters
+        if kind == "discrete":
+            bins = min(int(np.ceil(scanner.range_max / 0.05)), 2000)
+            chosen = gs.DiscreteBeamModel(parameters, range_max=scanner.range_max, bins=bins)
+        return gs.BeamModel(grid, scanner, chosen, backend=backend, beams=beams)
+
+    return make
+
+
 @dataclass
 class Followed:
     """A filter's track: estimates less references, covariances, ranks of the references, verdicts, times [ms]."""

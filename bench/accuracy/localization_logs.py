@@ -25,25 +25,6 @@ from gpusense.evaluation.machine import machine, machine_line
 from gpusense.evaluation.tracking import read_steps
 from gpusense.localization.defaults import DEFAULTS
 
-# Of a beam model: a scanner with a deviation of a few centimetres among people.
-BEAM = dict(z_hit=0.7, z_short=0.1, z_max=0.05, z_rand=0.15, sigma_hit=0.07, lambda_short=0.5)
-
-
-def makers(kind, backend, beams):
-    """Return a maker of models of a kind: ``make(grid, scanner)``."""
-    if kind == "field":
-        return recordings.field(backend, beams=beams)
-    parameters = gs.BeamParameters(**BEAM)
-
-    def make(grid, scanner):
-        chosen = parameters
-        if kind == "discrete":
-            bins = min(int(np.ceil(scanner.range_max / 0.05)), 2000)
-            chosen = gs.DiscreteBeamModel(parameters, range_max=scanner.range_max, bins=bins)
-        return gs.BeamModel(grid, scanner, chosen, backend=backend, beams=beams)
-
-    return make
-
 
 def wean(backend, seeds):
     """Return where starts anywhere on wean_hall's map end, and their verdicts."""
@@ -96,7 +77,7 @@ def main() -> None:
             )
             motion = gs.fit_odometry_motion(odometry, truth).motion
         for kind in args.models:
-            models = recording.models(makers(kind, args.backend, args.beams))
+            models = recording.models(recordings.makers(kind, args.backend, args.beams))
             for count in args.particles:
                 runs = [
                     recordings.follow(recording, models, limit=args.limit, particles=count, seed=seed, motion=motion)

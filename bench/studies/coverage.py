@@ -5,12 +5,15 @@ of the 50, 80 and 95 % regions, width of the 95 % interval of the position, medi
 histogram of the true poses, which is flat where the weights are right.
 
     python bench/studies/coverage.py --logs intel csail fr079 --beams 10 30 90 180 --out bench/results/coverage_cpu.json
+    python bench/studies/coverage.py --logs intel olin --models beam --beams 60 --weights "plain product" auto
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -29,10 +32,10 @@ WEIGHTS = {
 }  # fmt: skip
 
 
-def maker(backend, beams, peer):
-    """Return ``make(grid, scanner)``: the field of the command, or nav2's with the same parameters."""
+def maker(kind, backend, beams, peer):
+    """Return ``make(grid, scanner)``: a model of a kind, or nav2's field with the command's parameters."""
     if peer is None:
-        return recordings.field(backend, beams=beams)
+        return recordings.makers(kind, backend, beams)
     shared = {name: DEFAULTS.field[name] for name in ("z_hit", "z_max", "z_rand", "sigma_hit")}
     weights = gs.LikelihoodFieldParameters(**shared)
     return lambda grid, scanner: gs.LikelihoodFieldModel(
@@ -43,16 +46,17 @@ def maker(backend, beams, peer):
 def table(results):
     """Return the results as a table of Markdown."""
     lines = [
-        "| log | beams | weights | temperature | median, 95 % error [cm] | coverage 50, 80, 95 % | width of 95 % [cm] "
-        "| median NEES | share of ranks in the outer fifth (0.2 is right) |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| log | model | beams | weights | temperature | median, 95 % error [cm] | coverage 50, 80, 95 % "
+        "| width of 95 % [cm] | median NEES | share of ranks in the outer fifth (0.2 is right) |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for r in results:
         outer = r["rank_histogram"][0] + r["rank_histogram"][-1]
         coverage = ", ".join(f"{r[f'coverage_{k}']:.2f}" for k in (50, 80, 95))
+        errors, width = f"{r['median_cm']:.1f}, {r['p95_cm']:.1f}", f"{100 * r['width_95']:.0f}"
         lines.append(
-            f"| {r['log']} | {r['beams']} | {r['weights']} | {r['temperature']:.3f} | {r['median_cm']:.1f}, "
-            f"{r['p95_cm']:.1f} | {coverage} | {100 * r['width_95']:.0f} | {r['nees_median']:.2f} | {outer:.2f} |"
+            f"| {r['log']} | {r['model']} | {r['beams']} | {r['weights']} | {r['temperature']:.3f} | {errors} "
+            f"| {coverage} | {width} | {r['nees_median']:.2f} | {outer:.2f} |"
         )
     return "\n".join(lines)
 
@@ -61,6 +65,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", default="opencl")
     parser.add_argument("--logs", nargs="+", default=["intel", "csail", "fr079"], choices=recordings.NAMES)
+    parser.add_argument("--models", nargs="+", default=["field"], choices=("field", "beam", "discrete"))
+    parser.add_argument(
+        "--weights", nargs="+", default=list(WEIGHTS), help='names of weights, or "temperature T" for a fixed one'
+    )
     parser.add_argument("--beams", nargs="+", type=int, default=[10, 30, 90, 180])
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=1)
@@ -70,16 +78,16 @@ def main() -> None:
     results = []
     for name in args.logs:
         recording = recordings.load(name)
-        for beams in args.beams:
-            for words, (temperature, peer) in WEIGHTS.items():
-                models = recording.models(maker(args.backend, beams, peer))
-                options = dict(limit=args.limit, particles=args.particles, temperature=temperature)
-                runs = [recordings.follow(recording, models, seed=seed, **options) for seed in range(args.seeds)]
-                row = dict(log=name, beams=beams, weights=words) | recordings.figures(runs)
-                print(table([row]).splitlines()[-1], flush=True)
-                results.append(row)
+        for kind, beams, words in itertools.product(args.models, args.beams, args.weights):
+            temperature, peer = WEIGHTS.get(words) or (float(words.removeprefix("temperature ")), None)
+            models = recording.models(maker(kind, args.backend, beams, peer))
+            options = dict(limit=args.limit, particles=args.particles, temperature=temperature)
+            runs = [recordings.follow(recording, models, seed=seed, **options) for seed in range(args.seeds)]
+            row = dict(log=name, model=kind, beams=beams, weights=words) | recordings.figures(runs)
+            print(table([row]).splitlines()[-1], flush=True)
+            results.append(row)
     if args.out is not None:
-        command = " ".join(["bench/studies/coverage.py", *sys.argv[1:]])
+        command = shlex.join(["bench/studies/coverage.py", *sys.argv[1:]])
         args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
         args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table(results)}\n")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense.evaluation.agreement import Model
 from gpusense.evaluation.worlds import cloud_uniform
-from gpusense.localization.temperature import BeamCorrelation
+from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.verdict import explained_share
 from gpusense.logs import Scan
 
@@ -86,6 +86,5 @@ def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most:
     """
     correlation = BeamCorrelation()
     for _, scan in scans[:most]:
-        parts = model.log_likelihood(np.array([scan.pose]), scan.ranges, per_beam=True)[1]
-        correlation.add(np.asarray(parts[0], np.float64))
+        learn_from_scan(correlation, model, scan.ranges, np.array(scan.pose))
     return correlation.temperature(model.used_beams)

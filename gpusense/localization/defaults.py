@@ -40,7 +40,7 @@ class Defaults(NamedTuple):
     beams: int | None = None
     threshold: float = 0.5
     stages: int = 4
-    share: float = 0.2
+    share: float = 0.1
     jitter: float = 0.2
     farthest: float = 1.0
     farthest_turn: float = 0.5

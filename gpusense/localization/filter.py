@@ -172,6 +172,8 @@ class ParticleFilter(Results):
         if not again:
             self._verdict.reset()
             self._trust = None
+            for sensor in self._sensors:
+                sensor.restart()
         if self.options.recovery == "augmented" and not self._pool[0]:
             self._set_pool(*starts.free_pool([sensor.model for sensor in self._sensors], None))
 
@@ -318,17 +320,21 @@ class ParticleFilter(Results):
         return options.settings_of_step(self.options, motion, step, count, self._pool, sensors)
 
     def _calibrate(self, given: list[Given]) -> None:
-        """Learn the correlation of beams at the estimate, often at first and seldom later."""
-        due = [(i, reading) for i, reading in given if self._sensors[i].calibrates]
-        count = self._verdict.corrections
-        if not due or (count > DEFAULTS.calibrations and count % 10 > 1):
+        """Learn how much beams are worth at the estimate, if the particles lie together."""
+        due = []
+        for index, reading in given:
+            sensor = self._sensors[index]
+            if sensor.calibrates:
+                sensor.count()
+                due += [(sensor, reading)] if sensor.due else []
+        if not due or self._cloud.summary().effective_sample_size < 2:
             return
-        if self._cloud.summary().effective_sample_size < 2:
+        numbers = self._cloud.estimate(self._shown)
+        covariance = covariance_of(numbers)
+        if max(covariance[0, 0], covariance[1, 1]) > skipping.TOGETHER**2:
             return
-        pose = self._cloud.estimate(self._shown)[:3]
-        for index, reading in due:
-            follows = count <= DEFAULTS.calibrations or count % 10 == 1
-            self._sensors[index].correlate(pose, reading, follows=follows)
+        for sensor, reading in due:
+            sensor.correlate(numbers[:3], covariance, reading)
 
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""

@@ -13,7 +13,8 @@ from gpusense.backends import arrays
 from gpusense.backends.base import Backend
 from gpusense.interface.constants import FIRST, TEMPERATURE
 from gpusense.interface.launches import Program
-from gpusense.localization.temperature import BeamCorrelation
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.models.point.base import PointModel
 from gpusense.models.scan.bound import DeviceCall
@@ -52,6 +53,7 @@ class Sensor:
         self.precision = np.dtype(model.precision)
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()
+        self._seen, self._learned = 0, -1
         self._ranges: Any = None
         self.seconds, self._started = 0.0, 0
 
@@ -61,9 +63,25 @@ class Sensor:
             return 1.0
         return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen
 
-    def correlate(self, pose: np.ndarray, reading: tuple[Any, ...], *, follows: bool) -> None:
-        """Learn the correlation of beams from a scan at the estimated pose."""
-        self._correlation.add(self.parts(pose[None], reading)[0], follows=follows)
+    def restart(self) -> None:
+        """Forget how many scans there were: the next one follows none."""
+        self._seen, self._learned = 0, -1
+
+    @property
+    def due(self) -> bool:
+        """Whether the last scan of those that were counted is one to learn from: often at first, seldom later."""
+        return self._seen <= DEFAULTS.calibrations or self._seen % 10 <= 1
+
+    def count(self) -> None:
+        """Count a scan."""
+        self._seen += 1
+
+    def correlate(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
+        """Learn how much beams are worth from the scan that was counted last, at the estimated pose."""
+        axes, scanner = axes_of(covariance), self.model.scanner
+        parts = self.parts(poses_around(pose, axes), reading)
+        self._correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
+        self._learned = self._seen
 
     def parts(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray:
         """Return (N, K) log-likelihoods of the beams of a scan, in float64."""

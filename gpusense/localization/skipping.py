@@ -19,13 +19,13 @@ from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import boundary
 
 # Particles that are asked; largest deviation of particles that lie together [m]; largest share of skipped beams.
-ASKED, _TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
+ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
 
 
 def together(poses: np.ndarray, weights: np.ndarray) -> bool:
     """Tell whether the deviation of particles is at most half a metre along x and along y."""
     d = poses[:, :2] - mean_pose(poses, weights)[:2]
-    return bool(np.all(weights @ d**2 <= _TOGETHER**2 * weights.sum()))
+    return bool(np.all(weights @ d**2 <= TOGETHER**2 * weights.sum()))
 
 
 def without_skipped(

@@ -1,18 +1,36 @@
-"""Temperature of a scan's log-likelihood, from the number of beams that are worth as much as independent ones.
+"""Temperature of a scan's log-likelihood: the weight at which its curvature is the variance of its score.
 
 The product over beams of a scan counts each as independent. They are not: one error of the map, or one person, changes
-many neighbours. The deviations of the log-likelihoods of beams from their mean, at the estimated pose, have an
-autocorrelation rho_l over l beams. The variance of the sum over a scan is 1 + 2 sum rho_l times that of independent
-beams, and the sum is worth as much as K / (1 + 2 sum rho_l) of them: the inflation of variance of a time series
-(Priestley, *Spectral Analysis and Time Series* (1981), section 5.3). Errors of the map also repeat from scan to scan:
-the mean log-likelihoods of consecutive scans have a correlation r, and n scans are worth n (1 - r) / (1 + r). So
+many neighbours. Let s_k be the score of beam k, the gradient of its log-likelihood with respect to the pose, H the sum
+of the negative second derivatives, and J the variance of the sum of the s_k. A likelihood has J = H (Bartlett's second
+identity). One with a temperature T has T^2 J = T H on average, so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura,
+"Bayesian composite marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite
+likelihoods" (2012)). P is the covariance of the pose: directions count by what is unknown of them.
 
-    temperature = (1 - r) / (1 + r) / (1 + 2 sum rho_l).
+J is measured. B, the sum of s_k s_k', is that of independent beams. Blocks of neighbours with scores g_b and sums B_b
+have the variance B_b under independence. A fit to the scan takes B_b B^-1 of the sum of all scores away from each, and
+leaves B_b - B_b B^-1 B_b. The ratio of the measured variance to this one, F_n for n blocks, is 1 for independent beams
+at any n, and the inflation of the variance for beams whose correlation is shorter than a block. Four blocks are the
+longest that leave a degree of freedom.
+
+Errors of maps are correlated over any length, so the variance still grows from blocks to the whole scan. Let it grow by
+x each time that blocks are four times as long (method of aggregated variance: Beran, *Statistics for Long-Memory
+Processes* (1994), section 4.4). The fit takes away what is common to all blocks, so that of the inflations V, x V and
+x^2 V of sixteenths, quarters and the whole
+
+    F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V - x^2 V / 4) / (1 - 1 / 4) are seen.
+
+With R = F_4 / F_16, x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1. R
+counts up to 5/3, where sums over n beams have the variance n^1.5; beyond, the fit hides most of the errors.
+
+Errors that repeat from scan to scan add up in a filter. With a correlation r of the blocks' scores at the same
+direction in consecutive scans, and a filter that keeps the share f of what it knew, errors have the variance
+(1 + r f) / (1 - r f) of independent ones. Its inverse is the second factor of the temperature.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,15 +39,66 @@ from gpusense._util.typing import AnyArray
 
 # Independent beams of a scan before there is data.
 INDEPENDENT_AT_FIRST = 10.0
-# Fewest independent beams of a scan: below, an estimate that is off by itself looks like correlation.
-INDEPENDENT_AT_LEAST = 4.0
-_LARGEST_REPEAT = 0.9
-# Longest lag, as a share of a scan; scans whose weight has fallen to 1 / e, and the least from which to judge.
-_LAGS, _MEMORY, _LEAST_SCANS = 0.25, 40, 5
+# Fewest independent beams of a scan, largest correlation of consecutive scans, and largest growth R.
+INDEPENDENT_AT_LEAST, _LARGEST_REPEAT, _LARGEST_GROWTH = 1.0, 0.9, 5 / 3
+# Scans whose weight has fallen to 1 / e; least scans from which to judge; least beams of a scan.
+_MEMORY, _LEAST_SCANS, _FEWEST = 40, 5, 8
+# Blocks of a scan: long ones, short ones, and those that are compared from scan to scan.
+_LONG, _SHORT, _SECTORS = 4, 16, 8
+# Least and largest steps [m], and radians that count as a metre.
+_STEPS, _TURN = (1e-4, 0.1), 0.25
+# Deviations from the pose to the points of a cubature of degree 3 in 3 dimensions (Arasaratnam and Haykin, "Cubature
+# Kalman filters" (2009)): differences are means of derivatives over the normal density of the pose.
+_FAR = 3**0.5
+# Steps at first where no covariance is known, ahead, to the side [m] and in heading [rad].
+_FIRST_STEPS = (0.05, 0.05, 0.0125)
+
+
+def axes_of(covariance: np.ndarray) -> np.ndarray:
+    """Return steps in the columns of a (3, 3) array: deviations along the axes of a covariance, 0.1 mm to 10 cm.
+
+    Args:
+        covariance: (3, 3) covariance of a pose [m, m, rad].
+    """
+    units = np.array([1.0, 1.0, _TURN])
+    values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
+    axes: np.ndarray = units[:, None] * vectors * np.clip(np.sqrt(np.maximum(values, 0.0)), *_STEPS)
+    return axes
+
+
+def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the (7, 3) poses at which scores are measured: the pose, and a step forth and back along each axis."""
+    return np.vstack([pose, pose + _FAR * axes.T, pose - _FAR * axes.T])
+
+
+class _Scores(NamedTuple):
+    """Scores (3, K) of beams along the axes, their curvature, and the scores' change (3,) by which a fit is made."""
+
+    each: np.ndarray
+    curvature: float
+    fit: np.ndarray
+    outer: np.ndarray
+
+    def of_blocks(self, block: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return (count, 3) scores of blocks after the fit, and (count, 3, 3) outer products, by blocks of beams."""
+        outer = np.zeros((count, 3, 3))
+        scores = np.zeros((count, 3))
+        np.add.at(scores, block, self.each.T)
+        np.add.at(outer, block, self.each.T[:, :, None] * self.each.T[:, None, :])
+        return scores - outer @ self.fit, outer
+
+
+def _scores_of(parts: np.ndarray) -> _Scores:
+    """Return the scores of (7, K) log-likelihoods at the poses of ``poses_around``."""
+    each = (parts[1:4] - parts[4:7]) / (2 * _FAR)
+    curvature = float(np.sum(2 * parts[0] - parts[1:4] - parts[4:7])) / _FAR**2
+    outer = each @ each.T
+    regular = outer + 1e-9 * max(float(np.trace(outer)), 1e-30) * np.eye(3)
+    return _Scores(each, curvature, np.linalg.solve(regular, each.sum(axis=1)), regular)
 
 
 class BeamCorrelation:
-    """Running autocorrelation of the log-likelihoods of neighbouring beams.
+    """Running variance of the scores of scans: how many independent beams they are worth.
 
     Attributes:
         scans: Scans added.
@@ -37,63 +106,89 @@ class BeamCorrelation:
     """
 
     def __init__(self) -> None:
-        self.scans, self.beams, self._mean = 0, 0.0, 0.0
-        self._products = np.zeros(0)
-        self._previous: float | None = None
-        self._repeated, self._squared, self._pairs = 0.0, 0.0, 0
+        self.scans, self.beams = 0, 0.0
+        # Curvature, variance of independent beams, variance of long blocks and as it would be, that of short blocks.
+        self._sums = np.zeros(6)
+        # Products and squares of consecutive scans; share of a pose's information that a scan brings.
+        self._products, self._pairs, self._gain = np.zeros(2), 0, 0.0
+        self._previous: tuple[np.ndarray, np.ndarray] | None = None
 
-    def add(self, parts: AnyArray, *, follows: bool = True) -> None:
+    def add(self, parts: AnyArray, axes: AnyArray, directions: AnyArray | None = None, *, follows: bool = True) -> None:
         """Add a scan.
 
         Args:
+            parts: (7, K) log-likelihoods of beams at :func:`poses_around` the estimated pose, in the order of their
+                bearings; beams without one, which are 0 or not finite, are left out.
+            axes: (3, 3) steps between the poses; their squares are the covariance of the pose.
+            directions: (K,) directions of beams in the world [rad]: needed to compare consecutive scans.
             follows: Whether the scan is the next one after the last one added.
-            parts: (K,) log-likelihoods of beams at the estimated pose, in the order of their bearings; beams without
-                one, which are 0 or not finite, are left out.
 
         Raises:
-            TypeError, ValueError: not (K,) real numbers.
+            TypeError, ValueError: arrays of other shapes.
         """
-        values = checks.array("parts", parts, ("K",), finite=False)
-        values = values[np.isfinite(values) & (values != 0)]
-        if len(values) < 8:
+        values = checks.array("parts", parts, (7, "K"), finite=False)
+        steps = checks.array("axes", axes, (3, 3))
+        used = np.isfinite(values).all(axis=0) & (values != 0).any(axis=0)
+        count = int(np.count_nonzero(used))
+        if count < _FEWEST:
+            self._previous = None
             return
+        scores = _scores_of(values[:, used])
+        gain = min(max(self.temperature(count) * scores.curvature / 3, 0.0), 1.0)
+        independent = float(np.trace(scores.outer)) * count / (count - 3)
+        found = np.array([scores.curvature, independent, *_variances(scores, _LONG), *_variances(scores, _SHORT)])
         keep = 1 - 1 / min(self.scans + 1, _MEMORY)
-        lags = max(int(_LAGS * len(values)), 1)
-        if lags + 1 > len(self._products):
-            self._products = np.concatenate([self._products, np.zeros(lags + 1 - len(self._products))])
-        self._mean = keep * self._mean + (1 - keep) * float(values.mean())
-        deviation = values - self._mean
-        products = np.zeros(len(self._products))
-        for lag in range(lags + 1):
-            products[lag] = deviation[lag:] @ deviation[: len(values) - lag] / len(values)
-        self._products = keep * self._products + (1 - keep) * products
-        self._follow(float(values.mean()), follows)
-        self.beams = keep * self.beams + (1 - keep) * len(values)
+        self._sums = keep * self._sums + (1 - keep) * found
+        self._gain = keep * self._gain + (1 - keep) * gain
+        self.beams = keep * self.beams + (1 - keep) * count
         self.scans += 1
+        if directions is not None:
+            ways = checks.array("directions", directions, (values.shape[1],))
+            self._follow(scores, steps, ways, used, follows)
 
-    def _follow(self, mean: float, follows: bool) -> None:
-        """Add the mean log-likelihood of a scan to the correlation of consecutive scans."""
-        if follows and self._previous is not None:
+    def _follow(
+        self, scores: _Scores, axes: np.ndarray, directions: np.ndarray, used: np.ndarray, follows: bool
+    ) -> None:
+        """Compare a scan's blocks of beams of the same directions with those of the last scan."""
+        # Sectors of the world, an eighth of a scan wide, and a whole number of them around.
+        ahead = np.sort(np.mod(directions, 2 * np.pi))
+        gap = float(np.diff(ahead, append=ahead[0] + 2 * np.pi).max())
+        around = max(round(_SECTORS * 2 * np.pi / max(2 * np.pi - gap, 0.1)), 1)
+        block = (np.mod(directions[used], 2 * np.pi) * (around / (2 * np.pi))).astype(np.int64) % around
+        blocks, _ = scores.of_blocks(block, around)
+        # Gradients in the world, times the covariance's root of this scan.
+        world = np.linalg.solve(axes.T, blocks.T).T
+        seen = np.bincount(block, minlength=around) > 0
+        if follows and self._previous is not None and len(self._previous[1]) == around:
+            both = seen & self._previous[1]
+            now, then = world[both] @ axes, self._previous[0][both] @ axes
             keep = 1 - 1 / min(self._pairs + 1, _MEMORY)
-            one, other = self._previous - self._mean, mean - self._mean
-            self._repeated = keep * self._repeated + (1 - keep) * one * other
-            self._squared = keep * self._squared + (1 - keep) * (one * one + other * other) / 2
+            found = np.array([np.sum(now * then), (np.sum(now * now) + np.sum(then * then)) / 2])
+            self._products = keep * self._products + (1 - keep) * found
             self._pairs += 1
-        self._previous = mean
+        self._previous = world, seen
 
     @property
     def repeat(self) -> float:
-        """Correlation r of the mean log-likelihoods of consecutive scans, 0 to 0.9."""
-        if self._pairs < _LEAST_SCANS or not self._squared > 0:
+        """Correlation r of the scores of consecutive scans in the same directions, 0 to 0.9."""
+        if self._pairs < _LEAST_SCANS or not self._products[1] > 0:
             return 0.0
-        return min(max(self._repeated / self._squared, 0.0), _LARGEST_REPEAT)
+        return min(max(float(self._products[0] / self._products[1]), 0.0), _LARGEST_REPEAT)
+
+    @property
+    def kept(self) -> float:
+        """Share f of what is known of a pose that comes from before the scan, 0 to 1."""
+        return 1 - self._gain if self.scans else 0.0
 
     @property
     def inflation(self) -> float:
         """Variance of the sum over a scan, relative to independent beams; at least 1."""
-        if not self.scans or not self._products[0] > 0:
+        _, _, long, long_wanted, short, short_wanted = self._sums
+        if not (long_wanted > 0 and short_wanted > 0 and short > 0):
             return 1.0
-        return float(max(1 + 2 * np.sum(self._products[1:]) / self._products[0], 1.0))
+        quarters = long / long_wanted
+        growth = min(max(quarters / (short / short_wanted), 1.0), _LARGEST_GROWTH)
+        return float(max(quarters * 3 * growth / (5 - 2 * growth), 1.0))
 
     def temperature(self, beams: int) -> float:
         """Return the temperature of a sensor of ``beams`` beams: that of the data, or a first one before there is any.
@@ -105,14 +200,51 @@ class BeamCorrelation:
             TypeError, ValueError: not a number of beams.
         """
         count = checks.integer("beams", beams, low=0)
-        if self.scans < _LEAST_SCANS:
+        if self.scans < _LEAST_SCANS or not self._sums[1] > 0:
             return min(1.0, INDEPENDENT_AT_FIRST / max(count, 1))
-        found = (1 - self.repeat) / (1 + self.repeat) / self.inflation
+        repeated = self.repeat * self.kept
+        found = (1 - repeated) / (1 + repeated) * self._sums[0] / (self._sums[1] * self.inflation)
         return min(1.0, max(found, INDEPENDENT_AT_LEAST / max(count, 1)))
 
 
+def _variances(scores: _Scores, count: int) -> tuple[float, float]:
+    """Return the variance of the scores of ``count`` blocks of beams after a fit, and that of independent beams."""
+    beams = scores.each.shape[1]
+    blocks, outer = scores.of_blocks(np.arange(beams) * count // beams, count)
+    taken = np.einsum("bij,bij->", outer, np.linalg.solve(scores.outer, outer).transpose(0, 2, 1))
+    return float(np.sum(blocks**2)), float(np.trace(scores.outer) - taken)
+
+
+def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, pose: AnyArray) -> None:
+    """Add a scan at a pose whose covariance is unknown: of one scan with the temperature so far.
+
+    Args:
+        correlation: The variance of the scores of other scans.
+        model: A model of scans.
+        ranges: (K,) ranges [m].
+        pose: (3,) pose of the robot [m, m, rad].
+    """
+    at, count = checks.array("pose", pose, (3,)), model.used_beams
+    sine, cosine = np.sin(at[2]), np.cos(at[2])
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    first = np.array(_FIRST_STEPS)
+    parts = _parts(model, poses_around(at, turn * first), ranges)
+    parts = np.where(np.isfinite(parts).all(axis=0), parts, 0.0)
+    curvature = np.maximum((2 * parts[0] - parts[1:4] - parts[4:7]).sum(axis=1), 0.0) / (_FAR * first) ** 2
+    information = correlation.temperature(count) * curvature + (np.array([1.0, 1.0, 1 / _TURN]) / _STEPS[1]) ** 2
+    axes = axes_of((turn / information) @ turn.T)
+    correlation.add(_parts(model, poses_around(at, axes), ranges), axes)
+
+
+def _parts(model: Any, poses: np.ndarray, ranges: AnyArray) -> np.ndarray:
+    return np.asarray(model.log_likelihood(poses, ranges, per_beam=True)[1], np.float64)
+
+
 def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float:
-    """Return the temperature that a log calls for: the one a filter with ``temperature="auto"`` arrives at.
+    """Return the temperature that a log calls for, where each scan is judged by itself.
+
+    A filter with ``temperature="auto"`` measures the same of its own scans, and lowers it further where errors repeat
+    from scan to scan.
 
     Args:
         model: A :class:`BeamModel` or :class:`LikelihoodFieldModel`.
@@ -124,11 +256,11 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]]), gs.Scanner.uniform(
-        ...     angle_min=-0.1, angle_increment=0.01, count=21, range_max=4.0)
-        >>> model = gs.BeamModel(grid, scanner, backend="numpy")
-        >>> scans = 1.5 + np.random.default_rng(0).normal(0, 0.05, (20, 21))
-        >>> 0.1 < gs.calibrate_temperature(model, scans, np.tile((0.5, 0.05, 0.0), (20, 1))) <= 1
+        >>> grid = gs.OccupancyGrid(np.pad(np.zeros((30, 40), int), 1, constant_values=100), resolution=0.1)
+        >>> model = gs.BeamModel(grid, gs.Scanner(np.arange(-3.1, 3.1, 0.05), range_max=9.0), backend="numpy")
+        >>> poses, noise = np.tile((2.0, 1.5, 0.3), (20, 1)), np.random.default_rng(0).normal(0, 0.05, (20, 124))
+        >>> scans = gs.RayCaster(grid, range_max=9.0, backend="numpy").cast(poses, model.scanner.bearings) + noise
+        >>> 0.3 < gs.calibrate_temperature(model, scans, poses) <= 1
         True
     """
     at = checks.array("poses", poses, ("S", 3))
@@ -137,5 +269,5 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
         raise ValueError(f"scans: must be at least {_LEAST_SCANS}, got {len(at)}")
     correlation = BeamCorrelation()
     for ranges, pose in zip(readings, at, strict=True):
-        correlation.add(model.log_likelihood(pose[None], ranges, per_beam=True)[1][0])
-    return correlation.temperature(model.scanner.count)
+        learn_from_scan(correlation, model, ranges, pose)
+    return correlation.temperature(model.used_beams)

@@ -8,7 +8,6 @@ import pytest
 import gpusense as gs
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.estimates import clustered
-from gpusense.localization.temperature import BeamCorrelation
 
 GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
 SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
@@ -266,17 +265,6 @@ def test_systematic_errors_and_slips_of_the_odometry_are_learned():
 
 def _step(pose, one, trans, two):
     return gs.compose_poses(gs.compose_poses(pose, (trans * np.cos(one), trans * np.sin(one), one)), (0, 0, two))
-
-
-def test_correlated_beams_are_worth_less():
-    rng, white, smooth = np.random.default_rng(0), BeamCorrelation(), BeamCorrelation()
-    for _ in range(60):
-        values = rng.normal(-2, 1, 300)
-        white.add(values)
-        smooth.add(np.convolve(rng.normal(-2, 1, 309), np.full(10, 0.1), "valid"))
-    # Moving averages of 10 have an inflation of 10.
-    assert white.temperature(300) > 0.6
-    assert 0.07 < smooth.temperature(300) < 0.16
 
 
 def test_kld_sampling_asks_for_more_where_the_cloud_is_wide():

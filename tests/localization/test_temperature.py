@@ -1,0 +1,147 @@
+"""The temperature against the variance of scores that is known from how the errors of scans were drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import gpusense as gs
+from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
+
+HALF = np.array([3.0, 2.0])
+# Of 40 scans with four blocks, F_4 has a deviation of 0.15, and F_4 / F_16 one of 0.2, which counts up to three times,
+# and only where it is above 1.
+LEAST, MOST = 0.5, 1.3
+
+
+def room(headings, count, span=np.pi):
+    """Return (K, 3) gradients of the distances of end points to walls of a room, seen from its centre, and bearings."""
+    ways = np.linspace(-span / 2, span / 2, count, endpoint=False) + headings
+    towards = np.stack([np.cos(ways), np.sin(ways)], axis=1)
+    reach = HALF / np.maximum(np.abs(towards), 1e-9)
+    first = reach[:, 0] < reach[:, 1]
+    normal = np.sign(towards) * np.stack([first, ~first], axis=1)
+    ends = towards * reach.min(axis=1)[:, None]
+    return np.column_stack([normal, normal[:, 1] * ends[:, 0] - normal[:, 0] * ends[:, 1]]), ways
+
+
+def autoregressive(rng, count, phi):
+    """Return normal errors of variance 1 whose autocorrelation is phi^l."""
+    noise = rng.normal(size=count + 200) * np.sqrt(1 - phi * phi)
+    return lfilter([1.0], [1.0, -phi], noise)[200:]
+
+
+def learned(draw, count, scans=150, sigma=0.05):
+    """Return what is learned of scans with drawn errors, and the temperature at which the mean NEES of fits is 3."""
+    rng, found, squared = np.random.default_rng(3), BeamCorrelation(), []
+    for _ in range(scans):
+        gradients, ways = room(rng.uniform(0, 2 * np.pi), count)
+        errors = draw(rng, count) * sigma
+        information = gradients.T @ gradients / sigma**2
+        fit = np.linalg.solve(information, gradients.T @ errors / sigma**2)
+        squared.append(fit @ information @ fit)
+        axes = axes_of(np.linalg.inv(information))
+        moved = errors - poses_around(fit, axes) @ gradients.T
+        found.add(-0.5 * (moved / sigma) ** 2 - 1, axes, ways)
+    return found, 3 / np.mean(squared)
+
+
+@pytest.mark.parametrize(("count", "phi"), [(180, 0.0), (720, 0.0), (720, 0.4), (720, 0.7)])
+def test_short_correlations_have_the_temperature_of_theory(count, phi):
+    found, _ = learned(lambda rng, n: autoregressive(rng, n, phi), count)
+    wanted = (1 - phi) / (1 + phi)
+    assert LEAST * wanted < found.temperature(count) < MOST * wanted
+    assert found.repeat < 0.2
+
+
+@pytest.mark.parametrize(("count", "phi"), [(180, 0.8), (180, 0.95), (60, 0.8)])
+def test_long_correlations_make_normalised_errors_of_fits_right(count, phi):
+    found, wanted = learned(lambda rng, n: autoregressive(rng, n, phi), count)
+    # Their variance ends to grow before the whole scan, which no block of it shows: at most 3 times too careful.
+    assert wanted / 3 < found.temperature(count) < 1.2 * wanted
+    plain = learned(lambda rng, n: rng.normal(size=n), count)[0]
+    assert found.temperature(count) < 0.5 * plain.temperature(count)
+
+
+def test_errors_that_are_larger_than_the_models_lower_the_temperature_too():
+    found, wanted = learned(lambda rng, n: 2 * rng.normal(size=n), 360)
+    assert 0.25 * LEAST < found.temperature(360) < 0.25 * MOST and wanted == pytest.approx(0.25, rel=0.25)
+    small, _ = learned(lambda rng, n: 0.5 * rng.normal(size=n), 360)
+    assert small.temperature(360) == 1.0
+
+
+@pytest.mark.parametrize("phi", [0.3, 0.8])
+def test_errors_that_repeat_are_found_in_turned_scans(phi):
+    """Errors belong to directions in the world, and change from scan to scan by a first-order autoregression."""
+    rng, sigma, bins = np.random.default_rng(5), 0.05, 720
+    found, apart = BeamCorrelation(), BeamCorrelation()
+    field, heading = rng.normal(size=bins), 0.0
+    for _ in range(120):
+        field = phi * field + np.sqrt(1 - phi * phi) * rng.normal(size=bins)
+        heading += 2 * np.pi / bins * rng.integers(-20, 20)
+        gradients, ways = room(heading, 360)
+        errors = sigma * field[np.rint(ways / (2 * np.pi) * bins).astype(int) % bins]
+        # The filter knows the pose better than a scan does.
+        axes = axes_of(0.5 * np.linalg.inv(gradients.T @ gradients / sigma**2))
+        moved = errors - poses_around(np.zeros(3), axes) @ gradients.T
+        for one in (found, apart):
+            one.add(-0.5 * (moved / sigma) ** 2 - 1, axes, ways, follows=one is found)
+    assert found.repeat == pytest.approx(phi, abs=0.15) and apart.repeat == 0
+    repeated = found.repeat * found.kept
+    assert 0.4 < found.kept < 1
+    wanted = apart.temperature(360) * (1 - repeated) / (1 + repeated)
+    assert found.temperature(360) == pytest.approx(wanted, rel=0.25)
+
+
+def test_scans_that_do_not_follow_and_few_beams_are_not_compared():
+    found, rng = BeamCorrelation(), np.random.default_rng(0)
+    gradients, ways = room(0.0, 60)
+    axes = axes_of(np.linalg.inv(gradients.T @ gradients / 0.01))
+    for index in range(20):
+        moved = 0.1 * rng.normal(size=60) - poses_around(np.zeros(3), axes) @ gradients.T
+        parts = -0.5 * (moved / 0.1) ** 2 - 1
+        parts[:, 50:] = (0.0, -np.inf)[index % 2]
+        found.add(parts, axes, ways, follows=False)
+        found.add(parts[:, :7], axes, ways[:7])
+    assert found.scans == 20 and found.beams == pytest.approx(50) and found.repeat == 0
+    with pytest.raises(ValueError, match="parts: shape must be"):
+        found.add(parts[0], axes)
+
+
+def test_models_of_scans_are_calibrated():
+    """Beam models of a room, with independent errors and with moving averages of 6 beams, whose inflation is 6."""
+    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+    scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=np.pi / 180, count=360, range_max=10.0)
+    model = gs.BeamModel(grid, scanner, gs.BeamParameters(0.97, 0.0, 0.0, 0.03, sigma_hit=0.05), backend="numpy")
+    rng = np.random.default_rng(2)
+    poses = np.column_stack([rng.uniform(3, 5, 30), rng.uniform(2.5, 4, 30), rng.uniform(-3, 3, 30)])
+    exact = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(poses, scanner.bearings)
+    white = exact + 0.05 * rng.normal(size=exact.shape)
+    smooth = exact + 0.05 * lfilter(np.full(6, 6**-0.5), [1.0], rng.normal(size=(30, 365)))[:, 5:]
+    found = [gs.calibrate_temperature(model, scans, poses) for scans in (white, smooth)]
+    assert found[0] > LEAST
+    # Errors of ranges count by the cosine of the incidence, which differs between neighbours: they are less correlated.
+    assert LEAST / 6 < found[1] < 1.6 / 6
+    with pytest.raises(ValueError, match="scans: must be at least 5"):
+        gs.calibrate_temperature(model, white[:4], poses[:4])
+
+
+def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
+    grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
+    scanner = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
+    models = [gs.LikelihoodFieldModel(grid, scanner, backend="numpy") for _ in range(2)]
+    pose = np.array([3.0, 2.5, 0.4])
+    ranges = gs.RayCaster(grid, range_max=10.0, backend="numpy").cast(pose[None], scanner.bearings)[0]
+    pf = gs.ParticleFilter(models, particles=100, seed=1)
+    pf.initialize(mean=pose, covariance=np.diag([1e-3, 1e-3, 1e-4]))
+    first = pf.temperatures
+    for step in range(16):
+        pf.correct({models[step % 2]: ranges})
+        pf.predict((0, 0, 0), (0, 0, 0))
+    assert first == (10 / 60, 10 / 60) and all(0 < value != 10 / 60 for value in pf.temperatures)
+    for sensor in pf._sensors:
+        assert sensor._correlation.scans == 8 and sensor._correlation.repeat > 0.5
+    pf.initialize_uniform()
+    pf.correct({models[0]: np.full(60, 20.0)})
+    assert pf._sensors[0]._correlation.scans == 8

@@ -14,6 +14,7 @@ from gpusense.localization import options, skipping, starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.estimates import covariance_of
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.results import Results
 from gpusense.localization.scoring import Given, Scoring, given_of

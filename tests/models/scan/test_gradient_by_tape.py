@@ -20,8 +20,8 @@ def tape_kernel(wp, flags):
 
     A change of the pose (x, y [m], theta) is its differentiable input.
     """
-    prelude, end_point, field = (warp_module(name) for name in ("prelude", "end_point", "field"))
-    of_field = field.functions(flags)
+    prelude, end_point, field_term = (warp_module(name) for name in ("prelude", "end_point", "field_term"))
+    of_field = field_term.functions(flags)
     place, bilinear, log_field = end_point.functions(flags).end_point, of_field.bilinear, of_field.log_field
     Window, options = prelude.Window, prelude.OPTIONS | {"enable_backward": True}
     HALF = wp.float64(0.5)

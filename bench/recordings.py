@@ -15,17 +15,21 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.evaluation.coverage import coverage_report, rank_of
-from gpusense.evaluation.tracking import START, read_steps
+from gpusense.evaluation.steps import read_steps
+from gpusense.evaluation.tracking import START
 from gpusense.localization.defaults import DEFAULTS
 
 CARMEN = {"intel": "intel", "csail": "csail", "fr079": "freiburg-079", "aces": "aces"}
 JARVIS = ("jarvis-s3000", "jarvis-nav350", "jarvis-fused")
-NAMES = (*CARMEN, *JARVIS, "olin")
+NAMES = (*CARMEN, "intel-raw", *JARVIS, "olin")
 
 
 @dataclass(frozen=True)
 class Event:
-    """A scan: index of its scanner, readings [m], odometry and reference pose of the robot [m, m, rad]."""
+    """A scan: index of its scanner, readings [m], odometry and reference pose of the robot [m, m, rad].
+
+    A reference pose is NaN where none is known.
+    """
 
     scanner: int
     ranges: np.ndarray
@@ -54,6 +58,8 @@ def load(name):
     """Return a recording by its name."""
     if name in CARMEN:
         return _carmen(name)
+    if name == "intel-raw":
+        return _intel_raw()
     return _olin() if name == "olin" else _jarvis(name)
 
 
@@ -64,6 +70,25 @@ def _carmen(name):
     steps = read_steps(folder / f"{CARMEN[name]}-corrected.log.gz", every=2, offset=1)
     events = [Event(0, s.scan.ranges, np.array(s.odometry), np.array(s.scan.pose)) for s in steps]
     return Recording(name, [(grid, steps[0].scan.scanner)], events)
+
+
+def _intel_raw():
+    """Every scan of the raw log in the map of the even corrected scans.
+
+    Odd corrected scans that the raw log has, too, give the reference; the run begins with the first of them.
+    """
+    folder = data() / "carmen_logs"
+    grid = gs.read_map(folder / "derived_maps" / "intel_even_05cm.yaml")
+    steps = read_steps(folder / "intel-rawodom-every5.log.gz", range_max=81.83)
+    matches = np.loadtxt(folder / "intel-rawodom-matches.csv", delimiter=",", skiprows=1)
+    truth = {int(raw): pose for raw, corrected, *pose in matches if int(corrected) % 2 == 1}
+    unknown = np.full(3, np.nan)
+    events = [
+        Event(0, s.scan.ranges, np.array(s.odometry), np.array(truth.get(s.index, unknown)))
+        for s in steps
+        if s.index >= min(truth)
+    ]
+    return Recording("intel-raw", [(grid, steps[0].scan.scanner)], events)
 
 
 def _jarvis(name):
@@ -144,6 +169,11 @@ class Followed:
     temperatures: np.ndarray
     ms: np.ndarray
 
+    def with_reference(self):
+        """Return the scans of which a reference pose is known."""
+        known = np.isfinite(self.differences).all(axis=1)
+        return Followed(**{name: values[known] for name, values in vars(self).items()})
+
 
 def follow(recording, models, *, limit=None, **options):
     """Track a recording from a normal start around the first reference pose; ranks need all particles."""
@@ -167,20 +197,24 @@ def follow(recording, models, *, limit=None, **options):
 
 def figures(tracks):
     """Return the figures of several tracks of one setting; the first 5 % of a track count for errors only."""
+    times = [t.ms for t in tracks]
+    verdicts = [t.lost for t in tracks]
+    temperatures = [t.temperatures for t in tracks]
+    tracks = [t.with_reference() for t in tracks]
     late = [slice(len(t.ms) // 20, None) for t in tracks]
     reports = [
         coverage_report(t.differences[s], t.covariances[s], t.ranks[s]) for t, s in zip(tracks, late, strict=True)
     ]
     errors = [np.hypot(*t.differences[:, :2].T) for t in tracks]
     result = dict(
-        seeds=len(tracks), scans=len(errors[0]),
+        seeds=len(tracks), scans=len(times[0]), references=len(errors[0]),
         median_cm=100 * float(np.median([np.median(e) for e in errors])),
         p95_cm=100 * float(np.median([np.percentile(e, 95) for e in errors])),
         heading_deg=float(np.degrees(np.median([np.median(np.abs(t.differences[:, 2])) for t in tracks]))),
         lost=int(sum(np.median(e[-max(len(e) // 10, 1) :]) > 1 for e in errors)),
-        said_lost=float(np.mean([t.lost.mean() for t in tracks])),
-        temperature=float(np.median([np.median(t.temperatures) for t in tracks])),
-        ms=float(np.median([np.median(t.ms) for t in tracks])),
+        said_lost=float(np.mean([one.mean() for one in verdicts])),
+        temperature=float(np.median([np.median(one) for one in temperatures])),
+        ms=float(np.median([np.median(one) for one in times])),
     )  # fmt: skip
     for key in reports[0]:
         result[key] = np.mean([r[key] for r in reports], axis=0).round(4).tolist()

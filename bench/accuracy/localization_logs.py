@@ -22,7 +22,7 @@ import recordings
 
 import gpusense as gs
 from gpusense.evaluation.machine import machine, machine_line
-from gpusense.evaluation.tracking import read_steps
+from gpusense.evaluation.steps import read_steps
 from gpusense.localization.defaults import DEFAULTS
 
 
@@ -73,7 +73,8 @@ def main() -> None:
         recording, motion = recordings.load(name), None
         if args.fit_motion:
             odometry, truth = (
-                np.array([getattr(e, which) for e in recording.events]) for which in ("odometry", "truth")
+                np.array([getattr(e, which) for e in recording.events if np.isfinite(e.truth).all()])
+                for which in ("odometry", "truth")
             )
             motion = gs.fit_odometry_motion(odometry, truth).motion
         for kind in args.models:

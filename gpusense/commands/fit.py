@@ -203,15 +203,13 @@ def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
     """Learn the noise of the odometry from the chosen scans; None where it is not asked for."""
-    import numpy as np
-
-    from gpusense.evaluation.tracking import read_steps
+    from gpusense.evaluation.steps import read_steps, references_to_learn_from
     from gpusense.localization.motion_fit import fit_odometry_motion
 
     if not args.fit_motion:
         return None
     steps = read_steps(args.log, every=args.every, offset=args.offset, limit=args.limit)
-    return fit_odometry_motion([step.odometry for step in steps], np.array([step.scan.pose for step in steps]))
+    return fit_odometry_motion(*references_to_learn_from(steps))
 
 
 def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> dict[str, Any]:

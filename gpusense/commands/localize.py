@@ -25,7 +25,8 @@ from gpusense.evaluation.machine import machine, machine_line
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.tracking import Step, Track
+    from gpusense.evaluation.steps import Step
+    from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
     from gpusense.localization.motion import MotionModel
     from gpusense.plots.viewer import Recording
@@ -36,14 +37,14 @@ HELP = "Localise a robot along a recorded log with a particle filter."
 LOST = 1
 
 _EPILOG = """\
-The filter begins around the first logged pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
+The filter begins around the first reference pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
 --global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
-are those of the weighted mean against the logged poses, where the log has them. Coverage is the share of logged poses
-inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a logged pose, to its right,
-or clockwise of it: many near 0 and 100 % are overconfidence.
+are those of the weighted mean against reference poses: those of --reference, or the logged ones. Coverage is the share
+of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a
+reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence.
 
-The verdict at the end does not need logged poses: it is 'lost' if the estimates of the last tenth of the scans explain
-too few of their beams, as on a wrong map.
+The verdict at the end does not need reference poses: it is 'lost' if the estimates of the last tenth of the scans
+explain too few of their beams, as on a wrong map.
 
 Ctrl-C ends the run with the results so far, and writes the files.
 
@@ -74,7 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     begin.add_argument("--global", dest="everywhere", action="store_true",
         help="begin anywhere in the free space of the map")  # fmt: skip
     begin.add_argument("--start", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
-        help="begin around a pose on the map [m, m, rad] (default: the first logged pose)")  # fmt: skip
+        help="begin around a pose on the map [m, m, rad] (default: the first reference pose)")  # fmt: skip
+    add("--reference", type=Path, metavar="FILE",
+        help="a TUM trajectory of true poses on the map to compare with, by the times of the scans (default: the "
+        "logged poses)")  # fmt: skip
     add("--parameters", "--params", type=Path, metavar="YAML",
         help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes (default: a likelihood "
         "field, and the noise below)")  # fmt: skip
@@ -96,7 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"(default: {DEFAULTS.sideways})")  # fmt: skip
     add("--reverse", type=not_negative_number, metavar="P",
         help=f"probability that a translation went the other direction (default: {DEFAULTS.reverse})")  # fmt: skip
-    add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this log first")
+    add("--fit-motion", action="store_true", help="learn the motion noise from the reference poses of this log first")
     add("--recovery", choices=("augmented", "sensor"),
         help="inject particles when the filter is lost: anywhere, or where the scan is likely (default: only a start "
         "with --global is repeated)")  # fmt: skip
@@ -112,17 +116,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw map, particles, estimated and logged poses")  # fmt: skip
+        help="draw map, particles, estimated and reference poses")  # fmt: skip
     add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
 
 
 def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C those so far."""
-    from gpusense.evaluation.tracking import Track, follow, read_steps, start
+    from gpusense.evaluation.tracking import Track, follow, start
 
-    steps = read_steps(
-        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, sensors=args.sensors
-    )
+    steps = _steps(args)
     pf = _filter(args, steps)
     start(pf, steps, everywhere=args.everywhere, pose=args.start)
     track, recording = Track(), _recording(args, pf)
@@ -138,6 +140,21 @@ def run(args: argparse.Namespace) -> int:
             _report(args, pf, track, len(steps), recording)
         raise
     return LOST if _report(args, pf, track, len(steps), recording)["lost"] else 0
+
+
+def _steps(args: argparse.Namespace) -> list[Step]:
+    """Read the chosen scans, with the poses of ``--reference`` where it is given.
+
+    Raises:
+        ValueError: a file breaks its format, or has no scan or pose of these.
+    """
+    from gpusense.evaluation.steps import read_steps, with_references
+    from gpusense.evaluation.trajectory_files import read_tum
+
+    steps = read_steps(
+        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, sensors=args.sensors
+    )
+    return steps if args.reference is None else with_references(steps, *read_tum(args.reference))
 
 
 def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
@@ -196,21 +213,19 @@ def _motion(args: argparse.Namespace, steps: list[Step], noise: dict[str, Any]) 
     Raises:
         ValueError: there are no logged poses to learn from, or a number breaks its rule.
     """
+    from gpusense.evaluation.steps import references_to_learn_from
     from gpusense.localization.motion import OdometryMotion
     from gpusense.localization.motion_fit import fit_odometry_motion
 
     if args.fit_motion:
-        poses = [step.scan.pose for step in steps if step.scan.pose is not None]
-        if len(poses) < len(steps):
-            raise ValueError("--fit-motion: needs a log with poses, got one without")
-        return fit_odometry_motion([step.odometry for step in steps], poses).motion
+        return fit_odometry_motion(*references_to_learn_from(steps)).motion
     given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
     return OdometryMotion(**noise | {name: value for name, value in given.items() if value is not None})
 
 
 def _text(track: Track, step: Step) -> str:
     errors = track.errors()
-    error = "" if errors is None else f", error {errors[0][-1]:.2f} m"
+    error = "" if errors is None or math.isnan(errors[0][-1]) else f", error {errors[0][-1]:.2f} m"
     rate = 1 / max(sum(track.seconds[-1]), 1e-9)
     return f"scan {step.index}{error}, {track.sizes[-1]:.0f} effective, {rate:.0f} scans/s"
 
@@ -219,11 +234,12 @@ def _report(
     args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recording: Recording | None
 ) -> dict[str, Any]:
     """Write the files, and print the results; return the summary."""
-    from gpusense.evaluation.tracking import summary, write_tum
+    from gpusense.evaluation.tracking import summary
+    from gpusense.evaluation.trajectory_files import write_tum
 
     result = summary(track)
     if args.tum is not None:
-        write_tum(track, args.tum)
+        write_tum(args.tum, [step.scan.time for step in track.steps], track.poses)
     if args.plot is not None:
         _draw(args.plot, pf, track)
     if recording is not None:
@@ -250,6 +266,10 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     print(f"scans                 {s['scans']}, temperature {s['temperature']}")
     deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
     print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
+    if result["references_repeat_odometry"]:
+        print("reference             the logged poses, which are the odometry's own: the errors include its drift")
+    elif 0 < result["references"] < result["scans"]:
+        print(f"reference             poses of {result['references']} scans")
     if result["error_median"] is not None:
         at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
         print(
@@ -260,7 +280,7 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
             f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
             f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)\n"
             f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad\n"
-            f"ranks of logged poses {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
+            f"ranks of references   {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
         )
     print(
         f"effective sample size median {s['effective_sample_size_median']}\n"

@@ -17,6 +17,7 @@ class Defaults(NamedTuple):
         threshold: Resample below this share of the particles.
         stages: Most stages of a correction.
         share: Least effective sample size of a stage, as a share of the particles.
+        enough: Effective sample size that is enough for a stage of any number of particles.
         jitter: Share of the difference of two particles by which a drawn one moves between stages.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].
@@ -41,6 +42,7 @@ class Defaults(NamedTuple):
     threshold: float = 0.5
     stages: int = 4
     share: float = 0.1
+    enough: int = 500
     jitter: float = 0.2
     farthest: float = 1.0
     farthest_turn: float = 0.5

@@ -125,7 +125,7 @@ def settings_of_step(
     s[MEAN : DEVIATION + 4], s[REVERSE] = settings_of(motion)
     s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
     s[POOL], s[POOL + 1 : POOL + 4] = pool
-    s[SHARE], s[THRESHOLD] = DEFAULTS.share, options.threshold
+    s[SHARE], s[THRESHOLD] = min(DEFAULTS.share, DEFAULTS.enough / count), options.threshold
     s[STRATIFIED] = _DRAWS[options.resampling]
     # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold.
     spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(options.threshold)) + 2

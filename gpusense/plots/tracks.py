@@ -1,4 +1,4 @@
-"""Draw a track: map, particles, estimated and logged poses, and errors with their deviations."""
+"""Draw a track: map, particles, estimated and reference poses, and errors with their deviations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOGGED, ESTIMATED, CLOUD = "#8fa3b8", "#e4572e", "#4c78a8"
 
 
 def track_figure(pf: ParticleFilter, track: Track) -> Figure:
-    """Draw the map with estimated and logged poses and the last particles, and errors along the track.
+    """Draw the map with estimated and reference poses and the last particles, and errors along the track.
 
     Args:
         pf: The filter after its last step.
@@ -27,9 +27,11 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     axes = figure.subplot_mosaic([["map", "error"], ["map", "explained"]], width_ratios=(1.6, 1.0))
     ax, upper, lower = (axes[name] for name in ("map", "error", "explained"))
     draw_map(ax, pf.grid)
-    poses, truth = np.array(track.poses).reshape(-1, 3), track.truth
-    if truth is not None:
-        ax.plot(truth[:, 0], truth[:, 1], "-", color=LOGGED, lw=1.6, label="logged pose")
+    poses, references = np.array(track.poses).reshape(-1, 3), track.references
+    if references is not None:
+        # Single poses among unknown ones have no line.
+        style = "-" if np.isfinite(references).all() else "."
+        ax.plot(references[:, 0], references[:, 1], style, color=LOGGED, lw=1.6, label="reference pose")
     ax.plot(poses[:, 0], poses[:, 1], "-", color=ESTIMATED, lw=0.8, label="estimate")
     cloud = pf.host_particles()
     ax.plot(cloud[:, 0], cloud[:, 1], ".", color=CLOUD, ms=1.5, label="particles after the last scan")
@@ -38,7 +40,10 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     index = [step.index for step in track.steps]
     errors = track.errors()
     if errors is not None:
-        upper.semilogy(index, np.maximum(errors[0], 1e-4), color=ESTIMATED, lw=0.8, label="error")
+        known = np.isfinite(errors[0])
+        upper.semilogy(
+            np.array(index)[known], np.maximum(errors[0][known], 1e-4), color=ESTIMATED, lw=0.8, label="error"
+        )
     upper.semilogy(index, np.maximum(deviation, 1e-4), color=CLOUD, lw=0.8, label="deviation of the particles")
     upper.set(xlabel="scan", ylabel="position [m]")
     upper.legend(loc="best", fontsize="small")

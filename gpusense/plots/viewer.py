@@ -1,4 +1,4 @@
-"""Record a filter's run for the viewer Rerun: map, particles, scan, estimated and logged poses, errors (rerun-sdk)."""
+"""Record a filter's run for the viewer Rerun: map, particles, scan, estimated and reference poses, errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util.files import write_whole
-from gpusense.evaluation.tracking import Step, Track
+from gpusense.evaluation.steps import Step
+from gpusense.evaluation.tracking import Track
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import compose_poses
 from gpusense.world.grid import OccupancyGrid
@@ -20,7 +21,8 @@ _INSTALL = "recording for Rerun needs the library rerun-sdk: pip install 'gpusen
 # Most particles of a scan that are recorded; length of the robot's arrow [m].
 _PARTICLES, _ARROW = 2000, 0.7
 # Red, green, blue.
-_WALL, _CLOUD, _SCAN, _ESTIMATE, _LOGGED = (90, 90, 90), (76, 120, 168), (242, 184, 72), (228, 87, 46), (143, 163, 184)
+_WALL, _CLOUD, _SCAN = (90, 90, 90), (76, 120, 168), (242, 184, 72)
+_ESTIMATE, _REFERENCE = (228, 87, 46), (143, 163, 184)
 
 
 class Recording:
@@ -39,7 +41,7 @@ class Recording:
         except ImportError as error:
             raise ImportError(f"{_INSTALL} ({error})") from None
         self._rr: Any = rerun
-        self._stream = rerun.RecordingStream("gpusense localize")
+        self._stream: Any = self._rr.RecordingStream("gpusense localize")
         self._content = self._stream.binary_stream()
         walls = grid.cell_centers(*np.nonzero(grid.occupied))
         self._points("map", walls, _WALL, grid.resolution / 2, static=True)
@@ -58,9 +60,9 @@ class Recording:
         self._points("particles", cloud[:: max(len(cloud) // _PARTICLES, 1), :2], _CLOUD, 0.02)
         self._points("scan", end_points(step.scan.scanner, step.scan.ranges, pose), _SCAN, 0.03)
         self._arrow("estimate", pose, _ESTIMATE)
-        if step.scan.pose is not None:
-            self._arrow("logged", np.array(step.scan.pose), _LOGGED)
-            error = float(np.hypot(*(pose[:2] - step.scan.pose[:2])))
+        if step.reference is not None:
+            self._arrow("reference", np.array(step.reference), _REFERENCE)
+            error = float(np.hypot(*(pose[:2] - step.reference[:2])))
             self._stream.log("error", rr.Scalars(error))
         self._stream.log("effective_sample_size", rr.Scalars(track.sizes[-1]))
         self._stream.log("lost", rr.Scalars(float(track.lost[-1])))
@@ -76,8 +78,9 @@ class Recording:
             OSError, ValueError: the file cannot be written.
         """
         paths = [("path/estimate", np.array(track.poses).reshape(-1, 3), _ESTIMATE)]
-        if track.truth is not None:
-            paths.append(("path/logged", track.truth, _LOGGED))
+        if track.references is not None:
+            known = np.isfinite(track.references[:, 0])
+            paths.append(("path/reference", track.references[known], _REFERENCE))
         for name, poses, colour in paths:
             line = self._rr.LineStrips3D([_flat(poses[:, :2])], colors=[colour])
             self._stream.log(name, line, static=True)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense.sweeps.job import Job
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.tracking import Step
+    from gpusense.evaluation.steps import Step
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
@@ -76,7 +76,7 @@ class Store:
 
     def steps(self, job: Job) -> list[Step]:
         """Return the scans of a job with their odometry."""
-        from gpusense.evaluation.tracking import read_steps
+        from gpusense.evaluation.steps import read_steps
 
         chosen = _chosen(job)
         key = (job.log, *chosen.items())

@@ -15,6 +15,7 @@ from support.command_line import error_of
 import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation import tracking
+from gpusense.evaluation.steps import read_steps
 
 BEARINGS = np.radians(np.arange(-90, 91, 1.0))
 
@@ -137,7 +138,7 @@ def test_odometry_that_copies_corrected_poses_is_chained_from_wheel_readings(tmp
 
     log = tmp_path / "copied.log"
     log.write_text("\n".join([scan(0, 0), wheels(0.3), wheels(0.9), scan(1, 1), wheels(2.1), scan(2, 2)]))
-    found = [step.odometry[0] for step in tracking.read_steps(log, range_max=8.0)]
+    found = [step.odometry[0] for step in read_steps(log, range_max=8.0)]
     np.testing.assert_allclose(found, [0, 0.9, 2.0])
 
 
@@ -227,8 +228,8 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     assert cli.main(call(place, "--limit", "3", "--record", str(path))) == 0
     assert f"written: {path}" in capsys.readouterr().out
     names = path.read_text().split()
-    each = ["particles", "scan", "estimate", "logged", "error", "effective_sample_size", "lost"]
-    assert names == ["map", *each * 3, "path/estimate", "path/logged"]
+    each = ["particles", "scan", "estimate", "reference", "error", "effective_sample_size", "lost"]
+    assert names == ["map", *each * 3, "path/estimate", "path/reference"]
     assert streams[0].times == [("scan", k) for k in range(3)]
     kept = dict(streams[0].logged)
     walls, grid = kept["map"][0][0], gs.read_map(place / "map.yaml")

@@ -17,7 +17,8 @@ from support.split_scene import field, states
 
 import gpusense as gs
 from gpusense.commands import cli
-from gpusense.evaluation.tracking import Track, follow, read_steps, start, summary
+from gpusense.evaluation.steps import read_steps
+from gpusense.evaluation.tracking import Track, follow, start, summary
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
 from gpusense.sweeps.plan import jobs_of

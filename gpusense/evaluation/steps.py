@@ -1,0 +1,155 @@
+"""Scans of a log as a filter takes them: with raw odometry, and with reference poses to compare estimates with."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
+from gpusense.logs import Odometry, Pose, Scan
+from gpusense.logs.several import read_lasers
+from gpusense.world.scanner import Scanner
+
+Floats = NDArray[np.float64]
+# Logged poses are those of the odometry where no step of one differs from that of the other by more [m, rad].
+_SAME = 1e-4
+# A reference pose lies between two of a trajectory that are no further apart [s], or is one at the same time.
+_FARTHEST, _SAME_TIME = 0.5, 1e-3
+
+
+@dataclass(frozen=True)
+class Step:
+    """A scan of a log with its odometry.
+
+    Attributes:
+        index: Index of the scan in the log.
+        scan: It.
+        odometry: Pose by raw odometry alone [m, m, rad].
+        sensor: Index of its laser.
+        reference: Pose of the robot to compare estimates with, by default the logged one; None where none is known.
+    """
+
+    index: int
+    scan: Scan
+    odometry: Pose
+    sensor: int = 0
+    reference: Pose | None = None
+
+
+def read_steps(
+    path: str | os.PathLike[str],
+    *,
+    range_max: float | None = None,
+    every: int = 1,
+    offset: int = 0,
+    limit: int | None = None,
+    sensors: Sequence[str] = (),
+) -> list[Step]:
+    """Read scans of a log with raw odometry.
+
+    Logs with corrected poses often have a copy of them in place of the odometry, and wheel readings between the scans
+    that start at the corrected pose of the scan before. The odometry is then chained from these readings.
+
+    Args:
+        path: The log.
+        range_max: Readings of at least this are "no return" [m]; None for the log's.
+        every: Stride of the scans of each laser.
+        offset: Index of the first scan of each laser.
+        limit: Largest number of scans; None for all.
+        sensors: Its lasers: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
+
+    Raises:
+        ValueError: the log breaks its format, has no scan of these, or a laser changes its geometry.
+        FileNotFoundError: the log is missing.
+    """
+    chained, last, between = np.zeros(3), None, None
+    steps: list[Step] = []
+    counts = [0] * max(len(sensors), 1)
+    scanners: dict[int, Scanner] = {}
+    for sensor, record in read_lasers(path, sensors, range_max=range_max):
+        if isinstance(record, Odometry):
+            between = record.pose
+            continue
+        if last is not None:
+            copied = record.pose is not None and np.allclose(record.pose, record.odometry, atol=1e-9)
+            after = between if copied and between is not None else record.odometry
+            chained = compose_poses(chained, pose_difference(last.odometry, after))
+        last, between = record, None
+        count = counts[sensor]
+        if count >= offset and (count - offset) % every == 0 and (limit is None or len(steps) < limit):
+            if record.scanner != scanners.setdefault(sensor, record.scanner):
+                raise ValueError(f"log: every scan must come from the same scanner, got another at scan {count}")
+            x, y, theta = (float(value) for value in chained)
+            steps.append(Step(count, record, (x, y, theta), sensor, record.pose))
+        counts[sensor] += 1
+    if not steps:
+        raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")
+    return steps
+
+
+def repeats_odometry(steps: Sequence[Step]) -> bool:
+    """Return whether the reference poses are those of the odometry, as in a log without corrections."""
+    known = [step for step in steps if step.reference is not None]
+    if len(known) < max(len(steps), 2):
+        return False
+    references = np.array([step.reference for step in known])
+    odometry = np.array([step.odometry for step in known])
+    difference = pose_difference(references[:-1], references[1:]) - pose_difference(odometry[:-1], odometry[1:])
+    difference[:, 2] = wrap_angle(difference[:, 2])
+    return bool(np.abs(difference).max() <= _SAME)
+
+
+def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Pose]]:
+    """Return odometry and reference poses of the steps that have a reference, to learn the noise of the odometry.
+
+    Raises:
+        ValueError: there is none, or the references are the odometry's own poses.
+    """
+    known = [(step.odometry, step.reference) for step in steps if step.reference is not None]
+    if not known:
+        raise ValueError("--fit-motion: must have a log with poses, or a --reference, got neither")
+    if repeats_odometry(steps):
+        raise ValueError("--fit-motion: must have poses that are not the odometry's own, got a log of these")
+    return [odometry for odometry, _ in known], [reference for _, reference in known]
+
+
+def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list[Step]:
+    """Return steps whose references are those of a trajectory at the times of the scans.
+
+    A pose between two of the trajectory at most half a second apart is interpolated.
+
+    Args:
+        steps: Steps.
+        times: (T,) increasing times of the trajectory [s].
+        poses: (T, 3) its poses.
+
+    Raises:
+        ValueError: no scan has a time of the trajectory.
+    """
+    found = [_pose_at(step.scan.time, times, poses) for step in steps]
+    if not any(found):
+        span = f"{times[0]:.3f} to {times[-1]:.3f} s"
+        first, last = steps[0].scan.time, steps[-1].scan.time
+        raise ValueError(f"--reference: must have poses at times of the scans, {first:.3f} to {last:.3f} s, got {span}")
+    return [replace(step, reference=pose) for step, pose in zip(steps, found, strict=True)]
+
+
+def _pose_at(time: float, times: Floats, poses: Floats) -> Pose | None:
+    """Return the pose of a trajectory at a time; None where none is near."""
+    after = int(np.searchsorted(times, time))
+    near = [k for k in (after - 1, after) if 0 <= k < len(times)]
+    nearest = min(near, key=lambda k: abs(times[k] - time))
+    if abs(times[nearest] - time) <= _SAME_TIME:
+        x, y, theta = (float(value) for value in poses[nearest])
+        return x, y, theta
+    if len(near) < 2 or times[after] - times[after - 1] > _FARTHEST:
+        return None
+    share = (time - times[after - 1]) / (times[after] - times[after - 1])
+    change = poses[after] - poses[after - 1]
+    change[2] = wrap_angle(change[2])
+    x, y, theta = (float(value) for value in poses[after - 1] + share * change)
+    return x, y, theta

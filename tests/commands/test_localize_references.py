@@ -1,0 +1,127 @@
+"""``gpusense localize --reference``: poses to compare with come from a trajectory, or are those of the log."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.command_line import error_of
+
+import gpusense as gs
+from gpusense.commands import cli
+from gpusense.evaluation.trajectory_files import read_tum, write_tum
+
+BEARINGS = np.radians(np.arange(-90, 91, 1.0))
+COUNT = 14
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Return a folder with a map, a log whose poses are its odometry, and the true trajectory of every other scan."""
+    folder, rng = tmp_path_factory.mktemp("references"), np.random.default_rng(1)
+    cells = np.pad(np.zeros((60, 80), int), 2, constant_values=100)
+    cells[30, :26] = 100
+    grid = gs.OccupancyGrid(cells, resolution=0.1)
+    gs.write_map(grid, folder / "map.yaml")
+    caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
+    poses, odometry, lines = [np.array([3.0, 1.5, 3.0])], np.zeros(3), []
+    for step in range(COUNT):
+        ranges = caster.cast(poses[-1][None], BEARINGS)[0] + rng.normal(0, 0.02, len(BEARINGS))
+        numbers = [*ranges, *odometry, *odometry]
+        lines.append(f"FLASER 181 {' '.join(f'{value:.4f}' for value in numbers)} {step}.0 robot {step}.0")
+        poses.append(gs.compose_poses(poses[-1], rng.normal((0.15, 0, 0.1), 0.01)))
+        odometry = gs.compose_poses(odometry, (0.15, 0, 0.1))
+    (folder / "raw.log").write_text("\n".join(lines))
+    write_tum(folder / "true.tum", np.arange(0, COUNT, 2), poses[:COUNT:2])
+    return folder
+
+
+def call(place, *more):
+    common = ["--particles", "300", "--backend", "numpy", "--range-max", "20", "--beams", "60"]
+    return ["localize", "--map", str(place / "map.yaml"), "--log", str(place / "raw.log"), *common, *more]
+
+
+def summary_of(capsys, arguments):
+    code = cli.main([*arguments, "--json"])
+    return code, json.loads(capsys.readouterr().out)["summary"]
+
+
+def test_errors_are_those_of_the_scans_that_have_a_reference(place, capsys):
+    arguments = call(place, "--reference", str(place / "true.tum"))
+    code, found = summary_of(capsys, arguments)
+    assert code == 0 and found["references"] == COUNT // 2 and not found["references_repeat_odometry"]
+    # The filter begins around the first reference pose, far from the odometry's.
+    assert found["error_95"] < 0.1 and found["heading_95"] < 0.1 and found["converged_at"] == 0
+    assert found["relative_95"] < 0.1 and sum(found["rank_histogram"]) == pytest.approx(1, abs=1e-3)
+    assert cli.main([*arguments, "--plot", str(place / "run.png")]) == 0
+    assert f"poses of {COUNT // 2} scans" in capsys.readouterr().out
+
+
+def test_a_later_convergence_is_counted_in_scans(place, capsys):
+    _, found = summary_of(capsys, call(place, "--reference", str(place / "true.tum"), "--start", "5.5", "1.5", "3"))
+    assert found["converged_at"] is None or found["converged_at"] % 2 == 0
+
+
+def test_logged_poses_that_are_the_odometry_are_named_so(place, capsys):
+    arguments = call(place, "--start", "3", "1.5", "3")
+    code, found = summary_of(capsys, arguments)
+    # The pose is right, and yet far from the odometry's.
+    assert code == 0 and not found["lost"] and found["references_repeat_odometry"] and found["error_median"] > 1
+    assert cli.main(arguments) == 0
+    assert "which are the odometry's own" in capsys.readouterr().out
+
+
+def test_noise_is_not_learned_from_the_odometry_itself(place, capsys):
+    assert "must have poses that are not the odometry's own" in error_of(call(place, "--fit-motion"), capsys)
+    arguments = call(place, "--fit-motion", "--reference", str(place / "true.tum"))
+    code, found = summary_of(capsys, arguments)
+    assert code == 0 and found["error_95"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("100 1 2 0 0 0 0 1\n101 1 2 0 0 0 0 1\n", "must have poses at times of the scans, 0.000 to 13.000 s"),
+        ("0 1 2 0 0 0 1\n", "must have eight finite numbers on each line, got 7 columns"),
+        ("0 1 2 0 0 0 0 nan\n", "must have eight finite numbers"),
+        ("0 1 2 0 0 0 0 0\n", "must have quaternions other than 0"),
+        ("1 1 2 0 0 0 0 1\n0 1 2 0 0 0 0 1\n", "must have increasing times, got 0.0 after 1.0"),
+        ("# nothing\n", "must have eight numbers on each line"),
+        ("one 1 2 0 0 0 0 1\n", "must have eight numbers on each line"),
+        (None, "bad.tum: No such file or directory"),
+    ],
+)
+def test_bad_trajectories_are_one_line(place, capsys, tmp_path, text, message):
+    path = tmp_path / "bad.tum"
+    if text is not None:
+        path.write_text(text)
+    assert message in error_of(call(place, "--reference", str(path)), capsys)
+
+
+def test_a_trajectory_is_read_as_written_and_flattened(tmp_path):
+    rng = np.random.default_rng(2)
+    poses = np.column_stack([rng.normal(size=(9, 2)), rng.uniform(-np.pi, np.pi, 9)])
+    write_tum(tmp_path / "a.tum", np.arange(9) / 7, poses)
+    times, found = read_tum(tmp_path / "a.tum")
+    np.testing.assert_allclose(times, np.arange(9) / 7, atol=1e-6)
+    np.testing.assert_allclose(found, poses, atol=2e-6)
+    # A quaternion of any length, tilted forwards by 0.2 rad after a turn of 1 rad.
+    w, z, turn, lean = np.cos(0.5), np.sin(0.5), np.cos(0.1), np.sin(0.1)
+    numbers = 3 * np.array([-z * lean, w * lean, z * turn, w * turn])
+    (tmp_path / "b.tum").write_text("0 1 2 3 {} {} {} {}\n".format(*numbers))
+    np.testing.assert_allclose(read_tum(tmp_path / "b.tum")[1], [[1, 2, 1]], atol=1e-12)
+
+
+def test_poses_between_those_of_a_trajectory_are_interpolated(place):
+    from gpusense.evaluation.steps import read_steps, with_references
+
+    steps = read_steps(place / "raw.log", range_max=20.0)
+    times = np.array([0.8, 1.2, 3.0, 5.9, 6.6])
+    poses = np.array([[0, 0, 3.1], [4, 8, 3.1 + 0.2 - 2 * np.pi], [7, 7, 1], [0, 0, 0], [1, 1, 1]])
+    found = [step.reference for step in with_references(steps, times, poses)]
+    # 1 s lies between two poses, 3 s is one of them, and the two around 6 s are too far apart.
+    assert [k for k, pose in enumerate(found) if pose is not None] == [1, 3]
+    np.testing.assert_allclose(found[1][:2], [2, 4])
+    assert gs.wrap_angle(found[1][2] - 3.2) == pytest.approx(0, abs=1e-12)
+    assert found[3] == (7.0, 7.0, 1.0)

@@ -96,7 +96,9 @@ def _fitness(fitness: Fitness) -> str:
         f"the logged poses explain {100 * fitness.explained:.0f} % of the beams of a scan, and are likelier than "
         f"{100 * fitness.better:.0f} % of poses anywhere"
     )
-    return f"the log fits the map: {share}" if fitness.fits else f"WRONG MAP: {share}; is this the map of the log?"
+    if fitness.fits:
+        return f"the log fits the map: {share}"
+    return f"WRONG MAP: {share}; is this the map of the log, and are its poses on the map?"
 
 
 def number_text(value: float | None, absent: str = "-") -> str:

@@ -166,13 +166,18 @@ class ParticleFilter(Results):
         return most if particles is None else checks.integer("particles", particles, low=1, high=most)
 
     def _place(self, poses: np.ndarray, *, again: bool = False) -> None:
-        """Replace all particles, and forget the likelihood of scans; a search again keeps the judgements of poses."""
+        """Replace all particles, and forget the likelihood of scans.
+
+        Args:
+            poses: (N, 3) poses.
+            again: Whether a search is repeated: readings, judgements of poses and a pending motion are kept.
+        """
         self._cloud.place(poses)
-        self._shown, self._started, self._pending, self._wide = len(poses), True, _STILL, 0
+        self._shown, self._started, self._wide = len(poses), True, 0
         self._backend.upload(np.zeros(STATE), self._cloud.state)
         if not again:
+            self._pending, self._last, self._trust = _STILL, {}, None
             self._verdict.reset()
-            self._trust = None
             for sensor in self._sensors:
                 sensor.restart()
         if self.options.recovery == "augmented" and not self._pool[0]:
@@ -222,6 +227,7 @@ class ParticleFilter(Results):
         Args:
             readings: The reading of the filter's only model, or a mapping from models to their readings; those of a
                 model whose ``log_likelihood`` takes several arguments are a tuple. None is a missing reading.
+                :meth:`estimate` and :meth:`reset` read arrays of a device again, which must not change until then.
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -249,7 +255,8 @@ class ParticleFilter(Results):
             raise
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
-        self._last = whole
+        # The caller may write the next readings to the same arrays.
+        self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
         self._wide = max(self._wide - 1, 0)
         self._verdict.corrected()
         if chosen.temperature == "auto":
@@ -266,8 +273,10 @@ class ParticleFilter(Results):
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
 
+        A motion that was predicted after these readings moves the new particles, too.
+
         Raises:
-            RuntimeError: there are no readings yet.
+            RuntimeError: there are no readings since the particles were initialised.
         """
         if not self._last:
             raise RuntimeError("reset: needs a correction first")
@@ -281,7 +290,7 @@ class ParticleFilter(Results):
             best = np.argsort(-score, kind="stable")[: max(count // 10, 1)]
         chosen = starts.spread(tries[best], (0.1, 0.1, 0.05), count, self._key(), each=True)
         kept = self._cloud.host_poses(self._cloud.next, self._cloud.count)
-        kept[:: max(len(kept) // count, 1)][:count] = chosen[: len(kept[:: max(len(kept) // count, 1)][:count])]
+        kept[:: max(len(kept) // count, 1)][:count] = chosen
         self._place(kept, again=True)
 
     def flush(self) -> None:
@@ -341,3 +350,8 @@ class ParticleFilter(Results):
         """Return the particles of the next step by KLD sampling."""
         poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
         return kld_count(poses, self.options.least, self.options.most)
+
+
+def _copied(reading: Any) -> Any:
+    """Return a copy of a NumPy array, and another object as it is."""
+    return reading.copy() if isinstance(reading, np.ndarray) else reading

@@ -80,7 +80,8 @@ class Results(ABC):
             else:
                 pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
         explained = self._verdict.explained(pose, self._last) if self._last else math.nan
-        size = summary.effective_sample_size if self._last else float(self._shown)
+        # It is 0 before the first correction of these particles.
+        size = summary.effective_sample_size or float(self._shown)
         return Estimate(
             pose, covariance, size, self._verdict.lost, explained, self.temperatures[0], summary.temperature,
             summary.degenerate, self._shown,

@@ -306,3 +306,41 @@ def test_readings_that_are_refused_cost_no_motion(backend):
         pf.correct(np.ones(4))
     pf.correct(np.full(5, np.nan))
     assert abs(pf.mean_and_covariance()[0][0] - 4.0) < 0.1
+
+
+def placed(backend="numpy", **options):
+    """Return a filter of a few particles near the truth."""
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    pf = gs.ParticleFilter(model, particles=200, seed=1, **options)
+    pf.initialize(mean=TRUTH, covariance=np.diag([0.01, 0.01, 1e-4]))
+    return pf
+
+
+def test_a_reset_keeps_the_motion_since_the_readings(backend):
+    still, moved = placed(backend), placed(backend)
+    for pf in (still, moved):
+        pf.correct(walls(TRUTH))
+    moved.predict((0, 0, 0), (0.5, 0, 0))
+    for pf in (still, moved):
+        pf.reset()
+    ways = np.hypot(*(moved.host_particles() - still.host_particles())[:, :2].T)
+    assert abs(np.median(ways) - 0.5) < 0.05
+
+
+def test_particles_without_a_correction_are_all_effective(backend):
+    pf = placed(backend)
+    pf.correct(walls(TRUTH))
+    pf.reset()
+    assert pf.estimate().effective_sample_size == 200
+    pf.initialize(mean=TRUTH, covariance=np.eye(3) * 0.01)
+    assert pf.estimate().effective_sample_size == 200
+    # Readings of the particles before say nothing of these.
+    with pytest.raises(RuntimeError, match="needs a correction first"):
+        pf.reset()
+
+
+def test_readings_may_be_overwritten_after_the_correction(backend):
+    pf, ranges = placed(backend), walls(TRUTH)
+    pf.correct(ranges)
+    ranges[:] = np.nan
+    assert pf.estimate().explained > 0.9

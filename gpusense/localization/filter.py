@@ -58,7 +58,8 @@ class ParticleFilter(Results):
 
     Raises:
         TypeError: A model or option of another type.
-        ValueError: No model, models of several devices, a device without float64, or an option beyond its limits.
+        ValueError: No model, models of several devices, a device without float64, an option beyond its limits, or
+            ``recovery="augmented"`` without a map.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -93,6 +94,8 @@ class ParticleFilter(Results):
             particles=particles, seed=seed, temperature=temperature, resampling=resampling, threshold=threshold,
             stages=stages, recovery=recovery, beam_skip=beam_skip,
         )  # fmt: skip
+        if self.options.recovery == "augmented" and not any(hasattr(one.model, "grid") for one in self._sensors):
+            raise ValueError("recovery: 'augmented' needs a model with a map, got none")
         most = self.options.most
         residual = self.options.resampling == "residual"
         self._cloud = Cloud(self._backend, most, len(self._sensors), self._sensors[0].precision, residual=residual)

@@ -95,6 +95,8 @@ class SplitParticleFilter(ParticleFilter):
     @property
     def moments(self) -> Any:
         """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt, in host memory."""
+        self._check_started()
+        self.flush()
         return self._cloud.estimate(self._shown)[:MOMENTS]
 
     @property

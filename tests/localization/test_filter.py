@@ -213,6 +213,7 @@ def test_starts_have_their_densities():
         (lambda: gs.ParticleFilter(gps(), temperature=2.0), "temperature: must be"),
         (lambda: gs.ParticleFilter(gps(), resampling="multinomial"), "resampling: must be"),
         (lambda: gs.ParticleFilter(gps(), stages=9), "stages: must be"),
+        (lambda: gs.ParticleFilter(gps(), recovery="augmented"), "recovery: 'augmented' needs a model with a map"),
         (lambda: gs.ParticleFilter(gps()).initialize(mean=np.zeros(3), covariance=-np.eye(3)), "positive semidefinite"),
         (lambda: gs.ParticleFilter(gps()).initialize_uniform(), "bounds: must be given"),
         (lambda: gs.OdometryMotion(alpha=(-1, 0, 0, 0)), "alpha: must be >= 0"),
@@ -344,3 +345,26 @@ def test_readings_may_be_overwritten_after_the_correction(backend):
     pf.correct(ranges)
     ranges[:] = np.nan
     assert pf.estimate().explained > 0.9
+
+
+def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
+    """With a threshold below 1 / N no weight may vanish in its rounding to an integer."""
+    pf = gs.ParticleFilter(gps(backend), particles=1000, seed=2, threshold=1e-15, stages=1)
+    pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.09, 0.09, 1e-6]))
+    for _ in range(3):
+        pf.correct(np.zeros(2))
+    found = pf.estimate()
+    # Three fixes with the variance of the start leave a quarter of it.
+    np.testing.assert_allclose(np.diag(found.covariance)[:2], 0.09 / 4, rtol=0.2)
+    assert 100 < found.effective_sample_size < 1000
+
+
+@pytest.mark.parametrize("turn", [-40.0, 20.0])
+def test_headings_stay_in_half_a_turn_after_several_turns(backend, turn):
+    motion = gs.VelocityMotion(alpha=(0,) * 6, least=(0.0, 0.0))
+    pf = gs.ParticleFilter(gps(backend), motion=motion, particles=10)
+    pf.initialize(mean=(0, 0, 0), covariance=np.zeros((3, 3)))
+    pf.predict((1.0, turn / 2), 2.0)
+    radius = 2.0 / turn
+    expected = radius * np.sin(turn), radius * (1 - np.cos(turn)), gs.wrap_angle(turn)
+    np.testing.assert_allclose(pf.host_particles(), np.tile(expected, (10, 1)), atol=1e-12)

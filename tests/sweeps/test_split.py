@@ -53,6 +53,15 @@ def test_several_sensors_and_a_start_anywhere(needs):
     assert equal(states(pf), states(one))
 
 
+def test_moments_follow_a_prediction():
+    pf = SplitParticleFilter(field, devices=["numpy"] * 2, particles=100, seed=1)
+    with pytest.raises(RuntimeError, match="must be initialised first"):
+        pf.moments  # noqa: B018
+    pf.initialize(mean=(1, 1, 0), covariance=np.eye(3) * 1e-6)
+    pf.predict((0, 0, 0), (0.5, 0, 0))
+    assert abs(pf.moments[0] - 1.5) < 0.05
+
+
 def test_few_particles_leave_a_device_idle():
     expected = states(gs.ParticleFilter(field("numpy"), particles=20, seed=1))
     pf = SplitParticleFilter(field, devices=["numpy"] * 4, particles=20, seed=1)

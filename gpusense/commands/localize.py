@@ -300,6 +300,8 @@ def _ranks(histogram: list[float]) -> str:
 
 
 def _verdict(result: dict[str, Any]) -> str:
+    if result["explained_median"] is None:
+        return "not lost: no scan has beams to judge by"
     share = f"the estimates explain {100 * result['explained_median']:.0f} % of the beams of a scan"
     if result["lost"]:
         return f"LOST: {share}; is this the map of the log?"

@@ -37,6 +37,10 @@ class SampledMotion(NamedTuple):
     reverse: float = 0.0
 
 
+# No motion.
+STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
+
+
 class MotionModel(Protocol):
     """Motion that a particle filter samples from the arguments of ``predict``."""
 

@@ -33,7 +33,7 @@ class Sensor:
         model: A scan, landmark or point model.
 
     Attributes:
-        model: It.
+        model: The model.
         backend: Its device.
         precision: Precision of its log-likelihoods.
         beams: Beams that a scan uses; 0 for other models.

@@ -368,3 +368,22 @@ def test_headings_stay_in_half_a_turn_after_several_turns(backend, turn):
     radius = 2.0 / turn
     expected = radius * np.sin(turn), radius * (1 - np.cos(turn)), gs.wrap_angle(turn)
     np.testing.assert_allclose(pf.host_particles(), np.tile(expected, (10, 1)), atol=1e-12)
+
+
+def test_a_fix_at_particles_without_weight_changes_nothing(backend):
+    pf = gs.ParticleFilter(gps(backend), particles=200, seed=1, threshold=0.4)
+    far = np.zeros((200, 3))
+    far[120:, 0] = 50.0
+
+    class Likelihood:
+        log_p, positions = np.zeros(200), far
+
+    pf.initialize_from(Likelihood())
+    pf.correct(np.zeros(2))
+    before = pf.estimate()
+    assert before.effective_sample_size == pytest.approx(120, abs=1) and not before.degenerate
+    pf.correct(np.array([50.0, 0.0]))
+    found, weights = pf.estimate(), pf.host_weights()
+    assert found.degenerate and found.effective_sample_size == pytest.approx(before.effective_sample_size)
+    np.testing.assert_allclose(found.pose, before.pose, atol=1e-12)
+    assert np.isfinite(weights).all() and weights[pf.host_particles()[:, 0] > 25].sum() == 0

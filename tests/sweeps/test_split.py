@@ -27,6 +27,20 @@ OPTIONS = [
 ]
 
 
+FEW = dict(particles=(20, 200), seed=1, threshold=0.4)
+
+
+class TwoPlaces:
+    """A likelihood of poses at two places that are far apart."""
+
+    log_p = np.zeros(200)
+    positions = np.repeat([(0.0, 0.0, 0.0), (50.0, 0.0, 0.0)], (120, 80), axis=0)
+
+
+def gps(device):
+    return gs.PositionModel(gs.PositionParameters(sigma=0.3, z_rand=0.0), backend=device)
+
+
 def equal(one, two):
     return all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
 
@@ -60,6 +74,18 @@ def test_moments_follow_a_prediction():
     pf.initialize(mean=(1, 1, 0), covariance=np.eye(3) * 1e-6)
     pf.predict((0, 0, 0), (0.5, 0, 0))
     assert abs(pf.moments[0] - 1.5) < 0.05
+
+
+def test_a_fix_at_particles_without_weight_has_the_bits_of_one_device(backend):
+    """The weights stay, and draws that change the number of particles take them."""
+    found = []
+    for make in (gs.ParticleFilter(gps(backend), **FEW), SplitParticleFilter(gps, devices=[backend] * 3, **FEW)):
+        make.initialize_from(TwoPlaces())
+        for x in (0.0, 50.0, 0.0):
+            make.correct(np.array([x, 0.0]))
+            found.append((make.host_particles(), make.host_weights(), make.estimate().pose))
+    assert len(found[0][0]) != len(found[2][0])
+    assert all(equal(one, two) for one, two in zip(found[:3], found[3:], strict=True))
 
 
 def test_few_particles_leave_a_device_idle():

@@ -90,16 +90,19 @@ class ParticleFilter(Beginnings):
         )  # fmt: skip
         if self.options.recovery == "augmented" and not any(hasattr(one.model, "grid") for one in self._sensors):
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
-        most = self.options.most
-        residual = self.options.resampling == "residual"
-        self._cloud = Cloud(self._backend, most, len(self._sensors), self._sensors[0].precision, residual=residual)
+        self._cloud = self._new_cloud()
         self._scoring = Scoring(self._cloud, self._sensors)
         self._step, self._started, self._pending = 0, False, STILL
-        self._shown, self._wide = most, 0
+        self._shown, self._wide = self.options.most, 0
         self._pool = 0, (0.0, 0.0, 0.0)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
         self._trust = None
+
+    def _new_cloud(self) -> Cloud:
+        """Return room for the particles."""
+        residual, precision = self.options.resampling == "residual", self._sensors[0].precision
+        return Cloud(self._backend, self.options.most, len(self._sensors), precision, residual=residual)
 
     def __repr__(self) -> str:
         one = self.options
@@ -157,8 +160,8 @@ class ParticleFilter(Beginnings):
         try:
             self._score(given, motion.kind, drawn)
         except BaseException:
-            # Readings that a model refuses cost no motion.
-            self._pending = self._pending if self._cloud.moved else motion
+            # Readings that a model refuses cost no motion. An equal one that is not STILL shows moved particles.
+            self._pending = STILL._replace() if self._cloud.moved else motion
             raise
         self._shown = self._cloud.count
         self._cloud.resized(drawn)

@@ -88,6 +88,24 @@ def test_a_fix_at_particles_without_weight_has_the_bits_of_one_device(backend):
     assert all(equal(one, two) for one, two in zip(found[:3], found[3:], strict=True))
 
 
+@pytest.mark.parametrize("split", [False, True], ids=["one", "split"])
+def test_the_motion_shows_where_the_second_of_two_readings_is_refused(backend, split):
+    def make(device):
+        return [gps(device), gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend=device)]
+
+    options = dict(particles=100, seed=1)
+    pf = SplitParticleFilter(make, devices=[backend] * 2, **options) if split else (
+        gs.ParticleFilter(make(backend), **options)
+    )  # fmt: skip
+    position, heading = pf.models
+    pf.initialize(mean=(0, 0, 0), covariance=np.eye(3) * 1e-6)
+    pf.correct({position: np.zeros(2)})
+    pf.predict((0, 0, 0), (1.0, 0, 0))
+    with pytest.raises(TypeError, match="heading: must hold real numbers"):
+        pf.correct({position: np.array([1.0, 0.0]), heading: "north"})
+    assert abs(pf.estimate().pose[0] - 1.0) < 0.1 and abs(pf.host_particles()[:, 0].mean() - 1.0) < 0.1
+
+
 def test_few_particles_leave_a_device_idle():
     expected = states(gs.ParticleFilter(field("numpy"), particles=20, seed=1))
     pf = SplitParticleFilter(field, devices=["numpy"] * 4, particles=20, seed=1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +19,6 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import print_json
-from gpusense.evaluation.machine import machine, machine_line
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
@@ -122,6 +119,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C those so far."""
+    from gpusense.commands.localize_report import report
     from gpusense.evaluation.tracking import Track, follow, start
 
     steps = _steps(args)
@@ -137,9 +135,9 @@ def run(args: argparse.Namespace) -> int:
                     recording.add(pf, track, one)
     except KeyboardInterrupt:
         if track.steps:
-            _report(args, pf, track, len(steps), recording)
+            report(args, pf, track, len(steps), recording)
         raise
-    return LOST if _report(args, pf, track, len(steps), recording)["lost"] else 0
+    return LOST if report(args, pf, track, len(steps), recording)["lost"] else 0
 
 
 def _steps(args: argparse.Namespace) -> list[Step]:
@@ -228,86 +226,3 @@ def _text(track: Track, step: Step) -> str:
     error = "" if errors is None or math.isnan(errors[0][-1]) else f", error {errors[0][-1]:.2f} m"
     rate = 1 / max(sum(track.seconds[-1]), 1e-9)
     return f"scan {step.index}{error}, {track.sizes[-1]:.0f} effective, {rate:.0f} scans/s"
-
-
-def _report(
-    args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recording: Recording | None
-) -> dict[str, Any]:
-    """Write the files, and print the results; return the summary."""
-    from gpusense.evaluation.tracking import summary
-    from gpusense.evaluation.trajectory_files import write_tum
-
-    result = summary(track)
-    if args.tum is not None:
-        write_tum(args.tum, [step.scan.time for step in track.steps], track.poses)
-    if args.plot is not None:
-        _draw(args.plot, pf, track)
-    if recording is not None:
-        recording.write(track, args.record)
-    if args.json:
-        options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
-        poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
-        document = {"options": options, "filter": repr(pf), "summary": result, "scans_chosen": chosen}
-        print_json(document | {"poses": poses, "machine": machine()})
-        return result
-    _print(pf, result, chosen, track)
-    for path in (args.tum, args.plot, args.record):
-        if path is not None:
-            print(f"written: {path}")
-    return result
-
-
-def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
-    """Print the summary."""
-    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name != "rank_histogram"}
-    print(f"{pf!r}\n")
-    if result["scans"] < chosen:
-        print(f"interrupted: results of {result['scans']} of {chosen} scans")
-    print(f"scans                 {s['scans']}, temperature {s['temperature']}")
-    deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
-    print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
-    if result["references_repeat_odometry"]:
-        print("reference             the logged poses, which are the odometry's own: the errors include its drift")
-    elif 0 < result["references"] < result["scans"]:
-        print(f"reference             poses of {result['references']} scans")
-    if result["error_median"] is not None:
-        at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
-        print(
-            f"position error        median {s['error_median']} m, 95 % below {s['error_95']} m\n"
-            f"heading error         median {s['heading_median']} rad, 95 % below {s['heading_95']} rad\n"
-            f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m\n"
-            f"within 1 m, 20 deg    {at}\n"
-            f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
-            f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)\n"
-            f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad\n"
-            f"ranks of references   {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
-        )
-    print(
-        f"effective sample size median {s['effective_sample_size_median']}\n"
-        f"ms per scan           predict {s['ms_predict']}, score {s['ms_score']}, resample {s['ms_resample']}, "
-        f"estimate {s['ms_estimate']}\n\n"
-        f"verdict: {_verdict(result)}\n\n{machine_line()}",
-    )
-    sys.stdout.flush()
-
-
-def _three(values: Any) -> str:
-    return "{:.3f} m, {:.3f} m, {:.3f} rad".format(*values)
-
-
-def _ranks(histogram: list[float]) -> str:
-    return " ".join(f"{100 * share:.0f}" for share in histogram)
-
-
-def _verdict(result: dict[str, Any]) -> str:
-    share = f"the estimates explain {100 * result['explained_median']:.0f} % of the beams of a scan"
-    if result["lost"]:
-        return f"LOST: {share}; is this the map of the log?"
-    return f"not lost: {share}"
-
-
-def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:
-    from gpusense.plots.drawing import save
-    from gpusense.plots.tracks import track_figure
-
-    save(track_figure(pf, track), path)

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]
-# Quantiles of chi-square with 3 degrees of freedom, and of the normal density.
+# Quantiles of chi-square with 3 degrees of freedom, and of the normal density; bins of the rank histogram.
 REGIONS = {"50": 2.366, "80": 4.642, "95": 7.815}
-NEES_MEDIAN, _NORMAL_95 = 2.366, 1.96
-BINS = 10
+_NORMAL_95, _BINS = 1.96, 10
 
 
 def nees_of(differences: Floats, covariances: Floats) -> Floats:
@@ -60,7 +59,7 @@ def coverage_report(differences: Floats, covariances: Floats, ranks: Floats) -> 
     """
     squared = nees_of(differences, covariances)
     largest = np.maximum(np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1], 0)
-    counts = np.histogram(ranks, bins=BINS, range=(0, 1))[0]
+    counts = np.histogram(ranks, bins=_BINS, range=(0, 1))[0]
     return {
         **{f"coverage_{name}": float(np.mean(squared < limit)) for name, limit in REGIONS.items()},
         "nees_median": float(np.median(squared)),

@@ -27,7 +27,7 @@ class Step:
 
     Attributes:
         index: Index of the scan in the log.
-        scan: It.
+        scan: The scan.
         odometry: Pose by raw odometry alone [m, m, rad].
         sensor: Index of its laser.
         reference: Pose of the robot to compare estimates with, by default the logged one; None where none is known.
@@ -59,7 +59,7 @@ def read_steps(
         range_max: Readings of at least this are "no return" [m]; None for the log's.
         every: Stride of the scans of each laser.
         offset: Index of the first scan of each laser.
-        limit: Largest number of scans; None for all.
+        limit: Largest number of scans; None for all. Nothing is read after the last one.
         sensors: Its lasers: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
 
     Raises:
@@ -80,11 +80,13 @@ def read_steps(
             chained = compose_poses(chained, pose_difference(last.odometry, after))
         last, between = record, None
         count = counts[sensor]
-        if count >= offset and (count - offset) % every == 0 and (limit is None or len(steps) < limit):
+        if count >= offset and (count - offset) % every == 0:
             if record.scanner != scanners.setdefault(sensor, record.scanner):
                 raise ValueError(f"log: every scan must come from the same scanner, got another at scan {count}")
             x, y, theta = (float(value) for value in chained)
             steps.append(Step(count, record, (x, y, theta), sensor, record.pose))
+            if len(steps) == limit:
+                break
         counts[sensor] += 1
     if not steps:
         raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")

@@ -35,7 +35,7 @@ class Track:
         ranks: Ranks of the reference poses among the particles (:func:`rank_of`), of the steps that have one.
         sizes: Effective sample sizes.
         lost: Verdicts.
-        explained: Shares of beams that the estimates explain.
+        explained: Shares of beams that the estimates explain; NaN for a scan without beams.
         temperatures: Temperatures.
         seconds: Seconds of each step: predict, score, resample, estimate.
     """
@@ -122,8 +122,13 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
 
 
 def summary(track: Track) -> dict[str, Any]:
-    """Return figures of a track: errors, coverage, convergence, verdict and times; None without reference poses."""
+    """Return figures of a track: errors, coverage, convergence, verdict and times.
+
+    Figures against reference poses are None without them, and so is the median share of explained beams where no scan
+    has beams.
+    """
     count = len(track.steps)
+    explained = [share for share in track.explained if not math.isnan(share)]
     seconds = np.array(track.seconds).reshape(-1, 4) * 1000
     means = np.median(seconds, axis=0)
     tail = track.lost[-max(count // 10, 1) :]
@@ -131,7 +136,7 @@ def summary(track: Track) -> dict[str, Any]:
         "scans": count,
         "lost": bool(np.mean(tail) > 0.5),
         "scans_lost": int(np.sum(track.lost)),
-        "explained_median": float(np.median(track.explained)),
+        "explained_median": float(np.median(explained)) if explained else None,
         "temperature": track.temperatures[-1],
         "effective_sample_size_median": float(np.median(track.sizes)),
     }

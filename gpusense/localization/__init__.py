@@ -1,1 +1,1 @@
-"""Localization of a robot: particle weights and resampling."""
+"""Localisation of a robot: the particle filter, its motion models, weights and temperature."""

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from gpusense._util import checks
-from gpusense._util.typing import AnyArray
-from gpusense.interface.constants import STATE
-from gpusense.localization import options, skipping, starts
+from gpusense.localization import options, resetting, skipping
 from gpusense.localization.adaptive import kld_count
+from gpusense.localization.beginnings import Beginnings
+from gpusense.localization.calibration import calibrate
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.estimates import covariance_of
-from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.results import Results
+from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.scoring import Given, Scoring, given_of
 from gpusense.localization.sensors import sensors_of
-from gpusense.localization.trust import Trust
 from gpusense.localization.verdict import Verdict
 
-_STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
 
-
-class ParticleFilter(Results):
+class ParticleFilter(Beginnings):
     """Monte Carlo localisation: particles that move with the odometry and are weighed by sensors.
 
     All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed
@@ -58,7 +52,8 @@ class ParticleFilter(Results):
 
     Raises:
         TypeError: A model or option of another type.
-        ValueError: No model, models of several devices, a device without float64, or an option beyond its limits.
+        ValueError: No model, models of several devices, a device without float64, an option beyond its limits, or
+            ``recovery="augmented"`` without a map.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -93,16 +88,21 @@ class ParticleFilter(Results):
             particles=particles, seed=seed, temperature=temperature, resampling=resampling, threshold=threshold,
             stages=stages, recovery=recovery, beam_skip=beam_skip,
         )  # fmt: skip
-        most = self.options.most
-        residual = self.options.resampling == "residual"
-        self._cloud = Cloud(self._backend, most, len(self._sensors), self._sensors[0].precision, residual=residual)
+        if self.options.recovery == "augmented" and not any(hasattr(one.model, "grid") for one in self._sensors):
+            raise ValueError("recovery: 'augmented' needs a model with a map, got none")
+        self._cloud = self._new_cloud()
         self._scoring = Scoring(self._cloud, self._sensors)
-        self._step, self._started, self._pending = 0, False, _STILL
-        self._shown, self._wide = most, 0
+        self._step, self._started, self._pending = 0, False, STILL
+        self._shown, self._wide = self.options.most, 0
         self._pool = 0, (0.0, 0.0, 0.0)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
-        self._trust: Trust | None = None
+        self._trust = None
+
+    def _new_cloud(self) -> Cloud:
+        """Return room for the particles."""
+        residual, precision = self.options.resampling == "residual", self._sensors[0].precision
+        return Cloud(self._backend, self.options.most, len(self._sensors), precision, residual=residual)
 
     def __repr__(self) -> str:
         one = self.options
@@ -112,92 +112,6 @@ class ParticleFilter(Results):
             f"ParticleFilter([{sensors}], {self.motion!r}, particles={count}, temperature={one.temperature!r}, "
             f"stages={one.stages}, backend={self.device.selection!r})"
         )
-
-    # ---- beginnings
-
-    def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
-        """Draw particles from a normal density.
-
-        Args:
-            mean: (3,) pose [m, m, rad].
-            covariance: (3, 3) covariance, positive semidefinite.
-            particles: Their number; the filter's (most) by default.
-
-        Raises:
-            TypeError, ValueError: an argument breaks its rule.
-        """
-        self._place(starts.normal(mean, covariance, self._number(particles), self._key()))
-
-    def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
-        """Draw particles uniformly over the free cells of the map, with any heading.
-
-        Without bounds and another ``recovery``, half of the particles are placed anew, as by :meth:`reset`, where they
-        have converged to a pose that scans contradict.
-
-        Args:
-            bounds: ((x_min, y_min), (x_max, y_max)) [m]: only there. Needed for models without a grid.
-            particles: Their number; the filter's (most) by default.
-
-        Raises:
-            TypeError, ValueError: an argument breaks its rule, or no cell is free.
-        """
-        pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
-        self._place(starts.spread(pool, spread, self._number(particles), self._key()))
-        self._wide = DEFAULTS.wide_scans
-        if bounds is None and self.options.recovery is None:
-            self._trust = Trust()
-
-    def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
-        """Draw particles from a likelihood over poses.
-
-        Args:
-            likelihood: An object with ``log_p``, an array of M log-likelihoods of any shape, and ``positions``, (M, 3)
-                poses in the same order or an array of shape ``log_p.shape + (3,)``.
-            particles: Their number; the filter's (most) by default.
-
-        Raises:
-            TypeError, ValueError: it has not these, or no finite log-likelihood.
-        """
-        pool, spread = starts.likely_pool(likelihood, self._number(particles), self._key())
-        self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))
-
-    def _number(self, particles: int | None) -> int:
-        most = self.options.most
-        return most if particles is None else checks.integer("particles", particles, low=1, high=most)
-
-    def _place(self, poses: np.ndarray, *, again: bool = False) -> None:
-        """Replace all particles, and forget the likelihood of scans; a search again keeps the judgements of poses."""
-        self._cloud.place(poses)
-        self._shown, self._started, self._pending, self._wide = len(poses), True, _STILL, 0
-        self._backend.upload(np.zeros(STATE), self._cloud.state)
-        if not again:
-            self._verdict.reset()
-            self._trust = None
-            for sensor in self._sensors:
-                sensor.restart()
-        if self.options.recovery == "augmented" and not self._pool[0]:
-            self._set_pool(*starts.free_pool([sensor.model for sensor in self._sensors], None))
-
-    def _set_pool(self, pool: np.ndarray, spread: tuple[float, float, float]) -> None:
-        self._cloud.set_pool(pool)
-        self._pool = len(pool), spread
-
-    def _key(self) -> tuple[int, int, int]:
-        """Return the two words of the seed, and a number of this step."""
-        self._step += 1
-        return *self.options.words, self._step
-
-    def _random_poses(self, count: int) -> np.ndarray:
-        """Return poses anywhere in the free space, the same ones each time; around the particles without a grid."""
-        key = (*self.options.words, 0)
-        try:
-            pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], None)
-        except ValueError:
-            centre = self._cloud.host_poses(self._cloud.shown, self._shown).mean(axis=0)
-            pool, spread = centre[None], (10.0, 10.0, math.pi)
-        return starts.spread(pool, spread, count, key)
-
-    # ---- steps
 
     def predict(self, *motion: Any) -> None:
         """Move the particles: by the odometry before and after the step, or what the motion model takes.
@@ -211,7 +125,7 @@ class ParticleFilter(Results):
         """
         self._check_started()
         sampled = self.motion.sampled(*motion)
-        if self._pending is not _STILL:
+        if self._pending is not STILL:
             self.flush()
         # The next correction begins with the move: one program has both.
         self._pending = sampled
@@ -222,6 +136,7 @@ class ParticleFilter(Results):
         Args:
             readings: The reading of the filter's only model, or a mapping from models to their readings; those of a
                 model whose ``log_likelihood`` takes several arguments are a tuple. None is a missing reading.
+                :meth:`estimate` and :meth:`reset` read arrays of a device again, which must not change until then.
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -236,24 +151,26 @@ class ParticleFilter(Results):
         if self._verdict.watches(whole):
             self._verdict.predicted(self.host_particles(), self.host_weights(), whole)
         if chosen.beam_skip is not None:
-            given = self._without_skipped(given, chosen.beam_skip)
-        motion, self._pending = self._pending, _STILL
+            particles = self.host_particles(), self.host_weights()
+            given = skipping.skipped(self._sensors, given, particles, self._verdict.anywhere, chosen.beam_skip)
+        motion, self._pending = self._pending, STILL
         drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
         self._cloud.upload_settings(self._settings(motion, [index for index, _ in given]))
         self._cloud.moved = False
         try:
             self._score(given, motion.kind, drawn)
         except BaseException:
-            # Readings that a model refuses cost no motion.
-            self._pending = self._pending if self._cloud.moved else motion
+            # Readings that a model refuses cost no motion. An equal one that is not STILL shows moved particles.
+            self._pending = STILL._replace() if self._cloud.moved else motion
             raise
         self._shown = self._cloud.count
         self._cloud.resized(drawn)
-        self._last = whole
+        # The caller may write the next readings to the same arrays.
+        self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
         self._wide = max(self._wide - 1, 0)
         self._verdict.corrected()
         if chosen.temperature == "auto":
-            self._calibrate(given)
+            calibrate(self._sensors, given, self._cloud, self._shown)
         if self._verdict.due and self._is_contradicted():
             self.reset()
 
@@ -266,29 +183,25 @@ class ParticleFilter(Results):
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
 
+        A motion that was predicted after these readings moves the new particles, too.
+
         Raises:
-            RuntimeError: there are no readings yet.
+            RuntimeError: there are no readings since the particles were initialised.
         """
         if not self._last:
             raise RuntimeError("reset: needs a correction first")
-        count = max(self._cloud.count // 2, 1)
-        tries = self._random_poses(max(20_000, 10 * count))
-        score = np.zeros(len(tries))
-        for index, reading in self._last.items():
-            sensor = self._sensors[index]
-            score += sensor.temperature(self.options.temperature, reading) * sensor.log_likelihood(tries, reading)
-        with np.errstate(invalid="ignore"):
-            best = np.argsort(-score, kind="stable")[: max(count // 10, 1)]
-        chosen = starts.spread(tries[best], (0.1, 0.1, 0.05), count, self._key(), each=True)
-        kept = self._cloud.host_poses(self._cloud.next, self._cloud.count)
-        kept[:: max(len(kept) // count, 1)][:count] = chosen[: len(kept[:: max(len(kept) // count, 1)][:count])]
-        self._place(kept, again=True)
+        tries = self._random_poses(resetting.tries_of(self._cloud.count))
+        poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
+        chosen = resetting.with_likely_poses(
+            poses, tries, self._sensors, self._last, self.options.temperature, self._key()
+        )
+        self._place(chosen, again=True)
 
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
-        if self._pending is _STILL:
+        if self._pending is STILL:
             return
-        motion, self._pending = self._pending, _STILL
+        motion, self._pending = self._pending, STILL
         self._cloud.upload_settings(self._settings(motion, []))
         self._cloud.move(motion.kind)
         self._shown = self._cloud.count
@@ -296,20 +209,6 @@ class ParticleFilter(Results):
     def _score(self, given: list[Given], kind: int, drawn: int) -> None:
         """Run the stages of a correction, the last of which draws a number of particles."""
         self._scoring.correct(given, kind, self.options.stages, drawn)
-
-    def _without_skipped(self, given: list[Given], share: float) -> list[Given]:
-        """Return readings without the beams that too few particles explain."""
-        poses, weights = self.host_particles(), self.host_weights()
-        if not skipping.together(poses, weights):
-            return given
-        asked = slice(None, None, max(len(poses) // skipping.ASKED, 1))
-        few, anywhere = (poses[asked], weights[asked]), self._verdict.anywhere()
-        return [
-            (i, skipping.without_skipped(self._sensors[i], reading, *few, anywhere, share))
-            if self._sensors[i].calibrates
-            else (i, reading)
-            for i, reading in given
-        ]
 
     def _settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
         """Return the numbers of a step."""
@@ -320,24 +219,12 @@ class ParticleFilter(Results):
         step, count = self._key()[2], self._cloud.count
         return options.settings_of_step(self.options, motion, step, count, self._pool, sensors)
 
-    def _calibrate(self, given: list[Given]) -> None:
-        """Learn how much beams are worth at the estimate, if the particles lie together."""
-        due = []
-        for index, reading in given:
-            sensor = self._sensors[index]
-            if sensor.calibrates:
-                sensor.count()
-                due += [(sensor, reading)] if sensor.due else []
-        if not due or self._cloud.summary().effective_sample_size < 2:
-            return
-        numbers = self._cloud.estimate(self._shown)
-        covariance = covariance_of(numbers)
-        if max(covariance[0, 0], covariance[1, 1]) > skipping.TOGETHER**2:
-            return
-        for sensor, reading in due:
-            sensor.correlate(numbers[:3], covariance, reading)
-
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""
         poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
         return kld_count(poses, self.options.least, self.options.most)
+
+
+def _copied(reading: Any) -> Any:
+    """Return a copy of a NumPy array, and another object as it is."""
+    return reading.copy() if isinstance(reading, np.ndarray) else reading

@@ -37,6 +37,10 @@ class SampledMotion(NamedTuple):
     reverse: float = 0.0
 
 
+# No motion.
+STILL = SampledMotion((0.0,) * 4, (0.0,) * 4)
+
+
 class MotionModel(Protocol):
     """Motion that a particle filter samples from the arguments of ``predict``."""
 
@@ -233,7 +237,9 @@ class VelocityMotion:
         length = math.hypot(math.sqrt(a1 * v * v + a2 * w * w) * seconds, at)
         half = math.sqrt(a3 * v * v + a4 * w * w) * seconds / 2
         last = math.hypot(math.sqrt(a5 * v * v + a6 * w * w) * seconds, ar)
-        return SampledMotion((w * seconds / 2, v * seconds, 0.0, 0.0), (half, length, 0.0, last), VELOCITY_MODEL)
+        # The last turn takes whole turns back: the kernel wraps a heading once.
+        back = math.tau * -round(w * seconds / math.tau)
+        return SampledMotion((w * seconds / 2, v * seconds, 0.0, back), (half, length, 0.0, last), VELOCITY_MODEL)
 
 
 def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:

@@ -36,6 +36,7 @@ from gpusense.interface.constants import (
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import SampledMotion, settings_of
 
+# Most particles.
 _MOST = 1 << 24
 _DRAWS = {"systematic": SYSTEMATIC, "stratified": INDEPENDENT, "residual": RESIDUAL}
 
@@ -127,8 +128,10 @@ def settings_of_step(
     s[POOL], s[POOL + 1 : POOL + 4] = pool
     s[SHARE], s[THRESHOLD] = min(DEFAULTS.share, DEFAULTS.enough / count), options.threshold
     s[STRATIFIED] = _DRAWS[options.resampling]
-    # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold.
-    spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(options.threshold)) + 2
+    # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold. An effective
+    # sample size of one particle is above any lower threshold.
+    threshold = max(options.threshold, 1 / _MOST)
+    spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(threshold)) + 2
     s[SCALE] = 2.0 ** (52 - spare)
     if options.recovery == "augmented":
         s[SLOW_RATE], s[FAST_RATE] = DEFAULTS.slow, DEFAULTS.fast

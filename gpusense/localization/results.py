@@ -80,7 +80,11 @@ class Results(ABC):
             else:
                 pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
         explained = self._verdict.explained(pose, self._last) if self._last else math.nan
-        size = summary.effective_sample_size if self._last else float(self._shown)
+        size = summary.effective_sample_size
+        if not size > 0:
+            # The kernels have summed no squares: before a correction, or where no weighted particle was possible.
+            weights = self._cloud.host_weights(self._shown)
+            size = float(weights.sum() ** 2 / (weights @ weights))
         return Estimate(
             pose, covariance, size, self._verdict.lost, explained, self.temperatures[0], summary.temperature,
             summary.degenerate, self._shown,

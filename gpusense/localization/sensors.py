@@ -33,7 +33,7 @@ class Sensor:
         model: A scan, landmark or point model.
 
     Attributes:
-        model: It.
+        model: The model.
         backend: Its device.
         precision: Precision of its log-likelihoods.
         beams: Beams that a scan uses; 0 for other models.
@@ -57,8 +57,8 @@ class Sensor:
         self._ranges: Any = None
         self.seconds, self._started = 0.0, 0
 
-    def temperature(self, chosen: float | str, reading: object = None) -> float:
-        """Return the temperature of the log-likelihood now."""
+    def temperature(self, chosen: float | str) -> float:
+        """Return the temperature of the log-likelihood now, given that of scans or "auto"."""
         if not self.calibrates:
             return 1.0
         return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen

@@ -9,23 +9,52 @@ explained by few particles, and these are the right ones.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization.pose_algebra import mean_pose
+from gpusense.localization.scoring import Given
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import boundary
 
 # Particles that are asked; largest deviation of particles that lie together [m]; largest share of skipped beams.
-ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
+_ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
 
 
 def together(poses: np.ndarray, weights: np.ndarray) -> bool:
     """Tell whether the deviation of particles is at most half a metre along x and along y."""
     d = poses[:, :2] - mean_pose(poses, weights)[:2]
     return bool(np.all(weights @ d**2 <= TOGETHER**2 * weights.sum()))
+
+
+def skipped(
+    sensors: Sequence[Sensor],
+    given: list[Given],
+    particles: tuple[np.ndarray, np.ndarray],
+    anywhere: Callable[[], np.ndarray],
+    share: float,
+) -> list[Given]:
+    """Return readings in which the scans lack the beams that too few particles explain.
+
+    Args:
+        sensors: The filter's sensors.
+        given: Indices of sensors with their readings.
+        particles: (N, 3) poses and (N,) weights.
+        anywhere: Returns (M, 3) poses anywhere in the free space.
+        share: Least weight of the particles that explain a used beam, as a share.
+    """
+    poses, weights = particles
+    if not together(poses, weights):
+        return given
+    asked = slice(None, None, max(len(poses) // _ASKED, 1))
+    few, elsewhere = (poses[asked], weights[asked]), anywhere()
+    return [
+        (i, without_skipped(sensors[i], reading, *few, elsewhere, share) if sensors[i].calibrates else reading)
+        for i, reading in given
+    ]
 
 
 def without_skipped(

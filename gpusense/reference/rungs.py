@@ -38,6 +38,16 @@ def largest_of(largest: np.ndarray, groups: int) -> float:
     return float(largest[:groups].max())
 
 
+def possible_of(totals: np.ndarray, largest: float) -> float:
+    """Return the largest score; -inf where all particles with a weight are impossible next to those without one."""
+    return largest if totals[RUNGS - 1] > 0.0 else -np.inf
+
+
+def column_of(high: float, rung: int) -> int:
+    """Return the column of sums with the weights of a rung; that of the weights before where none is possible."""
+    return 2 * RUNGS if high == -np.inf else rung
+
+
 def tempered(score: np.ndarray, largest: float, left: float) -> np.ndarray:
     """Return the likelihoods of scores relative to the largest on the last rung.
 
@@ -90,10 +100,11 @@ def set_stage(
     """Write the state of a stage that uses a rung; at stage 0, follow the evidence."""
     if stage == 0:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
-    size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
+    with np.errstate(invalid="ignore"):
+        size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
     rest = left - left * 0.5**rung
     state[stage * STAGE + LEFT] = rest if stage + 1 < stages else 0.0
-    state[stage * STAGE + TOTAL] = totals[rung]
+    state[stage * STAGE + TOTAL] = totals[column_of(high, rung)]
     state[stage * STAGE + SAMPLE_SIZE] = size
     wanted = size < settings[THRESHOLD] * particles or rest > 0.0 or (stage == 0 and state[INJECTED] > 0.0)
     state[stage * STAGE + RESAMPLED] = 1.0 if wanted else 0.0

@@ -17,7 +17,7 @@ from gpusense.interface.constants import (
     TEMPERATURE,
     WEIGHT_SUMS,
 )
-from gpusense.reference.rungs import largest_of, left_of, rung_of, set_stage, tempered
+from gpusense.reference.rungs import largest_of, left_of, possible_of, rung_of, set_stage, tempered
 
 
 def add_scores(
@@ -97,7 +97,7 @@ def set_weights(
     stages: int,
 ) -> None:
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
-    scale, left, high = settings[SCALE], left_of(state, stage), largest_of(largest, groups)
+    scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, largest_of(largest, groups))
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0
     likelihood = tempered(score[:particles], high, left)
     for _ in range(rung, RUNGS - 1):

@@ -18,10 +18,8 @@ from gpusense.interface.constants import (
     ESTIMATE,
     ESTIMATE_SUMS,
     FIRST,
-    LEFT,
     SETTINGS,
     SHARE,
-    STAGE,
     TEMPERATURE,
     WEIGHT_SUMS,
     WHOLE,
@@ -30,7 +28,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.sensors import Sensor
-from gpusense.reference.rungs import rung_of
+from gpusense.reference.rungs import left_of, rung_of
 from gpusense.sweeps.gathered import Gathered
 from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
 
@@ -93,11 +91,12 @@ class Shard:
                 self._cloud.move(kind)
         yield
 
-    def _upload_settings(self, drawn: Part, **changes: float) -> None:
+    def _upload_settings(self, drawn: Part, share: float | None = None) -> None:
+        """Upload the numbers of the step for the particles of a part, with another share where one is given."""
         settings = self._settings.copy()
         settings[FIRST], settings[WHOLE], settings[DRAWN] = drawn.first, self._part.whole, drawn.whole
-        if "share" in changes:
-            settings[SHARE] = changes["share"]
+        if share is not None:
+            settings[SHARE] = share
         self._backend.upload(settings, self._cloud.settings)
 
     def score(self, source: int, given: Sequence[Given]) -> Step:
@@ -171,7 +170,7 @@ class Shard:
         cloud, part, stage = self._cloud, self._part, place[0]
         cloud.shown, cloud.next = source, 1 - source
         if part.size:
-            self._choose_rung(totals, float(state[(stage - 1) * STAGE + LEFT]) if stage else 1.0)
+            self._choose_rung(totals, left_of(state, stage))
             self._backend.upload(totals, cloud.sums.totals)
             out = cloud.weight, cloud.ends
             self._backend.run(cloud.sums.set_weights(cloud.numbers(), (cloud.sums.largest, 1), place, out))
@@ -198,7 +197,7 @@ class Shard:
             share = float(np.nextafter(share, math.inf if found < wanted else 0.0))
         else:
             raise RuntimeError(f"weights: must have a share for rung {wanted} of {count:g} particles, got none")
-        self._upload_settings(self._part, share=share)
+        self._upload_settings(self._part, share)
 
     def shift_ends(self, offset: float) -> Step:
         """Add the weights of the shards before to the cumulative weights on the device, and wait."""

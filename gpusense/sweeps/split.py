@@ -25,13 +25,12 @@ from gpusense.localization.cloud import Cloud
 from gpusense.localization.sums import fans_of
 from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate
-from gpusense.reference.rungs import rung_of
-from gpusense.reference.weighing import join_rows, set_weights
+from gpusense.reference.rungs import column_of, left_of, possible_of, rung_of, set_stage
+from gpusense.reference.weighing import join_rows
 from gpusense.sweeps.parts import Given, Part, parts_of
 from gpusense.sweeps.teams import Here, There
 
 _PLAIN = frozenset[str]()
-_NONE = np.empty(0)
 # Bytes of a pose and a cumulative weight.
 _PARTICLE = 32
 
@@ -127,32 +126,14 @@ class SplitCloud(Cloud):
         stage, state = place[0], self._numbers
         high = max(self._all("score", source, given))
         each = self._all("weigh", high, stage)
-        totals, largest = np.zeros(WEIGHT_SUMS), np.array([high])
+        totals = np.zeros(WEIGHT_SUMS)
         join_rows(_PLAIN, np.concatenate(each), totals, self._size, WEIGHT_SUMS, self._size)
-        left = state[(stage - 1) * STAGE + LEFT] if stage else 1.0
+        left, high = left_of(state, stage), possible_of(totals, high)
         rung = rung_of(totals, self._settings, self._settings[SHARE] * self.count) if left > 0.0 else 0
-        set_weights(
-            _PLAIN,
-            _NONE,
-            _NONE,
-            largest,
-            _NONE,
-            _NONE,
-            totals,
-            self._settings,
-            state,
-            _NONE,
-            _NONE,
-            self.count,
-            1,
-            1,
-            1,
-            1,
-            *place,
-        )
+        set_stage(totals, self._settings, state, high, left, rung, self.count, *place)
         drawn = self._parts if state[stage * STAGE + LEFT] > 0.0 else parts_of(last, self._size)
         marks = self._marks(stage, drawn)
-        offsets = np.cumsum([0.0, *(one[rung] for one in each[:-1])])
+        offsets = np.cumsum([0.0, *(one[column_of(high, rung)] for one in each[:-1])])
         shown = state.copy()
         if marks is not None:
             # A filter that changes its size draws, whatever its weights.

@@ -64,17 +64,21 @@ class SplitParticleFilter(ParticleFilter):
             raise TypeError(f"devices: must be a list of selection strings, got {checks.show(devices)}")
         if executors is not None and len(executors) != len(devices):
             raise ValueError(f"executors: must be one for each of {len(devices)} devices, got {len(executors)}")
-        models = models_of(make, devices[0])
-        super().__init__(models, **options)
+        self._make, self._devices, self._executors = make, devices, executors
+        super().__init__(models_of(make, devices[0]), **options)
+
+    def _new_cloud(self) -> SplitCloud:
+        """Return room for the particles of each device."""
+        make, devices, executors = self._make, self._devices, self._executors
         most, count, residual = self.options.most, len(devices), self.options.resampling == "residual"
         # Parts are whole blocks, whose number does not always divide by that of the shards.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)
         team: Here | There
         if executors is None:
-            team = Here([models, *(models_of(make, device) for device in devices[1:])], share, residual)
+            team = Here([self.models, *(models_of(make, device) for device in devices[1:])], share, residual)
         else:
             team = There(executors, make, devices, share, residual)
-        self._cloud = SplitCloud(team, self._backend, most, self._sensors[0].precision, residual=residual)
+        return SplitCloud(team, self._backend, most, self._sensors[0].precision, residual=residual)
 
     def __repr__(self) -> str:
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
@@ -95,6 +99,8 @@ class SplitParticleFilter(ParticleFilter):
     @property
     def moments(self) -> Any:
         """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt, in host memory."""
+        self._check_started()
+        self.flush()
         return self._cloud.estimate(self._shown)[:MOMENTS]
 
     @property

@@ -35,6 +35,16 @@ double largest_of(global const double *largest, const int groups) {
     return high;
 }
 
+// Return the largest score; -inf where all particles with a weight are impossible next to those without one.
+double possible_of(global const double *totals, const double largest) {
+    return totals[RUNGS - 1] > 0.0 ? largest : -INFINITY;
+}
+
+// Return the column of sums with the weights of a rung; that of the weights before where none is possible.
+int column_of(const double high, const int rung) {
+    return high == -INFINITY ? 2 * RUNGS : rung;
+}
+
 // Return the likelihood of a score relative to the largest, on the last rung; 1 where none is possible or nothing is
 // left. Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
 double tempered(const double score, const double largest, const double left) {
@@ -81,7 +91,7 @@ void set_stage(global const double *totals, global const double *settings, globa
                        (stage == 0 && state[INJECTED] > 0.0);
     global double *own = state + stage * STAGE;
     own[LEFT] = stage + 1 < stages ? rest : 0.0;
-    own[TOTAL] = totals[rung];
+    own[TOTAL] = totals[column_of(high, rung)];
     own[SAMPLE_SIZE] = size;
     own[RESAMPLED] = wanted ? 1.0 : 0.0;
     own[DEGENERATE] = high == -INFINITY ? 1.0 : 0.0;

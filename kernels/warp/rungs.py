@@ -5,6 +5,8 @@ See weighing.py.
 Recovery: augmented MCL, *Probabilistic Robotics* table 8.3, with the mean likelihood per beam.
 """
 
+import math
+
 import warp as wp
 
 from .elementary import exp_of, log_of
@@ -19,6 +21,7 @@ STAGE = wp.constant(8)
 LOWEST = wp.constant(wp.float64(0.0078125))
 EVIDENCE, SLOW, FAST, INJECTED = (wp.constant(place) for place in (48, 49, 50, 51))
 LARGEST_EXPONENT = wp.constant(wp.float64(700.0))
+NEVER = wp.constant(wp.float64(-math.inf))
 ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
 
 
@@ -29,6 +32,24 @@ def largest_of(largest: wp.array(dtype=wp.float64), groups: wp.int32):
     for g in range(1, groups):
         high = wp.max(high, largest[g])
     return high
+
+
+# Return the largest score; -inf where all particles with a weight are impossible next to those without one.
+@wp.func
+def possible_of(totals: wp.array(dtype=wp.float64), largest: wp.float64):
+    high = NEVER + ZERO
+    if totals[RUNGS - 1] > ZERO:
+        high = largest
+    return high
+
+
+# Return the column of sums with the weights of a rung; that of the weights before where none is possible.
+@wp.func
+def column_of(high: wp.float64, rung: wp.int32):
+    column = rung
+    if wp.isinf(high):
+        column = 2 * RUNGS
+    return column
 
 
 # Return the likelihood of a score relative to the largest, on the last rung; 1 where none is possible or nothing is
@@ -110,7 +131,7 @@ def set_stage(
         wanted = True
     first = stage * STAGE
     state[first + LEFT] = wp.where(stage + 1 < stages, rest, ZERO)
-    state[first + TOTAL] = totals[rung]
+    state[first + TOTAL] = totals[column_of(high, rung)]
     state[first + SAMPLE_SIZE] = size
     state[first + RESAMPLED] = wp.where(wanted, ONE, ZERO)
     state[first + DEGENERATE] = wp.where(wp.isinf(high), ONE, ZERO)

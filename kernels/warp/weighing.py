@@ -7,15 +7,26 @@ sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums o
 """
 
 import functools
-import math
 
 import warp as wp
 
 from .prelude import kernel, precision
-from .rungs import RUNGS, SCALE, SHARE, WEIGHT_SUMS, largest_of, left_of, rung_of, set_stage, tempered
+from .rungs import (
+    NEVER,
+    RUNGS,
+    SCALE,
+    SHARE,
+    WEIGHT_SUMS,
+    column_of,
+    largest_of,
+    left_of,
+    possible_of,
+    rung_of,
+    set_stage,
+    tempered,
+)
 
 TEMPERATURE = wp.constant(27)
-NEVER = wp.constant(wp.float64(-math.inf))
 ZERO = wp.constant(wp.float64(0.0))
 eight = wp.types.vector(length=8, dtype=wp.float64)
 
@@ -154,15 +165,16 @@ def make(name, flags):
             return
         scale = settings[SCALE]
         left = left_of(state, stage)
-        high = largest_of(largest, groups)
+        high = possible_of(totals, largest_of(largest, groups))
         rung = int(0)
         if left > ZERO:
             rung = rung_of(totals, settings, settings[SHARE] * wp.float64(particles))
+        column = column_of(high, rung)
         total = ZERO + ZERO
         for g in range(b / fan):
-            total += joined[g * WEIGHT_SUMS + rung]
+            total += joined[g * WEIGHT_SUMS + column]
         for i in range(b - b % fan, b):
-            total += sums[i * WEIGHT_SUMS + rung]
+            total += sums[i * WEIGHT_SUMS + column]
         for n in range(begin, wp.min(begin + block, particles)):
             likelihood = tempered(score[n], high, left)
             for _k in range(rung, RUNGS - 1):

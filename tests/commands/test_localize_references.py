@@ -125,3 +125,19 @@ def test_poses_between_those_of_a_trajectory_are_interpolated(place):
     np.testing.assert_allclose(found[1][:2], [2, 4])
     assert gs.wrap_angle(found[1][2] - 3.2) == pytest.approx(0, abs=1e-12)
     assert found[3] == (7.0, 7.0, 1.0)
+
+
+@pytest.mark.parametrize(("blind", "verdict"), [({3}, " % of the beams"), (set(range(COUNT)), "no scan has beams")])
+def test_scans_without_beams_leave_the_verdict_to_others(place, capsys, blind, verdict):
+    lines = (place / "raw.log").read_text().split("\n")
+    for scan in blind:
+        words = lines[scan].split()
+        lines[scan] = " ".join([*words[:2], *["25.0"] * 181, *words[183:]])
+    (place / "blind.log").write_text("\n".join(lines))
+    arguments = call(place, "--reference", str(place / "true.tum"), "--log", str(place / "blind.log"))
+    _, found = summary_of(capsys, arguments)
+    explained = found["explained_median"]
+    assert explained is None if len(blind) == COUNT else explained > 0.9
+    cli.main(arguments)
+    text = capsys.readouterr().out
+    assert verdict in text and "nan" not in text

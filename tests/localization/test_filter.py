@@ -213,6 +213,7 @@ def test_starts_have_their_densities():
         (lambda: gs.ParticleFilter(gps(), temperature=2.0), "temperature: must be"),
         (lambda: gs.ParticleFilter(gps(), resampling="multinomial"), "resampling: must be"),
         (lambda: gs.ParticleFilter(gps(), stages=9), "stages: must be"),
+        (lambda: gs.ParticleFilter(gps(), recovery="augmented"), "recovery: 'augmented' needs a model with a map"),
         (lambda: gs.ParticleFilter(gps()).initialize(mean=np.zeros(3), covariance=-np.eye(3)), "positive semidefinite"),
         (lambda: gs.ParticleFilter(gps()).initialize_uniform(), "bounds: must be given"),
         (lambda: gs.OdometryMotion(alpha=(-1, 0, 0, 0)), "alpha: must be >= 0"),
@@ -306,3 +307,83 @@ def test_readings_that_are_refused_cost_no_motion(backend):
         pf.correct(np.ones(4))
     pf.correct(np.full(5, np.nan))
     assert abs(pf.mean_and_covariance()[0][0] - 4.0) < 0.1
+
+
+def placed(backend="numpy", **options):
+    """Return a filter of a few particles near the truth."""
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
+    pf = gs.ParticleFilter(model, particles=200, seed=1, **options)
+    pf.initialize(mean=TRUTH, covariance=np.diag([0.01, 0.01, 1e-4]))
+    return pf
+
+
+def test_a_reset_keeps_the_motion_since_the_readings(backend):
+    still, moved = placed(backend), placed(backend)
+    for pf in (still, moved):
+        pf.correct(walls(TRUTH))
+    moved.predict((0, 0, 0), (0.5, 0, 0))
+    for pf in (still, moved):
+        pf.reset()
+    ways = np.hypot(*(moved.host_particles() - still.host_particles())[:, :2].T)
+    assert abs(np.median(ways) - 0.5) < 0.05
+
+
+def test_particles_without_a_correction_are_all_effective(backend):
+    pf = placed(backend)
+    pf.correct(walls(TRUTH))
+    pf.reset()
+    assert pf.estimate().effective_sample_size == 200
+    pf.initialize(mean=TRUTH, covariance=np.eye(3) * 0.01)
+    assert pf.estimate().effective_sample_size == 200
+    # Readings of the particles before say nothing of these.
+    with pytest.raises(RuntimeError, match="needs a correction first"):
+        pf.reset()
+
+
+def test_readings_may_be_overwritten_after_the_correction(backend):
+    pf, ranges = placed(backend), walls(TRUTH)
+    pf.correct(ranges)
+    ranges[:] = np.nan
+    assert pf.estimate().explained > 0.9
+
+
+def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
+    """With a threshold below 1 / N no weight may vanish in its rounding to an integer."""
+    pf = gs.ParticleFilter(gps(backend), particles=1000, seed=2, threshold=1e-15, stages=1)
+    pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.09, 0.09, 1e-6]))
+    for _ in range(3):
+        pf.correct(np.zeros(2))
+    found = pf.estimate()
+    # Three fixes with the variance of the start leave a quarter of it.
+    np.testing.assert_allclose(np.diag(found.covariance)[:2], 0.09 / 4, rtol=0.2)
+    assert 100 < found.effective_sample_size < 1000
+
+
+@pytest.mark.parametrize("turn", [-40.0, 20.0])
+def test_headings_stay_in_half_a_turn_after_several_turns(backend, turn):
+    motion = gs.VelocityMotion(alpha=(0,) * 6, least=(0.0, 0.0))
+    pf = gs.ParticleFilter(gps(backend), motion=motion, particles=10)
+    pf.initialize(mean=(0, 0, 0), covariance=np.zeros((3, 3)))
+    pf.predict((1.0, turn / 2), 2.0)
+    radius = 2.0 / turn
+    expected = radius * np.sin(turn), radius * (1 - np.cos(turn)), gs.wrap_angle(turn)
+    np.testing.assert_allclose(pf.host_particles(), np.tile(expected, (10, 1)), atol=1e-12)
+
+
+def test_a_fix_at_particles_without_weight_changes_nothing(backend):
+    pf = gs.ParticleFilter(gps(backend), particles=200, seed=1, threshold=0.4)
+    far = np.zeros((200, 3))
+    far[120:, 0] = 50.0
+
+    class Likelihood:
+        log_p, positions = np.zeros(200), far
+
+    pf.initialize_from(Likelihood())
+    pf.correct(np.zeros(2))
+    before = pf.estimate()
+    assert before.effective_sample_size == pytest.approx(120, abs=1) and not before.degenerate
+    pf.correct(np.array([50.0, 0.0]))
+    found, weights = pf.estimate(), pf.host_weights()
+    assert found.degenerate and found.effective_sample_size == pytest.approx(before.effective_sample_size)
+    np.testing.assert_allclose(found.pose, before.pose, atol=1e-12)
+    assert np.isfinite(weights).all() and weights[pf.host_particles()[:, 0] > 25].sum() == 0

@@ -219,6 +219,22 @@ def test_the_localizer_drives_a_filter(localizer: ModuleType, monkeypatch: pytes
     assert np.isfinite(FakeFilter.made[1].calls[-1][1]).sum() == 90
 
 
+def test_a_scanner_of_as_many_beams_as_places_may_vary(localizer: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeFilter.made = []
+    monkeypatch.setattr(gs, "ParticleFilter", FakeFilter, raising=False)
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
+    own.set_map(map_message())
+    for k in range(2):
+        message = scan_of(localizer.PLACES)
+        message.angle_min, message.angle_increment = -1.0 + 0.1 * k, 2.0 / localizer.PLACES
+        assert own.update(message, (1.0 * k, 0.0, 0.0), (0.0, 0.0, 0.0))
+    first, second = FakeFilter.made
+    assert np.isfinite(first.calls[-1][1]).all()
+    # The readings of 2 rad lie at bearings of 2 rad.
+    read = second.model.scanner.bearings[np.isfinite(second.calls[-1][1])]
+    assert read.min() == pytest.approx(-0.9, abs=0.005) and read.max() == pytest.approx(1.1, abs=0.005)
+
+
 @pytest.mark.skipif(not hasattr(gs, "ParticleFilter"), reason="this version has no particle filter")
 def test_the_localizer_localises(localizer: ModuleType) -> None:
     own = localizer.Localizer(from_nav2({"sigma_hit": 0.1, "update_min_d": 0.05}), backend="numpy")

@@ -128,8 +128,11 @@ def test_draws_keep_the_expected_copies(stratified):
     np.testing.assert_allclose(copies / repeats, expected, atol=5 * np.sqrt(expected.max() / repeats))
 
 
-def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC):
-    """Return all buffers after two motions, a correction of two stages and an estimate."""
+def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, lone=False):
+    """Return all buffers after two motions, a correction of two stages and an estimate.
+
+    Where ``lone`` is set, only particles without a weight are possible.
+    """
     device, rng = get_backend(selection), np.random.default_rng(0)
     sums, block = Sums(device, 2 * count + 16), 8
     settings = settings_of_step(
@@ -148,6 +151,8 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC):
         estimate=np.zeros(c.ESTIMATE), share=np.zeros(count),
     )  # fmt: skip
     buffers["first"][:3] = -np.inf
+    if lone:
+        buffers["before"][::2], buffers["first"][::2] = 0.0, 1e7
     on = {name: device.upload(values) for name, values in buffers.items()}
     sizes, step = dict(particles=count, block=block), dict(settings=on["settings"])
     program = []
@@ -190,6 +195,16 @@ def test_every_backend_has_the_bits_of_the_reference(backend, count, flags, lane
     expected, found = run_step("numpy", count, flags), run_step(backend, count, flags, lanes=lanes)
     for name, values in expected.items():
         assert np.array_equal(values, found[name]), name
+
+
+@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+def test_weights_stay_where_only_particles_without_one_are_possible(backend, lanes):
+    expected, found = run_step("numpy", 1500, lone=True), run_step(backend, 1500, lanes=lanes, lone=True)
+    for name, values in expected.items():
+        assert np.array_equal(values, found[name], equal_nan=True), name
+    stage = found["state"][: c.STAGE]
+    assert stage[c.DEGENERATE] == 1 and stage[c.TOTAL] == 750 * 2.0**36 and stage[c.LEFT] == 0
+    assert np.array_equal(found["weight"][:4] > 0, [False, True, False, True])
 
 
 @pytest.mark.parametrize("draws", [c.INDEPENDENT, c.RESIDUAL], ids=["stratified", "residual"])

@@ -27,6 +27,20 @@ OPTIONS = [
 ]
 
 
+FEW = dict(particles=(20, 200), seed=1, threshold=0.4)
+
+
+class TwoPlaces:
+    """A likelihood of poses at two places that are far apart."""
+
+    log_p = np.zeros(200)
+    positions = np.repeat([(0.0, 0.0, 0.0), (50.0, 0.0, 0.0)], (120, 80), axis=0)
+
+
+def gps(device):
+    return gs.PositionModel(gs.PositionParameters(sigma=0.3, z_rand=0.0), backend=device)
+
+
 def equal(one, two):
     return all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
 
@@ -51,6 +65,45 @@ def test_several_sensors_and_a_start_anywhere(needs):
     assert np.array_equal(pf.particles, pf.host_particles()) and abs(pf.weights.sum() - 1) < 1e-12
     # A filter that begins again forgets its state.
     assert equal(states(pf), states(one))
+
+
+def test_moments_follow_a_prediction():
+    pf = SplitParticleFilter(field, devices=["numpy"] * 2, particles=100, seed=1)
+    with pytest.raises(RuntimeError, match="must be initialised first"):
+        pf.moments  # noqa: B018
+    pf.initialize(mean=(1, 1, 0), covariance=np.eye(3) * 1e-6)
+    pf.predict((0, 0, 0), (0.5, 0, 0))
+    assert abs(pf.moments[0] - 1.5) < 0.05
+
+
+def test_a_fix_at_particles_without_weight_has_the_bits_of_one_device(backend):
+    """The weights stay, and draws that change the number of particles take them."""
+    found = []
+    for make in (gs.ParticleFilter(gps(backend), **FEW), SplitParticleFilter(gps, devices=[backend] * 3, **FEW)):
+        make.initialize_from(TwoPlaces())
+        for x in (0.0, 50.0, 0.0):
+            make.correct(np.array([x, 0.0]))
+            found.append((make.host_particles(), make.host_weights(), make.estimate().pose))
+    assert len(found[0][0]) != len(found[2][0])
+    assert all(equal(one, two) for one, two in zip(found[:3], found[3:], strict=True))
+
+
+@pytest.mark.parametrize("split", [False, True], ids=["one", "split"])
+def test_the_motion_shows_where_the_second_of_two_readings_is_refused(backend, split):
+    def make(device):
+        return [gps(device), gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend=device)]
+
+    options = dict(particles=100, seed=1)
+    pf = SplitParticleFilter(make, devices=[backend] * 2, **options) if split else (
+        gs.ParticleFilter(make(backend), **options)
+    )  # fmt: skip
+    position, heading = pf.models
+    pf.initialize(mean=(0, 0, 0), covariance=np.eye(3) * 1e-6)
+    pf.correct({position: np.zeros(2)})
+    pf.predict((0, 0, 0), (1.0, 0, 0))
+    with pytest.raises(TypeError, match="heading: must hold real numbers"):
+        pf.correct({position: np.array([1.0, 0.0]), heading: "north"})
+    assert abs(pf.estimate().pose[0] - 1.0) < 0.1 and abs(pf.host_particles()[:, 0].mean() - 1.0) < 0.1
 
 
 def test_few_particles_leave_a_device_idle():

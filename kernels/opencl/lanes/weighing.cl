@@ -44,12 +44,13 @@ kernel void set_weights(global const double *score, global const double *before,
                         const int groups, const int stage, const int stages) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double scale = settings[SCALE], left = left_of(state, stage), high = largest_of(largest, groups);
+    const double scale = settings[SCALE], left = left_of(state, stage);
+    const double high = possible_of(totals, largest_of(largest, groups));
     const int rung = left > 0.0 ? rung_of(totals, settings, settings[SHARE] * (double)particles) : 0;
-    const int end = min(begin + block, particles);
+    const int end = min(begin + block, particles), column = column_of(high, rung);
     double sum = 0.0;
-    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + rung];
-    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + rung];
+    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + column];
+    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + column];
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
         doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, left);

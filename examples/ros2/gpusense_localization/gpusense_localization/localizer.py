@@ -30,6 +30,7 @@ class Localizer:
         self.grid: gs.OccupancyGrid | None = None
         self.filter: Any = None
         self._scanner: gs.Scanner | None = None
+        self._spread = False
         self.estimate: Any = None
         self._last: Pose | None = None
         self._start: tuple[np.ndarray, np.ndarray] | None = None
@@ -80,15 +81,15 @@ class Localizer:
         """
         scanner = gs.Scanner.from_laser_scan(message, mount)
         if self.filter is None:
+            self._spread = False
             self._make(scanner)
-        elif scanner != self._scanner and self._scanner.count != PLACES:
+        elif scanner != self._scanner and not self._spread:
+            self._spread = True
             self._make(gs.Scanner.uniform(
                 angle_min=-math.pi, angle_increment=2 * math.pi / PLACES, count=PLACES, range_max=scanner.range_max,
                 range_min=scanner.range_min, mount=mount,
             ))  # fmt: skip
-        if scanner == self._scanner:
-            return np.array(message.ranges, np.float64)
-        return spread_readings(message, PLACES)
+        return spread_readings(message, PLACES) if self._spread else np.array(message.ranges, np.float64)
 
     def _make(self, scanner: gs.Scanner) -> None:
         model = self.options.make_model(self.grid, scanner, backend=self.backend)

@@ -1,0 +1,116 @@
+"""Beginnings of a particle filter: particles from a density, anywhere on the map, or from a likelihood."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense._util.typing import AnyArray
+from gpusense.interface.constants import STATE
+from gpusense.localization import starts
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.motion import STILL, SampledMotion
+from gpusense.localization.results import Results
+from gpusense.localization.trust import Trust
+
+
+class Beginnings(Results):
+    """The part of a particle filter that places its particles."""
+
+    # Number of the last step, the motion that the next one begins with, and corrections left at a low temperature.
+    _step: int
+    _pending: SampledMotion
+    _wide: int
+    # Poses that recovery injects: their number, and half widths of the box around each.
+    _pool: tuple[int, starts.Spread]
+    _trust: Trust | None
+
+    def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
+        """Draw particles from a normal density.
+
+        Args:
+            mean: (3,) pose [m, m, rad].
+            covariance: (3, 3) covariance, positive semidefinite.
+            particles: Their number; the filter's (most) by default.
+
+        Raises:
+            TypeError, ValueError: an argument breaks its rule.
+        """
+        self._place(starts.normal(mean, covariance, self._number(particles), self._key()))
+
+    def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
+        """Draw particles uniformly over the free cells of the map, with any heading.
+
+        Without bounds and another ``recovery``, half of the particles are placed anew, as by :meth:`reset`, where they
+        have converged to a pose that scans contradict.
+
+        Args:
+            bounds: ((x_min, y_min), (x_max, y_max)) [m]: only there. Needed for models without a grid.
+            particles: Their number; the filter's (most) by default.
+
+        Raises:
+            TypeError, ValueError: an argument breaks its rule, or no cell is free.
+        """
+        pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
+        self._place(starts.spread(pool, spread, self._number(particles), self._key()))
+        self._wide = DEFAULTS.wide_scans
+        if bounds is None and self.options.recovery is None:
+            self._trust = Trust()
+
+    def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
+        """Draw particles from a likelihood over poses.
+
+        Args:
+            likelihood: An object with ``log_p``, an array of M log-likelihoods of any shape, and ``positions``, (M, 3)
+                poses in the same order or an array of shape ``log_p.shape + (3,)``.
+            particles: Their number; the filter's (most) by default.
+
+        Raises:
+            TypeError, ValueError: it has not these, or no finite log-likelihood.
+        """
+        pool, spread = starts.likely_pool(likelihood, self._number(particles), self._key())
+        self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))
+
+    def _number(self, particles: int | None) -> int:
+        most = self.options.most
+        return most if particles is None else checks.integer("particles", particles, low=1, high=most)
+
+    def _place(self, poses: np.ndarray, *, again: bool = False) -> None:
+        """Replace all particles, and forget the likelihood of scans.
+
+        Args:
+            poses: (N, 3) poses.
+            again: Whether a search is repeated: readings, judgements of poses and a pending motion are kept.
+        """
+        self._cloud.place(poses)
+        self._shown, self._started, self._wide = len(poses), True, 0
+        self._backend.upload(np.zeros(STATE), self._cloud.state)
+        if not again:
+            self._pending, self._last, self._trust = STILL, {}, None
+            self._verdict.reset()
+            for sensor in self._sensors:
+                sensor.restart()
+        if self.options.recovery == "augmented" and not self._pool[0]:
+            self._set_pool(*starts.free_pool([sensor.model for sensor in self._sensors], None))
+
+    def _set_pool(self, pool: np.ndarray, spread: tuple[float, float, float]) -> None:
+        self._cloud.set_pool(pool)
+        self._pool = len(pool), spread
+
+    def _key(self) -> tuple[int, int, int]:
+        """Return the two words of the seed, and a number of this step."""
+        self._step += 1
+        return *self.options.words, self._step
+
+    def _random_poses(self, count: int) -> np.ndarray:
+        """Return poses anywhere in the free space, the same ones each time; around the particles without a grid."""
+        key = (*self.options.words, 0)
+        try:
+            pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], None)
+        except ValueError:
+            centre = self._cloud.host_poses(self._cloud.shown, self._shown).mean(axis=0)
+            pool, spread = centre[None], (10.0, 10.0, math.pi)
+        return starts.spread(pool, spread, count, key)

@@ -8,7 +8,8 @@ import importlib
 import io
 import os
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
 from gpusense._version import __version__
@@ -57,6 +58,21 @@ class Layout(argparse.RawDescriptionHelpFormatter):
             self._action_max_length = max(self._action_max_length, self._current_indent + 2 + longest)
 
 
+@contextlib.contextmanager
+def _short_warnings() -> Iterator[None]:
+    """Print a warning as one line, without the place in the source that raised it."""
+
+    def line(message: Warning | str, *_: object, **__: object) -> str:
+        return f"gpusense: warning: {' '.join(str(message).split())}\n"
+
+    before = warnings.formatwarning
+    warnings.formatwarning = line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -72,7 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        code = _dispatch(list(sys.argv[1:] if argv is None else argv))
+        with _short_warnings():
+            code = _dispatch(list(sys.argv[1:] if argv is None else argv))
         print(end="", flush=True)
         return code
     except BrokenPipeError:

@@ -38,14 +38,15 @@ The filter begins around the first reference pose or that of --start, with devia
 --global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
 are those of the weighted mean against reference poses: those of --reference, or the logged ones. Coverage is the share
 of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a
-reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence.
+reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence. NEES is the squared distance
+of a reference pose in deviations.
 
 The verdict at the end does not need reference poses: it is 'lost' if the estimates of the last tenth of the scans
 explain too few of their beams, as on a wrong map.
 
 Ctrl-C ends the run with the results so far, and writes the files.
 
-Exit codes: 0 success, 1 lost at the end, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 1 lost at the end, or no reading there to judge by, 2 bad input, 130 interrupted.
 
 example:
   gpusense localize --map map.yaml --log run.log.gz
@@ -72,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     begin.add_argument("--global", dest="everywhere", action="store_true",
         help="begin anywhere in the free space of the map")  # fmt: skip
     begin.add_argument("--start", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
-        help="begin around a pose on the map [m, m, rad] (default: the first reference pose)")  # fmt: skip
+        help="begin around a pose on the map [m, m, rad] (default: the first reference pose, at its scan)")  # fmt: skip
     add("--reference", type=Path, metavar="FILE",
         help="a TUM trajectory of true poses on the map to compare with, by the times of the scans (default: the "
         "logged poses)")  # fmt: skip
@@ -137,7 +138,8 @@ def run(args: argparse.Namespace) -> int:
         if track.steps:
             report(args, pf, track, len(steps), recording)
         raise
-    return LOST if report(args, pf, track, len(steps), recording)["lost"] else 0
+    found = report(args, pf, track, len(steps), recording)
+    return LOST if found["lost"] or found["explained_at_end"] is None else 0
 
 
 def _steps(args: argparse.Namespace) -> list[Step]:
@@ -152,7 +154,13 @@ def _steps(args: argparse.Namespace) -> list[Step]:
     steps = read_steps(
         args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, sensors=args.sensors
     )
-    return steps if args.reference is None else with_references(steps, *read_tum(args.reference))
+    if args.reference is None:
+        return steps
+    steps = with_references(steps, *read_tum(args.reference))
+    if args.everywhere or args.start is not None:
+        return steps
+    # The run begins around the first reference pose.
+    return steps[next(i for i, step in enumerate(steps) if step.reference is not None) :]
 
 
 def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
@@ -216,6 +224,10 @@ def _motion(args: argparse.Namespace, steps: list[Step], noise: dict[str, Any]) 
     from gpusense.localization.motion_fit import fit_odometry_motion
 
     if args.fit_motion:
+        for name in ("motion_noise", "sideways", "reverse"):
+            if getattr(args, name) is not None:
+                option = "--" + name.replace("_", "-")
+                raise ValueError(f"--fit-motion: must be given without {option}, which it learns, got both")
         return fit_odometry_motion(*references_to_learn_from(steps)).motion
     given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
     return OdometryMotion(**noise | {name: value for name, value in given.items() if value is not None})

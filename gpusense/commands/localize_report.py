@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import sys
 from pathlib import Path
@@ -40,7 +41,7 @@ def report(
 
     result = summary(track)
     if args.tum is not None:
-        write_tum(args.tum, [step.scan.time for step in track.steps], track.poses)
+        write_tum(args.tum, _times(track), track.poses)
     if args.plot is not None:
         _draw(args.plot, pf, track)
     if recording is not None:
@@ -55,7 +56,22 @@ def report(
     for path in (args.tum, args.plot, args.record):
         if path is not None:
             print(f"written: {path}")
+    if args.tum is not None and not _increase(track):
+        print("times of the log do not increase: the trajectory has the indices of the scans in their place")
     return result
+
+
+def _increase(track: Track) -> bool:
+    """Return whether the times of the scans increase, as readers of trajectories demand."""
+    times = [step.scan.time for step in track.steps]
+    return all(one < two for one, two in itertools.pairwise(times))
+
+
+def _times(track: Track) -> list[float]:
+    """Return the times of the scans [s], or their indices where these do not increase."""
+    if _increase(track):
+        return [step.scan.time for step in track.steps]
+    return [float(i) for i in range(len(track.steps))]
 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
@@ -68,10 +84,12 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
     print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
     if result["references_repeat_odometry"]:
-        print("reference             the logged poses, which are the odometry's own: the errors include its drift")
+        print("reference             none: the logged poses are the odometry's own")
     elif 0 < result["references"] < result["scans"]:
         print(f"reference             poses of {result['references']} scans")
-    if result["error_median"] is not None:
+    if result["references_repeat_odometry"]:
+        print(f"distance from it      median {s['error_median']} m, 95 % below {s['error_95']} m")
+    elif result["error_median"] is not None:
         at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
         print(
             f"position error        median {s['error_median']} m, 95 % below {s['error_95']} m\n"
@@ -101,9 +119,9 @@ def _ranks(histogram: list[float]) -> str:
 
 
 def _verdict(result: dict[str, Any]) -> str:
-    if result["explained_median"] is None:
-        return "not lost: no scan has beams to judge by"
-    share = f"the estimates explain {100 * result['explained_median']:.0f} % of the beams of a scan"
+    if result["explained_at_end"] is None:
+        return "none, no scan at the end has a reading to judge by"
+    share = f"the last estimates explain {100 * result['explained_at_end']:.0f} % of the beams of a scan"
     if result["lost"]:
         return f"LOST: {share}; is this the map of the log?"
     return f"not lost: {share}"

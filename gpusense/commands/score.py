@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: calibrated from the chosen scans")
     group = parser.add_argument_group("parameters of the model")
-    group.add_argument("--parameters", type=Path, metavar="YAML",
+    group.add_argument("--parameters", "--params", type=Path, metavar="YAML",
         help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
     for name, meaning in _MEANING.items():
         group.add_argument(_option(name), type=number, metavar="X", help=meaning)

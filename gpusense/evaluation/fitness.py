@@ -59,12 +59,15 @@ class FitnessOfLog:
         self._better: list[float] = []
 
     def add(self, index: int, scan: Scan) -> float:
-        """Return the share of a scan's beams that its logged pose explains; NaN without beams."""
+        """Return the share of a scan's beams that its logged pose explains; NaN where readings do not depend on it."""
         random = np.random.default_rng((self._seed, index, _STREAM))
         poses = np.vstack([np.array([scan.pose]), cloud_uniform(self._model.grid, _RANDOM, random)])
         log_p, terms = self._model.log_likelihood(poses, scan.ranges, per_beam=True)
         parts = np.asarray(terms, np.float64)
         share = explained_share(parts[0], parts[1:])
+        # Readings that are alike at all poses, as no returns, tell nothing.
+        if np.isfinite(log_p[0]) and (log_p == log_p[0]).all():
+            return math.nan
         if not math.isnan(share):
             self._shares.append(share)
             self._better.append(float(np.mean(log_p[1:] < log_p[0])))

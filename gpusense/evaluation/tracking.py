@@ -128,7 +128,6 @@ def summary(track: Track) -> dict[str, Any]:
     has beams.
     """
     count = len(track.steps)
-    explained = [share for share in track.explained if not math.isnan(share)]
     seconds = np.array(track.seconds).reshape(-1, 4) * 1000
     means = np.median(seconds, axis=0)
     tail = track.lost[-max(count // 10, 1) :]
@@ -136,7 +135,8 @@ def summary(track: Track) -> dict[str, Any]:
         "scans": count,
         "lost": bool(np.mean(tail) > 0.5),
         "scans_lost": int(np.sum(track.lost)),
-        "explained_median": float(np.median(explained)) if explained else None,
+        "explained_at_end": _median(track.explained[-len(tail) :]),
+        "explained_median": _median(track.explained),
         "temperature": track.temperatures[-1],
         "effective_sample_size_median": float(np.median(track.sizes)),
     }
@@ -150,6 +150,12 @@ def summary(track: Track) -> dict[str, Any]:
     if result["converged_at"] is not None:
         result["converged_at"] = int(known[result["converged_at"]])
     return result | coverage_report(differences[known], np.array(track.covariances)[known], np.array(track.ranks))
+
+
+def _median(shares: Sequence[float]) -> float | None:
+    """Return the median of the shares that are known; None without one."""
+    known = [share for share in shares if not math.isnan(share)]
+    return float(np.median(known)) if known else None
 
 
 def _errors(differences: Floats, references: Floats, poses: Floats) -> dict[str, Any]:

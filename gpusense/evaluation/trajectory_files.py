@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util import checks
 from gpusense._util.files import write_whole
 
 Floats = NDArray[np.float64]
@@ -36,21 +36,35 @@ def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats]) -> No
     write_whole(path, write)
 
 
+def _numbers(path: Path) -> Iterator[list[float]]:
+    """Return the eight numbers of each line; text after # is a comment.
+
+    Raises:
+        ValueError: a line has not eight finite numbers.
+    """
+    with path.open(encoding="utf-8") as file:
+        for line, text in enumerate(file, 1):
+            words = text.split("#")[0].split()
+            try:
+                numbers = [float(word) for word in words]
+            except ValueError:
+                numbers = []
+            if words and not (len(numbers) == 8 and all(map(math.isfinite, numbers))):
+                raise ValueError(f"{path}: line {line} must have eight finite numbers, got {checks.show(text.strip())}")
+            if words:
+                yield numbers
+
+
 def read_tum(path: Path) -> tuple[Floats, Floats]:
     """Read a TUM trajectory: times (T,) [s] and poses (T, 3), the headings those of the quaternions.
 
     Raises:
-        ValueError: a line has not eight finite numbers, a quaternion is 0, or times do not increase.
+        ValueError: a line has not eight finite numbers, there is none, a quaternion is 0, or times do not increase.
         FileNotFoundError: the file is missing.
     """
-    try:
-        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("error")  # NumPy warns of a file without numbers.
-            rows = np.loadtxt(file, dtype=np.float64, comments="#", ndmin=2)
-    except (ValueError, UserWarning) as error:
-        raise ValueError(f"{path}: must have eight numbers on each line, got {error}") from None
-    if rows.shape[1] != 8 or not np.isfinite(rows).all():
-        raise ValueError(f"{path}: must have eight finite numbers on each line, got {rows.shape[1]} columns")
+    rows = np.array(list(_numbers(path))).reshape(-1, 8)
+    if not len(rows):
+        raise ValueError(f"{path}: must have a pose, got none")
     if not (np.diff(rows[:, 0]) > 0).all():
         line = int(np.argmin(np.diff(rows[:, 0]) > 0)) + 1
         raise ValueError(f"{path}: must have increasing times, got {rows[line, 0]} after {rows[line - 1, 0]}")

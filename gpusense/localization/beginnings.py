@@ -64,12 +64,22 @@ class Beginnings(Results):
         """Draw particles from a likelihood over poses.
 
         Args:
-            likelihood: An object with ``log_p``, an array of M log-likelihoods of any shape, and ``positions``, (M, 3)
-                poses in the same order or an array of shape ``log_p.shape + (3,)``.
+            likelihood: The result of :func:`pose_likelihood`, or an object with ``log_p``, an array of M
+                log-likelihoods of any shape, and ``positions``, (M, 3) poses in the same order. Particles are spread
+                over the cells of its ``resolution`` [m] and the gaps of its ``headings``, if it has these.
             particles: Their number; the filter's (most) by default.
 
         Raises:
             TypeError, ValueError: it has not these, or no finite log-likelihood.
+
+        Example:
+            >>> import gpusense as gs
+            >>> grid, scanner = gs.OccupancyGrid([[0, 0, 100]], 1.0), gs.Scanner([0.0], 9.0)
+            >>> model = gs.LikelihoodFieldModel(grid, scanner, backend="numpy")
+            >>> pf = gs.ParticleFilter(model, particles=100)
+            >>> pf.initialize_from(gs.pose_likelihood(model, [1.9], resolution=1.0, headings=4))
+            >>> pf.host_particles().shape
+            (100, 3)
         """
         pool, spread = starts.likely_pool(likelihood, self._number(particles), self._key())
         self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))

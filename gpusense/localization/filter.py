@@ -134,8 +134,9 @@ class ParticleFilter(Beginnings):
         """Weigh the particles by readings, and draw new ones where it is due.
 
         Args:
-            readings: The reading of the filter's only model, or a mapping from models to their readings; those of a
-                model whose ``log_likelihood`` takes several arguments are a tuple. None is a missing reading.
+            readings: The reading of the filter's only model, or a mapping from models to their readings. Where
+                ``log_likelihood`` takes several arguments, a tuple has them: ``(features, correspondence)``,
+                ``(ranges, ids)``, ``(fix, covariance)``. None is a missing reading.
                 :meth:`estimate` and :meth:`reset` read arrays of a device again, which must not change until then.
 
         Raises:

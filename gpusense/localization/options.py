@@ -72,6 +72,17 @@ class Options(NamedTuple):
         return self.seed & 0xFFFFFFFF, self.seed >> 32
 
 
+def _temperature(value: Any) -> float | str:
+    """Check a temperature.
+
+    Raises:
+        TypeError, ValueError: neither "auto" nor a number in (0, 1].
+    """
+    if isinstance(value, str) and value != "auto":
+        raise ValueError(f"temperature: must be 'auto' or a number, got {checks.show(value)}")
+    return value if isinstance(value, str) else checks.real("temperature", value, above=0, high=1)
+
+
 def checked(*, particles: Any, temperature: Any, recovery: Any, beam_skip: Any, **options: Any) -> Options:
     """Check the options of a filter.
 
@@ -83,7 +94,7 @@ def checked(*, particles: Any, temperature: Any, recovery: Any, beam_skip: Any, 
         least=least,
         most=most,
         seed=checks.integer("seed", options["seed"], low=0, high=(1 << 64) - 1),
-        temperature="auto" if temperature == "auto" else checks.real("temperature", temperature, above=0, high=1),
+        temperature=_temperature(temperature),
         resampling=checks.choice("resampling", options["resampling"], ("systematic", "stratified", "residual")),
         threshold=checks.real("threshold", options["threshold"], above=0, high=1),
         stages=checks.integer("stages", options["stages"], low=1, high=6),

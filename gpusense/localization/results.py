@@ -45,7 +45,9 @@ class Results(ABC):
 
     def _check_started(self) -> None:
         if not self._started:
-            raise RuntimeError("ParticleFilter: must be initialised first, by initialize or initialize_uniform")
+            raise RuntimeError(
+                "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"
+            )
 
     @property
     def device(self) -> BackendInfo:

@@ -24,7 +24,8 @@ def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[Given]:
     """Return the readings that are not missing, in the order of the sensors.
 
     Args:
-        readings: The reading of the only sensor, or a mapping from models to theirs.
+        readings: The reading of the only sensor, or a mapping from models to theirs. A tuple that begins with an array
+            holds several arguments, any other is an array itself.
         sensors: The sensors.
 
     Raises:
@@ -41,7 +42,12 @@ def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[Given]:
         raise TypeError(f"readings: must be a mapping from models to their readings, got {checks.show(readings)}")
     else:
         pairs = [] if readings is None else [(0, readings)]
-    return [(i, value if isinstance(value, tuple) else (value,)) for i, value in pairs]
+    return [(i, value if _is_several(value) else (value,)) for i, value in pairs]
+
+
+def _is_several(value: Any) -> bool:
+    """Tell whether a reading is a tuple of arguments: its first one is an array, not a number."""
+    return isinstance(value, tuple) and len(value) > 0 and np.ndim(value[0]) > 0
 
 
 class Scoring:

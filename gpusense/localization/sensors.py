@@ -42,11 +42,14 @@ class Sensor:
 
     Raises:
         TypeError: another object.
+        ValueError: a model with a temperature other than 1.
     """
 
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel, LandmarkModel)):
             raise TypeError(f"models: must be measurement models, got {checks.show(model)}")
+        if isinstance(model, ScanModel) and model.temperature != 1:
+            raise ValueError(f"models: must have temperature 1, the filter has its own, got {model.temperature}")
         self.model: Any = model
         self.calibrates = isinstance(model, ScanModel)
         self.backend: Backend = model.backend
@@ -111,6 +114,10 @@ class Sensor:
         """
         begin = time.perf_counter()
         if self.calibrates:
+            if np.ndim(reading[0]) != 1:
+                raise ValueError(
+                    f"ranges: must be those of one scan, ({self.model.scanner.count},), got {np.shape(reading[0])}"
+                )
             self.model.start_scoring(poses, *reading, out=out, before=before)
             self._started += 1
             # Arrays that it reads stay alive until then.
@@ -166,11 +173,14 @@ def sensors_of(models: Any) -> list[Sensor]:
 
     Raises:
         TypeError: another object.
-        ValueError: none, too many, of several devices or precisions, or of a device without float64.
+        ValueError: none, too many, one twice, with a temperature, of several devices or precisions, or of a device
+            without float64.
     """
     chosen = list(models) if isinstance(models, Sequence) else [models]
     if not 0 < len(chosen) <= _MOST_SENSORS:
         raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
+    if len({id(model) for model in chosen}) < len(chosen):
+        raise ValueError("models: must be different ones, since readings are found by their model, got one twice")
     sensors = [Sensor(model) for model in chosen]
     backend = sensors[0].backend
     if any(sensor.backend is not backend for sensor in sensors):

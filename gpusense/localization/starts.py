@@ -100,13 +100,13 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
     Raises:
         TypeError, ValueError: it has no such arrays, or no finite log-likelihood.
     """
-    for name in ("log_p", "positions"):
-        if not hasattr(likelihood, name):
-            raise TypeError(f"likelihood: must have log_p and positions, got {checks.show(likelihood)}")
+    if not hasattr(likelihood, "log_p") or not (hasattr(likelihood, "poses") or hasattr(likelihood, "positions")):
+        raise TypeError(f"likelihood: must be one of pose_likelihood, got {checks.show(likelihood)}")
+    shape = np.shape(likelihood.log_p)
     log_p = np.asarray(likelihood.log_p, np.float64).reshape(-1)
-    poses = np.asarray(likelihood.positions, np.float64).reshape(-1, 3)
-    if len(log_p) != len(poses):
-        raise ValueError(f"likelihood: positions must be those of log_p, got {len(poses)} for {len(log_p)}")
+    if not hasattr(likelihood, "poses") and np.size(likelihood.positions) != 3 * log_p.size:
+        count = np.size(likelihood.positions) // 3
+        raise ValueError(f"likelihood: positions must be those of log_p, got {count} for {log_p.size}")
     finite = np.isfinite(log_p)
     if not finite.any():
         raise ValueError("likelihood: must have a finite log_p, got none")
@@ -114,6 +114,10 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
     ends = np.cumsum(weight)
     start = float(uniform_of(_words(1, key, 3)[0])[0])
     rows = np.searchsorted(ends, (np.arange(count) + start) / count * ends[-1], side="right")
-    step = float(getattr(likelihood, "resolution", 0.0)) / 2
-    turn = math.pi / log_p.size if not hasattr(likelihood, "headings") else math.pi / max(int(likelihood.headings), 1)
-    return poses[np.minimum(rows, len(poses) - 1)], (step, step, turn if step else 0.0)
+    rows = np.minimum(rows, log_p.size - 1)
+    if hasattr(likelihood, "poses"):
+        poses = likelihood.poses(*np.unravel_index(rows, shape))
+    else:
+        poses = np.asarray(likelihood.positions, np.float64).reshape(-1, 3)[rows]
+    step, headings = float(getattr(likelihood, "resolution", 0.0)) / 2, np.size(getattr(likelihood, "headings", ()))
+    return poses, (step, step, math.pi / headings if headings else 0.0)

@@ -37,7 +37,8 @@ def read_lasers(
     form = format_of(checks.path("path", path))
     if sensors and not form.topics:
         if len(sensors) > 1 or sensors[0] not in (FRONT, REAR):
-            raise ValueError(f"sensors: must be one of 'front' and 'rear' for {form.name}, got {', '.join(sensors)}")
+            rule = f"must be only one of 'front' and 'rear' for {form.name}, which states no mounts"
+            raise ValueError(f"sensors: {rule}, got {', '.join(sensors)}")
         return _of(0, read_log(path, range_max=range_max, odometry=True, rear=sensors[0] == REAR))
     topics: Sequence[str | None] = sensors or (None,)
     each = [

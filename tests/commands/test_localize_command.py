@@ -179,9 +179,12 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
     [
         (
             ["--sensors", "front", "rear"],
-            "'front' and 'rear' for a CARMEN log, got front, rear",
+            "which states no mounts, got front, rear",
         ),
-        (["--sensors", "/scan"], "sensors: must be one of 'front' and 'rear' for a CARMEN log, got /scan"),
+        (
+            ["--sensors", "/scan"],
+            "must be only one of 'front' and 'rear' for a CARMEN log, which states no mounts, got /scan",
+        ),
         (["--temperature", "2"], "temperature: must be"),
         (["--offset", "99"], "log: must have a scan of index 99"),
         (["--motion-noise", "1", "2", "3"], "expected 4 arguments"),

@@ -69,7 +69,54 @@ def test_logged_poses_that_are_the_odometry_are_named_so(place, capsys):
     # The pose is right, and yet far from the odometry's.
     assert code == 0 and not found["lost"] and found["references_repeat_odometry"] and found["error_median"] > 1
     assert cli.main(arguments) == 0
-    assert "which are the odometry's own" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "none: the logged poses are the odometry's own" in out and "coverage" not in out
+
+
+def test_the_run_begins_at_the_first_reference(place, capsys, tmp_path):
+    times, poses = read_tum(place / "true.tum")
+    write_tum(tmp_path / "late.tum", times[2:], poses[2:])
+    code, found = summary_of(capsys, call(place, "--reference", str(tmp_path / "late.tum")))
+    assert code == 0 and found["scans"] == COUNT - 4 and found["error_95"] < 0.1
+
+
+def test_noise_is_given_or_learned(place, capsys):
+    arguments = call(place, "--fit-motion", "--sideways", "0.1", "--reference", str(place / "true.tum"))
+    assert "--fit-motion: must be given without --sideways" in error_of(arguments, capsys)
+
+
+def test_without_returns_there_is_no_verdict(place, capsys):
+    arguments = [*call(place, "--start", "3", "1.5", "3"), "--range-max", "0.01", "--limit", "3"]
+    assert cli.main(arguments) == 1
+    assert "verdict: none, no scan at the end has a reading" in capsys.readouterr().out
+
+
+def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path):
+    # The robot is carried away after the first half.
+    lines = (place / "raw.log").read_text().splitlines()
+    caster = gs.RayCaster(gs.read_map(place / "map.yaml"), range_max=20.0, backend="numpy")
+    elsewhere = caster.cast(np.array([[6.5, 4.8, -2.0]]), BEARINGS)[0]
+    words = [line.split() for line in lines + lines[COUNT // 2 :] * 2]
+    for step, row in enumerate(words):
+        if step >= COUNT // 2:
+            row[2:183] = [f"{value:.3f}" for value in elsewhere]
+        row[-1] = row[-3] = f"{step}.0"
+    (tmp_path / "carried.log").write_text("\n".join(" ".join(row) for row in words))
+    arguments = call(place, "--start", "3", "1.5", "3", "--json")
+    arguments[arguments.index("--log") + 1] = str(tmp_path / "carried.log")
+    code = cli.main(arguments)
+    found = json.loads(capsys.readouterr().out)["summary"]
+    assert code == 1 and found["lost"] and found["explained_at_end"] < 0.8
+
+
+def test_times_that_repeat_become_indices(place, capsys, tmp_path):
+    text = (place / "raw.log").read_text().replace(" 3.0 robot 3.0", " 2.0 robot 2.0")
+    (tmp_path / "same.log").write_text(text)
+    arguments = call(place, "--start", "3", "1.5", "3", "--tum", str(tmp_path / "a.tum"))
+    arguments[arguments.index("--log") + 1] = str(tmp_path / "same.log")
+    assert cli.main(arguments) == 0
+    assert "times of the log do not increase" in capsys.readouterr().out
+    assert read_tum(tmp_path / "a.tum")[0].tolist() == list(range(COUNT))
 
 
 def test_noise_is_not_learned_from_the_odometry_itself(place, capsys):
@@ -83,12 +130,12 @@ def test_noise_is_not_learned_from_the_odometry_itself(place, capsys):
     ("text", "message"),
     [
         ("100 1 2 0 0 0 0 1\n101 1 2 0 0 0 0 1\n", "must have poses at times of the scans, 0.000 to 13.000 s"),
-        ("0 1 2 0 0 0 1\n", "must have eight finite numbers on each line, got 7 columns"),
-        ("0 1 2 0 0 0 0 nan\n", "must have eight finite numbers"),
+        ("0 1 2 0 0 0 0 1\n1 1 2 0 0 0 1\n", "line 2 must have eight finite numbers, got '1 1 2 0 0 0 1'"),
+        ("0 1 2 0 0 0 0 nan\n", "line 1 must have eight finite numbers, got '0 1 2 0 0 0 0 nan'"),
         ("0 1 2 0 0 0 0 0\n", "must have quaternions other than 0"),
         ("1 1 2 0 0 0 0 1\n0 1 2 0 0 0 0 1\n", "must have increasing times, got 0.0 after 1.0"),
-        ("# nothing\n", "must have eight numbers on each line"),
-        ("one 1 2 0 0 0 0 1\n", "must have eight numbers on each line"),
+        ("# nothing\n\n", "must have a pose, got none"),
+        ("one 1 2 0 0 0 0 1\n", "line 1 must have eight finite numbers"),
         (None, "bad.tum: No such file or directory"),
     ],
 )
@@ -127,7 +174,9 @@ def test_poses_between_those_of_a_trajectory_are_interpolated(place):
     assert found[3] == (7.0, 7.0, 1.0)
 
 
-@pytest.mark.parametrize(("blind", "verdict"), [({3}, " % of the beams"), (set(range(COUNT)), "no scan has beams")])
+@pytest.mark.parametrize(
+    ("blind", "verdict"), [({3}, " % of the beams"), (set(range(COUNT)), "no scan at the end has a reading")]
+)
 def test_scans_without_beams_leave_the_verdict_to_others(place, capsys, blind, verdict):
     lines = (place / "raw.log").read_text().split("\n")
     for scan in blind:

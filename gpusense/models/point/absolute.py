@@ -73,7 +73,7 @@ class PositionModel(PointModel):
             self._hit = self._gaussian("covariance", (exact(matrix[0][0]), exact(matrix[0][1]), exact(matrix[1][1])))
 
     def log_likelihood(
-        self, poses: AnyArray, fix: ArrayLike, *, covariance: ArrayLike | None = None, out: Any = None
+        self, poses: AnyArray, fix: ArrayLike, covariance: ArrayLike | None = None, *, out: Any = None
     ) -> np.ndarray:
         """Return log p(z | x) of a fix for each particle, natural logarithm.
 

@@ -11,6 +11,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.interface.constants import STATE
 from gpusense.localization import starts
+from gpusense.localization.calibration import is_together
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.results import Results
@@ -24,6 +25,8 @@ class Beginnings(Results):
     _step: int
     _pending: SampledMotion
     _wide: int
+    # Whether the particles lie together, as far as is known.
+    _together: bool
     # Poses that recovery injects: their number, and half widths of the box around each.
     _pool: tuple[int, starts.Spread]
     _trust: Trust | None
@@ -40,6 +43,7 @@ class Beginnings(Results):
             TypeError, ValueError: an argument breaks its rule.
         """
         self._place(starts.normal(mean, covariance, self._number(particles), self._key()))
+        self._together = is_together(np.asarray(covariance))
 
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
@@ -96,7 +100,7 @@ class Beginnings(Results):
             again: Whether a search is repeated: readings, judgements of poses and a pending motion are kept.
         """
         self._cloud.place(poses)
-        self._shown, self._started, self._wide = len(poses), True, 0
+        self._shown, self._started, self._wide, self._together = len(poses), True, 0, False
         self._backend.upload(np.zeros(STATE), self._cloud.state)
         if not again:
             self._pending, self._last, self._trust = STILL, {}, None

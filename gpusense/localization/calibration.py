@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-from gpusense.localization import skipping
-from gpusense.localization.cloud import Cloud
-from gpusense.localization.estimates import covariance_of
+import numpy as np
+
 from gpusense.localization.scoring import Given
 from gpusense.localization.sensors import Sensor
+from gpusense.localization.skipping import TOGETHER
+
+# Corrections after which a filter whose particles lie together looks whether they still do.
+LOOK = 5
+# A sensor, and the scan to learn from.
+Due = list[tuple[Sensor, tuple[Any, ...]]]
 
 
-def calibrate(sensors: Sequence[Sensor], given: Sequence[Given], cloud: Cloud, shown: int) -> None:
-    """Learn from the scans of a correction at the estimated pose, if the particles lie together.
+def due_of(sensors: Sequence[Sensor], given: Sequence[Given]) -> Due:
+    """Count the scans of a correction; return those to learn from, with their sensors.
 
     Args:
         sensors: The filter's sensors.
         given: Indices of sensors with their readings.
-        cloud: The particles after the correction.
-        shown: Number of the particles that have weights.
     """
     due = []
     for index, reading in given:
@@ -26,11 +30,13 @@ def calibrate(sensors: Sequence[Sensor], given: Sequence[Given], cloud: Cloud, s
         if sensor.calibrates:
             sensor.count()
             due += [(sensor, reading)] if sensor.due else []
-    if not due or cloud.summary().effective_sample_size < 2:
-        return
-    numbers = cloud.estimate(shown)
-    covariance = covariance_of(numbers)
-    if max(covariance[0, 0], covariance[1, 1]) > skipping.TOGETHER**2:
-        return
-    for sensor, reading in due:
-        sensor.correlate(numbers[:3], covariance, reading)
+    return due
+
+
+def is_together(covariance: np.ndarray) -> bool:
+    """Tell whether particles of a covariance lie together: their deviation along x and along y is at most half a metre.
+
+    Args:
+        covariance: (3, 3) covariance of their poses [m, m, rad].
+    """
+    return bool(max(covariance[0, 0], covariance[1, 1]) <= TOGETHER**2)

@@ -16,8 +16,9 @@ class Defaults(NamedTuple):
         beams: Beams of a scan that commands use; None for all.
         threshold: Resample below this share of the particles.
         stages: Most stages of a correction.
-        share: Least effective sample size of a stage, as a share of the particles.
-        enough: Effective sample size that is enough for a stage of any number of particles.
+        share: Least effective sample size of a stage, as a share of the particles, where they lie together.
+        enough: Effective sample size that is enough for a stage of any number of particles that lie together.
+        share_apart: Least share where they lie apart, so that few places do not win by chance.
         jitter: Share of the difference of two particles by which a drawn one moves between stages.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].
@@ -43,6 +44,7 @@ class Defaults(NamedTuple):
     stages: int = 4
     share: float = 0.1
     enough: int = 500
+    share_apart: float = 0.2
     jitter: float = 0.2
     farthest: float = 1.0
     farthest_turn: float = 0.5

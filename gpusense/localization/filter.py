@@ -10,9 +10,10 @@ from gpusense._util import checks
 from gpusense.localization import options, resetting, skipping
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.beginnings import Beginnings
-from gpusense.localization.calibration import calibrate
+from gpusense.localization.calibration import LOOK, Due, due_of, is_together
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.estimates import covariance_of
 from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.scoring import Given, Scoring, given_of
 from gpusense.localization.sensors import sensors_of
@@ -94,6 +95,7 @@ class ParticleFilter(Beginnings):
         self._scoring = Scoring(self._cloud, self._sensors)
         self._step, self._started, self._pending = 0, False, STILL
         self._shown, self._wide = self.options.most, 0
+        self._corrections, self._together = 0, False
         self._pool = 0, (0.0, 0.0, 0.0)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
@@ -170,10 +172,21 @@ class ParticleFilter(Beginnings):
         self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
         self._wide = max(self._wide - 1, 0)
         self._verdict.corrected()
-        if chosen.temperature == "auto":
-            calibrate(self._sensors, given, self._cloud, self._shown)
+        self._corrections += 1
+        due = due_of(self._sensors, given) if chosen.temperature == "auto" else []
+        if due or not self._together or self._corrections % LOOK == 0:
+            self._look(due)
         if self._verdict.due and self._is_contradicted():
             self.reset()
+
+    def _look(self, due: Due) -> None:
+        """Find out whether the particles lie together, and if so learn from scans at the estimated pose."""
+        numbers = self._cloud.estimate(self._shown)
+        covariance = covariance_of(numbers)
+        self._together = is_together(covariance)
+        if due and self._together and self._cloud.summary().effective_sample_size >= 2:
+            for sensor, reading in due:
+                sensor.correlate(numbers[:3], covariance, reading)
 
     def _is_contradicted(self) -> bool:
         """Tell whether scans contradict the pose so that half of the particles should be replaced."""
@@ -218,7 +231,7 @@ class ParticleFilter(Beginnings):
         for sensor in (self._sensors[index] for index in given):
             sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
         step, count = self._key()[2], self._cloud.count
-        return options.settings_of_step(self.options, motion, step, count, self._pool, sensors)
+        return options.settings_of_step(self.options, motion, step, count, self._pool, sensors, self._together)
 
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""

@@ -57,16 +57,16 @@ def test_errors_fall_with_the_root_of_the_number_of_particles():
 
 def test_many_particles_take_no_more_stages_than_they_need(backend):
     # With a ratio r of the variances of fix and prior, r (2 + r) / (1 + r)^2 = 7.5 % of the particles are effective.
-    variance = 0.09 / 0.04
-
-    def state(count):
-        pf = gs.ParticleFilter(gps(backend), particles=count, seed=1)
-        pf.initialize(mean=(0, 0, 0), covariance=np.diag([variance, variance, 0.01]))
+    def state(count, deviation):
+        sigma = deviation * np.sqrt(0.04)
+        model = gs.PositionModel(gs.PositionParameters(sigma=sigma, z_rand=0.0), backend=backend)
+        pf = gs.ParticleFilter(model, particles=count, seed=1)
+        pf.initialize(mean=(0, 0, 0), covariance=np.diag([deviation**2, deviation**2, 0.01]))
         pf.correct(np.zeros(2))
         return pf._cloud.summary()
 
-    few, many = state(4000), state(20_000)
-    assert few.stages > 1 and many.stages == 1
+    few, many, apart = state(4000, 0.5), state(20_000, 0.5), state(20_000, 2.0)
+    assert few.stages > 1 and many.stages == 1 and apart.stages > 1
     assert 500 < many.effective_sample_size < 0.1 * 20_000
 
 

@@ -18,7 +18,7 @@ from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
 from gpusense.localization.defaults import DEFAULTS
 
 # Below this translation [m] no direction can be read from it.
-_SHORTEST = 0.01
+SHORTEST = 0.01
 
 
 class SampledMotion(NamedTuple):
@@ -72,7 +72,7 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
     one, two = checks.array("before", before, (3,)), checks.array("after", after, (3,))
     x, y, turn = _difference(one, two)
     trans = math.hypot(x, y)
-    first = math.atan2(y, x) if trans >= _SHORTEST else 0.0
+    first = math.atan2(y, x) if trans >= SHORTEST else 0.0
     if abs(first) > math.pi / 2:
         first, trans = first - math.copysign(math.pi, first), -trans
     return first, trans, math.remainder(turn - first, math.tau)
@@ -148,7 +148,7 @@ class OdometryMotion:
         squares = first * first + second * second
         length = math.sqrt(a3 * trans * trans + a4 * squares + at * at)
         side = math.sqrt(self.sideways * squares + at * at) if self.sideways > 0 else 0.0
-        reverse = self.reverse if abs(trans) >= _SHORTEST else 0.0
+        reverse = self.reverse if abs(trans) >= SHORTEST else 0.0
         return SampledMotion(
             (first, trans, 0.0, second), (deviations[0], length, side, deviations[1]), STRAIGHT, reverse
         )

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -132,6 +133,22 @@ class OdometryMotion:
         object.__setattr__(self, "sideways", checks.real("sideways", self.sideways, low=0))
         missed = checks.array("systematic", self.systematic, (3,))
         object.__setattr__(self, "systematic", tuple(float(value) for value in missed))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes; a missing one is the default.
+
+        Raises:
+            TypeError: ``values`` is not a mapping, or a value has the wrong type.
+            ValueError: A key names no attribute, or a value breaks its rule.
+        """
+        if not isinstance(values, Mapping):
+            raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
+        names = [one.name for one in dataclasses.fields(cls)]
+        for key in values:
+            if key not in names:
+                raise ValueError(f"values: every key must be one of {', '.join(names)}, got {checks.show(key)}")
+        return cls(**values)
 
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""

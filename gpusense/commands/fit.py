@@ -235,7 +235,7 @@ def _print(result: Result, files: list[Path]) -> None:
     if result.incidence is not None:
         print(f"\n{result.incidence}")
     if result.motion is not None:
-        print(f"\nodometry: {result.motion.motion}, of {result.motion.steps} steps")
+        _print_motion(result.motion)
     if result.held_out:
         print(f"\nheld out: {result.held_out_readings} readings, mean log-likelihood of one [nats]")
         columns = ("parameters", "log-likelihood", "std. error", "fitted ones gain", "std. error of it")
@@ -251,6 +251,13 @@ def _print(result: Result, files: list[Path]) -> None:
     if files:
         print("\nwritten: " + ", ".join(map(str, files)))
     print(f"\n{machine_line()}")
+
+
+def _print_motion(fit: MotionFit) -> None:
+    path = f"{fit.travelled:.1f} m and {fit.turned:.1f} rad"
+    print(f"\nodometry: {fit.motion}, of {fit.steps} steps ({path}) with {fit.references} reference poses")
+    if fit.undetermined:
+        print(f"at most the default, because the log does not determine them: {', '.join(fit.undetermined)}")
 
 
 def _error(value: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,10 +44,7 @@ def read_localization(path: Path) -> tuple[BeamParameters | None, dict[str, Any]
     if "odometry_motion" not in content:
         return beam, {}
     values = content["odometry_motion"]
-    known = {one.name for one in fields(OdometryMotion)}
-    if isinstance(values, dict) and (unknown := sorted(map(str, values.keys() - known))):
-        raise ValueError(f"{path}: odometry_motion: must have keys among {sorted(known)}, got {unknown}")
-    _made(path, "odometry_motion", values, lambda mapping: OdometryMotion(**mapping))
+    _made(path, "odometry_motion", values, OdometryMotion.from_dict)
     return beam, values
 
 

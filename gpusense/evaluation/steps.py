@@ -106,17 +106,17 @@ def repeats_odometry(steps: Sequence[Step]) -> bool:
 
 
 def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Pose]]:
-    """Return odometry and reference poses of the steps that have a reference, to learn the noise of the odometry.
+    """Return odometry and reference poses of all steps, to learn the noise of the odometry; NaN without a reference.
 
     Raises:
         ValueError: there is none, or the references are the odometry's own poses.
     """
-    known = [(step.odometry, step.reference) for step in steps if step.reference is not None]
-    if not known:
+    if all(step.reference is None for step in steps):
         raise ValueError("--fit-motion: must have a log with poses, or a --reference, got neither")
     if repeats_odometry(steps):
         raise ValueError("--fit-motion: must have poses that are not the odometry's own, got a log of these")
-    return [odometry for odometry, _ in known], [reference for _, reference in known]
+    none = (np.nan, np.nan, np.nan)
+    return [step.odometry for step in steps], [step.reference or none for step in steps]
 
 
 def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list[Step]:

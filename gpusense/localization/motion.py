@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
 from gpusense.localization.defaults import DEFAULTS
 
 # Below this translation [m] no direction can be read from it.
-_SHORTEST = 0.01
+SHORTEST = 0.01
 
 
 class SampledMotion(NamedTuple):
@@ -76,7 +77,7 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
     one, two = checks.array("before", before, (3,)), checks.array("after", after, (3,))
     x, y, turn = _difference(one, two)
     trans = math.hypot(x, y)
-    first = math.atan2(y, x) if trans >= _SHORTEST else 0.0
+    first = math.atan2(y, x) if trans >= SHORTEST else 0.0
     if abs(first) > math.pi / 2:
         first, trans = first - math.copysign(math.pi, first), -trans
     return first, trans, math.remainder(turn - first, math.tau)
@@ -137,6 +138,22 @@ class OdometryMotion:
         missed = checks.array("systematic", self.systematic, (3,))
         object.__setattr__(self, "systematic", tuple(float(value) for value in missed))
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes; a missing one is the default.
+
+        Raises:
+            TypeError: ``values`` is not a mapping, or a value has the wrong type.
+            ValueError: A key names no attribute, or a value breaks its rule.
+        """
+        if not isinstance(values, Mapping):
+            raise TypeError(f"values: must be a mapping, got {checks.show(values)}")
+        names = [one.name for one in dataclasses.fields(cls)]
+        for key in values:
+            if key not in names:
+                raise ValueError(f"values: every key must be one of {', '.join(names)}, got {checks.show(key)}")
+        return cls(**values)
+
     def sampled(self, *arguments: Any) -> SampledMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
         if len(arguments) != 2:
@@ -152,7 +169,7 @@ class OdometryMotion:
         squares = first * first + second * second
         length = math.sqrt(a3 * trans * trans + a4 * squares + at * at)
         side = math.sqrt(self.sideways * squares + at * at) if self.sideways > 0 else 0.0
-        reverse = self.reverse if abs(trans) >= _SHORTEST else 0.0
+        reverse = self.reverse if abs(trans) >= SHORTEST else 0.0
         return SampledMotion(
             (first, trans, 0.0, second), (deviations[0], length, side, deviations[1]), STRAIGHT, reverse
         )

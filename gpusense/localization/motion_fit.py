@@ -1,19 +1,27 @@
-"""Noise of the odometry model from a log with reference poses, by maximum likelihood.
+"""Noise of the odometry model from a log with reference poses, by maximum likelihood with weak priors.
 
 The difference between reference and odometry over a step is, to first order, normal: (along, across, heading) =
-(noise of the translation, trans * noise of the first turn + noise to the side, noise of both turns). Steps that fit
-better with the odometer's translation reversed are counted, and give the probability of a reverse. A Student t density
-with 4 degrees of freedom keeps single slips from inflating the noise of all steps. A filter draws normal noise: the
+(noise of the translation, trans * noise of the first turn + noise to the side, noise of both turns). Where references
+are further apart, the covariances of the steps in between add up (:mod:`gpusense.localization.step_errors`). A Student
+t density with 4 degrees of freedom keeps single slips from inflating the noise of all steps. Steps that fit better with
+the odometer's translation reversed are counted, and give the probability of a reverse. A filter draws normal noise: the
 variances are multiplied by the mean square of standardised errors, each at most 9.
 
 Errors of an odometer repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
 Their constant part is fitted, too (on the intel log 3 degrees a metre). For the rest, variances are multiplied by
 1 + 2 sum rho_l, the inflation of the variance of a sum by the autocorrelation rho_l of standardised errors.
+
+A log may not determine each variance: a robot that never turned tells nothing of the noise of turns. The logarithm of
+each has a normal prior around the default, whose deviation is a factor of ten. A variance without data keeps the
+default, and 100 steps that determine it move it by 2 % of the way to it. With the Fisher information I of the t density
+(Lange, Little and Taylor 1989), the logarithms have the covariance (I + 1 / prior variance)^-1. A variance counts as
+determined where that at least halves the prior's deviation. One that is not, inflated too, is the default at most.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +29,10 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
+from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import OdometryMotion, odometry_turns
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.localization.pose_algebra import pose_difference
+from gpusense.localization.step_errors import NOISES, REST, Errors, corrected, errors_of
 
 _FREEDOM = 4.0
 _LEAST_ALPHA, _MOST_ALPHA = 1e-6, 1.0
@@ -34,6 +44,11 @@ _CLEAR = 0.05
 _LAGS, _MOST_INFLATION = 10, 10.0
 # Deviation of the systematic error before there is data, of each of its three parts; rounds of the fit.
 _PRIOR, _ROUNDS = 0.1, 3
+# Defaults of the variances, the deviation of their logarithms, and steps that the default of the reverse counts as.
+_DEFAULT = np.array([*DEFAULTS.alpha, DEFAULTS.sideways, *(value**2 for value in DEFAULTS.least)])
+_PRIOR_LOG, _PRIOR_STEPS = math.log(10), 25
+# A variance is determined where the deviation of its logarithm is at most this share of the prior's.
+_DETERMINED = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,10 +57,17 @@ class MotionFit:
 
     Attributes:
         motion: The model.
-        steps: Number of steps.
+        steps: Number of steps of the odometer between the first and the last reference.
         reversed_steps: Steps in which the odometer's translation had the wrong sign.
         inflation: Factor of the variances, by the autocorrelation and the tails of errors; ``motion`` has it.
-        log_likelihood: Of all steps before the inflation, natural logarithm up to a constant.
+        log_likelihood: Of all differences before the inflation, natural logarithm up to a constant.
+        references: Number of reference poses.
+        travelled: Sum of the translations of the steps [m].
+        turned: Sum of their turns [rad].
+        log_errors: (7,) standard errors of the logarithms of alpha1 to alpha4, ``sideways`` and the squares of
+            ``least``; 2.3, a factor of ten, where the log tells nothing.
+        undetermined: Names of those that the log does not determine, whose logarithm has an error above 1.15: each is
+            the default, or less where the log excludes that much.
 
     Example:
         >>> import gpusense as gs
@@ -58,18 +80,27 @@ class MotionFit:
     reversed_steps: int
     inflation: float
     log_likelihood: float
+    references: int = 0
+    travelled: float = 0.0
+    turned: float = 0.0
+    log_errors: tuple[float, ...] = ()
+    undetermined: tuple[str, ...] = ()
 
 
 def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool = True) -> MotionFit:
     """Fit the noise of :class:`OdometryMotion` to a log with reference poses.
 
+    The noise is that of one step of ``odometry``, and depends on its length: pass the steps that a filter will take,
+    all of them. Reference poses may be known at some only. A variance that the log does not determine is at most the
+    default of :class:`OdometryMotion`, and is in ``undetermined``.
+
     Args:
         odometry: (M, 3) poses of the odometer, M > 2 [m, m, rad].
-        poses: (M, 3) reference poses at the same times.
+        poses: (M, 3) reference poses at the same times; rows of NaN where none is known, at most M - 3.
         systematic: Also fit the errors that repeat at each step; they are 0 otherwise.
 
     Raises:
-        TypeError, ValueError: not poses, or fewer than three.
+        TypeError, ValueError: not poses, fewer than three, or an odometer that moved by less than 1 cm and 0.01 rad.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -77,32 +108,76 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
         >>> truth[:, 0] = np.arange(400)
         >>> odometry = truth + np.cumsum(rng.normal(0, [0.1, 0, 0], (400, 3)), axis=0)
         >>> fit = gs.fit_odometry_motion(odometry, truth)
-        >>> 0.005 < fit.motion.alpha[2] / fit.inflation < 0.02
-        True
+        >>> 0.005 < fit.motion.alpha[2] / fit.inflation < 0.02, "alpha1" in fit.undetermined
+        (True, True)
     """
     reported = checks.array("odometry", odometry, ("N", 3))
-    reference = checks.array("poses", poses, (len(reported), 3))
     if len(reported) < 3:
         raise ValueError(f"odometry: must hold at least 3 poses, got {len(reported)}")
-    turns = np.array([odometry_turns(a, b) for a, b in itertools.pairwise(reported)])
-    truth = pose_difference(reference[:-1], reference[1:])
-    flipped = _distance(turns * (1, -1, 1), truth) < _distance(turns, truth) - _CLEAR
-    turns[flipped, 1] *= -1
+    reference, at = _references(poses, len(reported))
+    turns = np.array([odometry_turns(a, b) for a, b in itertools.pairwise(reported[at[0] : at[-1] + 1])])
+    at = at - at[0]
+    travelled, turned = float(np.abs(turns[:, 1]).sum()), float(np.abs(turns[:, [0, 2]]).sum())
+    if travelled < REST[0] and turned < REST[1]:
+        rule = f"must move by {REST[0]} m or {REST[1]} rad in all between the first and the last reference"
+        raise ValueError(f"odometry: {rule}, got {travelled:.3g} m and {turned:.3g} rad")
+    moved, wrong = _reverse(turns, reference, at)
     repeated = np.zeros(3)
-    noise, cost = _fitted(turns, _residuals(turns, truth), [_start(0.001), _start(0.02)])
+    errors = errors_of(turns, reference, at)
+    noise, cost = _fitted(errors, [_start(0.001), _start(0.02)])
     for _ in range(_ROUNDS if systematic else 0):
-        repeated = _systematic(noise, turns, _residuals(turns, truth))
-        noise, cost = _fitted(turns, _residuals(_corrected(turns, repeated), truth), [noise])
-    corrected = _corrected(turns, repeated)
-    inflation = _inflation(noise, corrected, _residuals(corrected, truth))
-    count, wrong = len(turns), int(flipped.sum())
-    return MotionFit(_motion(noise * inflation, (wrong + 0.5) / (count + 1), repeated), count, wrong, inflation, -cost)
+        repeated = repeated + _systematic(noise, errors, repeated)
+        errors = errors_of(corrected(turns, repeated), reference, at)
+        noise, cost = _fitted(errors, [noise])
+    inflation, deviations = _inflation(noise, errors), _log_errors(noise, errors)
+    unsure = deviations > _DETERMINED * _PRIOR_LOG
+    noise = np.where(unsure, np.minimum(noise * max(inflation, 1.0), _DEFAULT), noise * inflation)
+    reverse = (wrong + _PRIOR_STEPS * DEFAULTS.reverse) / (moved + _PRIOR_STEPS)
+    return MotionFit(
+        motion=_motion(noise, reverse, repeated),
+        steps=len(turns),
+        reversed_steps=wrong,
+        inflation=inflation,
+        log_likelihood=-cost,
+        references=len(at),
+        travelled=travelled,
+        turned=turned,
+        log_errors=tuple(float(value) for value in deviations),
+        undetermined=tuple(itertools.compress(NOISES, unsure)),
+    )
+
+
+def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reference poses and their indices.
+
+    Raises:
+        TypeError, ValueError: they are no poses, or fewer than three.
+    """
+    values = checks.array("poses", poses, (count, 3), finite=False)
+    absent = np.isnan(values).all(axis=1)
+    checks.array("poses", np.where(absent[:, None], 0.0, values))
+    at = np.flatnonzero(~absent)
+    if len(at) < 3:
+        raise ValueError(f"poses: must hold at least 3 rows that are not NaN, got {len(at)}")
+    return values[at], at
+
+
+def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[int, int]:
+    """Turn the translations around that fit better so; return the number of steps that could, and of those that do.
+
+    A reverse shows only where a step has a reference before and after it.
+    """
+    single = np.flatnonzero(np.diff(at) == 1)
+    truth, steps = pose_difference(reference[single], reference[single + 1]), at[single]
+    taken = turns[steps]
+    flipped = _distance(taken * (1, -1, 1), truth) < _distance(taken, truth) - _CLEAR
+    turns[steps[flipped], 1] *= -1
+    return int(np.count_nonzero(2 * np.abs(taken[:, 1]) > _CLEAR)), int(flipped.sum())
 
 
 def _start(alpha: float) -> np.ndarray:
     """Return variances to begin a search with: four of alpha, to the side, and the least ones [m^2, rad^2]."""
-    translation, turn = OdometryMotion().least
-    return np.array([alpha] * 5 + [translation**2, turn**2])
+    return np.array([alpha] * 5 + list(_DEFAULT[5:]))
 
 
 def _motion(noise: np.ndarray, reverse: float, repeated: np.ndarray) -> OdometryMotion:
@@ -111,19 +186,20 @@ def _motion(noise: np.ndarray, reverse: float, repeated: np.ndarray) -> Odometry
     return OdometryMotion(tuple(values[:4]), reverse, (float(least[0]), float(least[1])), missed, values[4])
 
 
-def _fitted(turns: np.ndarray, residual: np.ndarray, starts: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the most likely variances, and the negative log-likelihood there."""
+def _fitted(errors: Errors, starts: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    """Return the most likely variances with the prior, and the negative log-likelihood there without it."""
     from scipy.optimize import minimize
 
     def cost(logs: np.ndarray) -> float:
-        return _cost(_limited(logs), turns, residual)
+        return _cost(_limited(logs), errors) + 0.5 * float(np.sum((logs - np.log(_DEFAULT)) ** 2)) / _PRIOR_LOG**2
 
     options = dict(maxiter=4000, maxfev=4000, adaptive=True, xatol=1e-2, fatol=1e-3)
     best: Any = min(
         (minimize(cost, np.log(start), method="Nelder-Mead", options=options) for start in starts),
         key=lambda found: found.fun,
     )
-    return _limited(best.x), float(best.fun)
+    noise = _limited(best.x)
+    return noise, _cost(noise, errors)
 
 
 def _limited(logs: np.ndarray) -> np.ndarray:
@@ -132,50 +208,22 @@ def _limited(logs: np.ndarray) -> np.ndarray:
     return np.exp(np.clip(logs, low, np.log([_MOST_ALPHA] * 5 + [_MOST**2] * 2)))
 
 
-def _corrected(turns: np.ndarray, repeated: np.ndarray) -> np.ndarray:
-    """Return motions without the systematic error, as :class:`OdometryMotion` corrects them."""
-    stretch, gain, drift = repeated
-    first, trans, second = turns.T
-    half = drift * trans / 2
-    return np.stack([first * (1 + gain) + half, trans * (1 + stretch), second * (1 + gain) + half], axis=1)
+def _systematic(noise: np.ndarray, errors: Errors, before: np.ndarray) -> np.ndarray:
+    """Return what is to be added to the systematic error (3,), given the variances.
 
-
-def _systematic(noise: np.ndarray, turns: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return the systematic error (3,) by least squares, reweighted for the t density, given the variances."""
-    first, trans, second = turns.T
-    zero = np.zeros_like(trans)
-    along, a, b, c, determinant = _covariances(noise, turns)
-    # Rows: error along, across, and of the heading, for each part of the systematic error.
-    design = np.stack(
-        [
-            np.stack([trans, zero, zero], axis=1),
-            np.stack([zero, trans * first, trans * trans / 2], axis=1),
-            np.stack([zero, first + second, trans], axis=1),
-        ],
-        axis=1,
-    )
-    inverse = np.zeros((len(turns), 3, 3))
-    inverse[:, 0, 0] = 1 / along
-    inverse[:, 1, 1], inverse[:, 2, 2] = c / determinant, a / determinant
-    inverse[:, 1, 2] = inverse[:, 2, 1] = -b / determinant
-    repeated = np.zeros(3)
+    It is by least squares, reweighted for the t density, around the error that is already corrected.
+    """
+    inverse = np.linalg.inv(errors.covariances(noise))
+    design, residual = errors.design, errors.residual
+    added = np.zeros(3)
     for _ in range(20):
-        left = residual - design @ repeated
-        weight = (_FREEDOM + 3) / (_FREEDOM + np.einsum("mi,mij,mj->m", left, inverse, left))
+        left = residual - np.einsum("gik,k->gi", design, added)
+        weight = (_FREEDOM + 3) / (_FREEDOM + np.einsum("gi,gij,gj->g", left, inverse, left))
         weighted = weight[:, None, None] * inverse
-        normal = np.einsum("mik,mij,mjl->kl", design, weighted, design) + np.eye(3) / _PRIOR**2
-        repeated = np.linalg.solve(normal, np.einsum("mik,mij,mj->k", design, weighted, residual))
-    return repeated
-
-
-def _covariances(noise: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the variance along, the covariance (a, b; b, c) of (across, heading), and its determinant."""
-    first, trans, second = turns.T
-    squares = first**2 + second**2
-    along = noise[2] * trans**2 + noise[3] * squares + noise[5]
-    one, two = (noise[0] * turn**2 + noise[1] * trans**2 + noise[6] for turn in (first, second))
-    a, b, c = one * trans**2 + noise[4] * squares + noise[5], one * trans, one + two
-    return along, a, b, c, np.maximum(a * c - b * b, 1e-30)
+        normal = np.einsum("gik,gij,gjl->kl", design, weighted, design) + np.eye(3) / _PRIOR**2
+        right = np.einsum("gik,gij,gj->k", design, weighted, residual) - before / _PRIOR**2
+        added = np.linalg.solve(normal, right)
+    return added
 
 
 def _distance(turns: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -184,21 +232,23 @@ def _distance(turns: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.hypot(x - truth[:, 0], y - truth[:, 1])
 
 
-def _residuals(turns: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return (M, 3) errors of steps along and across the translation, and of the heading."""
-    x = truth[:, 0] - turns[:, 1] * np.cos(turns[:, 0])
-    y = truth[:, 1] - turns[:, 1] * np.sin(turns[:, 0])
-    cosine, sine = np.cos(turns[:, 0]), np.sin(turns[:, 0])
-    heading = wrap_angle(truth[:, 2] - turns[:, 0] - turns[:, 2])
-    return np.stack([cosine * x + sine * y, cosine * y - sine * x, heading], axis=1)
+def _log_errors(noise: np.ndarray, errors: Errors) -> np.ndarray:
+    """Return the standard errors (7,) of the logarithms of the variances, by the Fisher information and the prior."""
+    inverse = np.linalg.inv(errors.covariances(noise))
+    parts = noise[:, None, None, None] * np.einsum("gij,kgjl->kgil", inverse, errors.basis)
+    traces = np.trace(parts, axis1=2, axis2=3)
+    top = _FREEDOM + 3
+    products = np.einsum("agij,bgji->ab", parts, parts)
+    information = (top * products - traces @ traces.T) / (2 * (top + 2))
+    return np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(noise)) / _PRIOR_LOG**2)))
 
 
-def _inflation(noise: np.ndarray, turns: np.ndarray, residual: np.ndarray) -> float:
+def _inflation(noise: np.ndarray, errors: Errors) -> float:
     """Return the factor of the variances by the tails of errors, and by their largest autocorrelation."""
-    along, a, _, c, _ = _covariances(noise, turns)
-    errors = [error / np.sqrt(variance) for error, variance in zip(residual.T, (along, a, c), strict=True)]
-    factors, tails = [1.0], [float(np.mean(np.minimum(error**2, _FAR))) for error in errors]
-    for error in errors:
+    variances = np.diagonal(errors.covariances(noise), axis1=1, axis2=2)
+    standardised = list((errors.residual / np.sqrt(variances)).T)
+    factors, tails = [1.0], [float(np.mean(np.minimum(error**2, _FAR))) for error in standardised]
+    for error in standardised:
         held = np.clip(error, -4, 4)
         products = [held[lag:] @ held[: len(held) - lag] for lag in range(min(_LAGS, len(held) - 1) + 1)]
         if products[0] > 0:
@@ -206,10 +256,14 @@ def _inflation(noise: np.ndarray, turns: np.ndarray, residual: np.ndarray) -> fl
     return float(min(max(factors), _MOST_INFLATION)) * max(float(np.mean(tails)), 0.5)
 
 
-def _cost(noise: np.ndarray, turns: np.ndarray, residual: np.ndarray) -> float:
+def _cost(noise: np.ndarray, errors: Errors) -> float:
     """Return the negative log-likelihood of residuals."""
-    along, a, b, c, determinant = _covariances(noise, turns)
-    across, heading = residual[:, 1], residual[:, 2]
-    squared = (c * across**2 - 2 * b * across * heading + a * heading**2) / determinant + residual[:, 0] ** 2 / along
-    logs = np.log(determinant) + np.log(along)
-    return float(np.sum(0.5 * logs + 0.5 * (_FREEDOM + 3) * np.log1p(squared / _FREEDOM)))
+    (a, b, c), (_, d, e), (_, _, f) = errors.covariances(noise).transpose(1, 2, 0)
+    # The inverse of a symmetric matrix by its minors.
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = np.maximum(a * p + b * q + c * r, 1e-30)
+    x, y, z = errors.residual.T
+    squared = p * x * x + (a * f - c * c) * y * y + (a * d - b * b) * z * z
+    squared += 2 * (q * x * y + r * x * z + (b * c - a * e) * y * z)
+    tails = 0.5 * (_FREEDOM + 3) * np.log1p(squared / determinant / _FREEDOM)
+    return float(np.sum(0.5 * np.log(determinant) + tails))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from gpusense._util import checks
 from gpusense._util.files import read_mapping
+from gpusense.localization.motion import MotionModel, OdometryMotion, OmniMotion
+from gpusense.localization.nav2_nodes import parameters_of
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.compat import Amcl
@@ -17,12 +19,16 @@ from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.peer_weights import BeamWeights, FieldWeights
 from gpusense.world.scanner import Scanner
 
+if TYPE_CHECKING:
+    from gpusense.localization.filter import ParticleFilter
+
 LaserModel = Literal["beam", "likelihood_field", "likelihood_field_prob"]
 
 # Defaults of nav2_amcl 1.5.0's node. The types of the values are those of the parameters.
 _DEFAULTS: dict[str, Any] = {
     "alpha1": 0.2, "alpha2": 0.2, "alpha3": 0.2, "alpha4": 0.2, "alpha5": 0.2,
-    "base_frame_id": "base_footprint", "global_frame_id": "map", "odom_frame_id": "odom",
+    "base_frame_id": "base_footprint", "beam_skip_threshold": 0.3, "do_beamskip": False,
+    "global_frame_id": "map", "odom_frame_id": "odom",
     "lambda_short": 0.1, "laser_likelihood_max_dist": 2.0, "laser_max_range": 100.0, "laser_min_range": -1.0,
     "laser_model_type": "likelihood_field", "max_beams": 60, "max_particles": 2000, "min_particles": 500,
     "map_topic": "map", "pf_err": 0.05, "pf_z": 0.99, "recovery_alpha_fast": 0.0, "recovery_alpha_slow": 0.0,
@@ -56,7 +62,10 @@ class Nav2Options:
     parameters: BeamParameters | LikelihoodFieldParameters
     """The model's parameters with weights that sum to 1; from ``beam_model`` where ``gpusense fit`` wrote the file."""
     alpha: tuple[float, float, float, float, float]
-    """Noise of the odometry, alpha1 to alpha5; the fifth is for omnidirectional robots."""
+    """Noise of the odometry, alpha1 to alpha5; the fifth is for omnidirectional robots. A missing one is the fitted one
+    in a file of ``gpusense fit --fit-motion``."""
+    odometry: OdometryMotion | None
+    """The noise that ``gpusense fit --fit-motion`` wrote; None in other files, and for omnidirectional robots."""
     motion: Literal["differential", "omni"]
     """The kind of robot."""
     particles: tuple[int, int]
@@ -69,6 +78,8 @@ class Nav2Options:
     """Corrections between resamplings."""
     recovery: tuple[float, float]
     """Decay rates of the slow and the fast average weight; 0 switches recovery off."""
+    beam_skip: float | None
+    """beam_skip_threshold where do_beamskip is true: the share of the particles that must explain a beam."""
     update_min: tuple[float, float]
     """Least translation along x or y [m] and least turn [rad] before the next correction."""
     max_beams: int
@@ -108,17 +119,44 @@ class Nav2Options:
         kind: Any = BeamModel if self.model == "beam" else LikelihoodFieldModel
         return cast("BeamModel | LikelihoodFieldModel", kind(grid, scanner, chosen, **options))
 
+    def make_motion(self) -> MotionModel:
+        """Make the motion model: the fitted noise where there is one, else ``alpha`` with the defaults of gpusense."""
+        if self.motion == "omni":
+            return OmniMotion(self.alpha)
+        return OdometryMotion(self.alpha[:4]) if self.odometry is None else self.odometry
 
-def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options:
+    def make_filter(self, models: Any, **options: Any) -> ParticleFilter:
+        """Make a particle filter with the motion, the number of particles, the recovery and the skipping of beams.
+
+        Recovery is "augmented", with gpusense's own rates, where both of ``recovery`` are positive.
+
+        Args:
+            models: A measurement model, or several.
+            options: Other options of :class:`ParticleFilter`, or these in place of the file's.
+
+        Raises:
+            TypeError, ValueError: As the class does.
+        """
+        from gpusense.localization.filter import ParticleFilter
+
+        chosen: dict[str, Any] = dict(
+            motion=self.make_motion(), particles=self.particles, beam_skip=self.beam_skip,
+            recovery="augmented" if all(self.recovery) else None,
+        )  # fmt: skip
+        return ParticleFilter(models, **(chosen | options))
+
+
+def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str | None = None) -> Nav2Options:
     """Read the parameters of nav2_amcl's node from a YAML file or a mapping, without ROS.
 
     A missing parameter has the node's default. The file is read as plain data; nothing in it is executed. The book's
     parameters have the same weights in proportion. A file of ``gpusense fit`` has the fitted parameters, with offset
-    and growth, in ``beam_model``: these are then ``parameters``.
+    and growth, in ``beam_model``: these are then ``parameters``; and its ``odometry_motion`` is ``odometry``.
 
     Args:
         source: The file of parameters; or its content: a mapping with ``amcl: ros__parameters:``, in any namespace, or
             the mapping of the parameters themselves.
+        node: Name of the node, with or without its namespaces, such as ``"/robot1/amcl"``; None for the only amcl.
 
     Returns:
         The options: model, parameters, motion, particles, gates, frames.
@@ -126,7 +164,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options
     Raises:
         FileNotFoundError: The file is missing.
         TypeError: A value has the wrong type; the message names the parameter.
-        ValueError: A value breaks its rule, or the file holds no parameters of amcl.
+        ValueError: A value breaks its rule, or the file holds no parameters of such a node, or those of several.
 
     Example:
         >>> import gpusense as gs
@@ -138,7 +176,13 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options
     else:
         file = checks.existing_file(checks.path("source", source))
         content, name = read_mapping(file), str(file)
-    found = _parameters_of(content, name)
+    found = parameters_of(content, name, node, _DEFAULTS)
+    robot = _ROBOTS[
+        checks.choice("robot_model_type", found.get("robot_model_type", _DEFAULTS["robot_model_type"]), tuple(_ROBOTS))
+    ]
+    odometry = _odometry(content, name) if robot == "differential" else None
+    if odometry is not None:
+        found = {f"alpha{k}": value for k, value in enumerate(odometry.alpha, 1)} | found
     values = {key: _value(name, key, found.get(key, default), default) for key, default in _DEFAULTS.items()}
     model = checks.choice("laser_model_type", values["laser_model_type"], _MODELS)
     weights = _weights(model, values)
@@ -147,7 +191,6 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options
         parameters: BeamParameters | LikelihoodFieldParameters = BeamParameters.from_dict(fitted)
     else:
         parameters = _normalized(weights)
-    robot = checks.choice("robot_model_type", values["robot_model_type"], tuple(_ROBOTS))
     least, most = (checks.integer(key, values[key], low=1) for key in ("min_particles", "max_particles"))
     if least > most:
         raise ValueError(f"min_particles: must be <= max_particles = {most}, got {least}")
@@ -157,12 +200,14 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options
         weights=weights,
         parameters=parameters,
         alpha=cast(Any, tuple(checks.real(f"alpha{k}", values[f"alpha{k}"], low=0) for k in range(1, 6))),
-        motion=cast(Any, _ROBOTS[robot]),
+        odometry=odometry,
+        motion=cast(Any, robot),
         particles=(least, most),
         pf_err=checks.real("pf_err", values["pf_err"], above=0),
         pf_z=checks.real("pf_z", values["pf_z"], above=0),
         resample_interval=checks.integer("resample_interval", values["resample_interval"], low=1),
         recovery=(_rate("recovery_alpha_slow", values), _rate("recovery_alpha_fast", values)),
+        beam_skip=_beam_skip(values),
         update_min=(values["update_min_d"], values["update_min_a"]),
         max_beams=checks.integer("max_beams", values["max_beams"], low=1),
         range_limits=(near if near >= 0 else None, far if far > 0 else None),
@@ -173,28 +218,6 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any]) -> Nav2Options
         initial_pose=_initial_pose(name, found) if values["set_initial_pose"] else None,
         ignored=tuple(sorted(str(key) for key in found if key not in _DEFAULTS and key != "initial_pose")),
     )
-
-
-def _parameters_of(content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Return the parameters of amcl in a file's content.
-
-    Raises:
-        ValueError: There are none.
-    """
-    if any(key in content for key in _DEFAULTS):
-        return content
-    waiting: list[tuple[Mapping[str, Any], bool]] = [(content, False)]
-    while waiting:
-        here, ours = waiting.pop()
-        own = here.get("ros__parameters")
-        if ours and isinstance(own, Mapping):
-            return own
-        for key, value in here.items():
-            if isinstance(value, Mapping) and key not in ("ros__parameters", "beam_model", "incidence_model"):
-                waiting.append((value, str(key).strip("/") in ("amcl", "**")))
-    if "beam_model" in content:
-        return {"laser_model_type": "beam"}
-    raise ValueError(f"{name}: must hold amcl's ros__parameters, got the keys {checks.show(sorted(map(str, content)))}")
 
 
 def _value(name: str, key: str, value: object, default: object) -> Any:
@@ -209,6 +232,27 @@ def _value(name: str, key: str, value: object, default: object) -> Any:
             raise TypeError(f"{place}: must be a string, got {checks.show(value)}")
         return value
     return checks.integer(place, value) if isinstance(default, int) else checks.real(place, value)
+
+
+def _odometry(content: Mapping[str, Any], name: str) -> OdometryMotion | None:
+    """Return the noise that gpusense fit wrote; None without it.
+
+    Raises:
+        TypeError, ValueError: It breaks a rule.
+    """
+    if "odometry_motion" not in content:
+        return None
+    try:
+        return OdometryMotion.from_dict(content["odometry_motion"])
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{name}: odometry_motion: {error}") from None
+
+
+def _beam_skip(values: Mapping[str, Any]) -> float | None:
+    """Return the share of the particles that must explain a beam; None where beams are not skipped."""
+    if not values["do_beamskip"]:
+        return None
+    return checks.real("beam_skip_threshold", values["beam_skip_threshold"], above=0, below=1)
 
 
 def _rate(key: str, values: Mapping[str, Any]) -> float:

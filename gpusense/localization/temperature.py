@@ -36,6 +36,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
+from gpusense.models.scan.model import ScanModel
 
 # Independent beams of a scan before there is data.
 INDEPENDENT_AT_FIRST = 10.0
@@ -252,7 +253,8 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
         poses: (S, 3) poses of the robot at the scans, from a tracker or a reference [m, m, rad].
 
     Raises:
-        TypeError, ValueError: fewer than five scans, or another number of poses.
+        TypeError: not a model of scans, or not arrays.
+        ValueError: fewer than five scans have eight beams with a log-likelihood, or another number of poses.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -263,6 +265,8 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
         >>> 0.3 < gs.calibrate_temperature(model, scans, poses) <= 1
         True
     """
+    if not isinstance(model, ScanModel):
+        raise TypeError(f"model: must be a model of scans, got {checks.show(model)}")
     at = checks.array("poses", poses, ("S", 3))
     readings = checks.array("scans", scans, (len(at), model.scanner.count), finite=False)
     if len(at) < _LEAST_SCANS:
@@ -270,4 +274,7 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
     correlation = BeamCorrelation()
     for ranges, pose in zip(readings, at, strict=True):
         learn_from_scan(correlation, model, ranges, pose)
+    if correlation.scans < _LEAST_SCANS:
+        rule = f"at least {_LEAST_SCANS} must have {_FEWEST} beams that the model uses"
+        raise ValueError(f"scans: {rule}, got {correlation.scans} of {len(at)}")
     return correlation.temperature(model.used_beams)

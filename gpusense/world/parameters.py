@@ -240,7 +240,7 @@ class LandmarkParameters(_Parameters):
     sigma_bearing: float | None = 0.05
     """The standard deviation of a bearing, > 0 [rad] (equation 6.40)."""
     sigma_signature: float | None = None
-    """The standard deviation of a signature, > 0, in its own unit (equation 6.40)."""
+    """The standard deviation of a signature, > 0, in its own unit (equation 6.40); None ignores signatures."""
     z_detect: float = 0.95
     """The weight of a feature that is a landmark, >= 0 [1]."""
     z_false: float = 0.05

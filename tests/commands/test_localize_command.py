@@ -99,7 +99,7 @@ def test_what_the_command_fit_wrote_is_used(place, capsys, tmp_path):
     motion = gs.OdometryMotion(**noise | {"sideways": 0.5})
     assert "BeamModel" in used and repr(motion) in used
     for text, message in (
-        ("odometry_motion: {speed: 1}", "odometry_motion: must have keys among"),
+        ("odometry_motion: {speed: 1}", "odometry_motion: values: every key must be one of alpha, reverse, least"),
         ("odometry_motion: [1]", "must hold a mapping odometry_motion"),
         ("odometry_motion: {alpha: [1, 2]}", "odometry_motion: alpha"),
         ("a: 1", "must hold a mapping beam_model or odometry_motion"),

@@ -218,6 +218,9 @@ def test_starts_have_their_densities():
         (lambda: gs.ParticleFilter(gps()).initialize_uniform(), "bounds: must be given"),
         (lambda: gs.OdometryMotion(alpha=(-1, 0, 0, 0)), "alpha: must be >= 0"),
         (lambda: gs.fit_odometry_motion(np.zeros((2, 3)), np.zeros((2, 3))), "at least 3 poses"),
+        (lambda: gs.fit_odometry_motion(np.zeros((9, 3)), np.zeros((9, 3))), "odometry: must move by .* got 0 m and 0"),
+        (lambda: gs.fit_odometry_motion(np.eye(9, 3), np.full((9, 3), np.nan)), "poses: must hold at least 3 rows"),
+        (lambda: gs.fit_odometry_motion(np.eye(3), [(0, 0, np.nan)] * 3), "poses: every value must be finite, got nan"),
     ],
 )
 def test_bad_input_is_refused(make, message):
@@ -277,6 +280,51 @@ def test_systematic_errors_and_slips_of_the_odometry_are_learned():
     )
     plain = gs.fit_odometry_motion(np.array(odometry), np.array(truth), systematic=False).motion
     assert plain.systematic == (0, 0, 0) and plain.alpha[1] > 1.2 * fit.motion.alpha[1]
+
+
+def _drive(motion, steps, rng):
+    """Return the poses of an odometer, and true ones that have the noise of a model."""
+    truth, odometry = [np.zeros(3)], [np.zeros(3)]
+    for _ in range(steps):
+        odometry.append(_step(odometry[-1], rng.normal(0.1, 0.15), rng.uniform(0, 0.6), rng.normal(0, 0.15)))
+        drawn = motion.sampled(*odometry[-2:])
+        one, ahead, side, two = np.array(drawn.mean) + rng.normal(size=4) * drawn.deviation
+        turned = gs.compose_poses(truth[-1], (0, 0, one))
+        truth.append(gs.compose_poses(turned, (ahead, side, two)))
+    return np.array(odometry), np.array(truth)
+
+
+def test_motion_noise_is_learned_from_references_at_some_steps():
+    motion = gs.OdometryMotion((0.03, 0.01, 0.02, 0.005), reverse=0, sideways=0.01, systematic=(0.02, -0.03, 0.02))
+    odometry, truth = _drive(motion, 6000, np.random.default_rng(3))
+    some = np.full_like(truth, np.nan)
+    some[3::17] = truth[3::17]
+    fit = gs.fit_odometry_motion(odometry, some)
+    assert fit.references == len(odometry[3::17]) and fit.steps == 17 * (fit.references - 1)
+    # Of the variances that these gaps determine, before the inflation; a step has 1/17 of a gap's.
+    ratio = np.array(fit.motion.alpha[:3]) / fit.inflation / motion.alpha[:3]
+    assert (np.abs(np.log(ratio)) < 3 * np.array(fit.log_errors[:3])).all() and max(fit.log_errors[:3]) < 0.7
+    assert "sideways" in fit.undetermined and fit.motion.sideways <= gs.OdometryMotion().sideways
+    np.testing.assert_allclose(fit.motion.systematic, motion.systematic, atol=0.03)
+    apart = gs.fit_odometry_motion(odometry[3::17], truth[3::17]).motion.alpha
+    assert apart[1] < 0.2 * motion.alpha[1]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.0005, 0.003])
+def test_motion_noise_of_a_robot_that_stands_stays_near_the_default(jitter):
+    rng, moves = np.random.default_rng(0), 10
+    odometry, truth = _drive(gs.OdometryMotion(reverse=0), moves, rng)
+    place = np.minimum(np.arange(1000) // 90, moves)
+    noise = jitter * np.array([1, 1, 0.5])
+    odometry, truth = (poses[place] + rng.normal(size=(1000, 3)) * noise for poses in (odometry, truth))
+    fit = gs.fit_odometry_motion(odometry, truth)
+    default = gs.OdometryMotion()
+    assert min(fit.motion.alpha) > 1e-5 and max(fit.motion.alpha) < 0.1 and fit.motion.reverse > 0.005
+    assert fit.undetermined and fit.steps == 999 and fit.travelled > 1
+    np.testing.assert_allclose(fit.motion.systematic, 0, atol=0.1)
+    rest = gs.fit_odometry_motion(odometry[:80] + rng.normal(0, 0.002, (80, 3)), truth[:80])
+    assert rest.undetermined[:5] == ("alpha1", "alpha2", "alpha3", "alpha4", "sideways")
+    assert rest.motion.alpha == pytest.approx(default.alpha, rel=0.02) and rest.motion.reverse == default.reverse
 
 
 def _step(pose, one, trans, two):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import math
+import re
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
@@ -26,6 +27,8 @@ def test_defaults_are_those_of_the_node() -> None:
     assert options.alpha == (0.2,) * 5 and options.particles == (500, 2000) and options.motion == "differential"
     assert options.update_min == (0.25, 0.2) and options.recovery == (0.0, 0.0) and options.resample_interval == 1
     assert options.range_limits == (None, 100.0) and options.initial_pose is None and options.ignored == ()
+    assert options.odometry is None and options.beam_skip is None
+    assert options.make_motion() == gs.OdometryMotion((0.2,) * 4)
 
 
 FILE = """
@@ -56,7 +59,7 @@ def test_a_file(tmp_path: Path) -> None:
     assert options.weights == gs.compat.BeamWeights(1.2, 0.2, 0.2, 0.4, 0.2, 1.0)
     assert options.parameters.to_dict() == pytest.approx(gs.BeamParameters(0.6, 0.1, 0.1, 0.2, 0.2, 1.0).to_dict())
     assert (options.motion, options.recovery, options.initial_pose) == ("omni", (0.001, 0.1), (1.5, -2.0, 0.5))
-    assert options.ignored == ("do_beamskip",)
+    assert options.ignored == () and options.beam_skip is None and options.make_motion() == gs.OmniMotion((0.2,) * 5)
     grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]], 0.1), gs.Scanner([0.0], range_max=4.0)
     ours = options.make_model(grid, scanner, backend="numpy")
     own = gs.BeamModel(grid, scanner, options.parameters, backend="numpy")
@@ -74,14 +77,62 @@ def test_what_the_command_fit_wrote(tmp_path: Path) -> None:
     expected = rng.uniform(1, 9, 4000)
     fit = gs.fit_beam_parameters(expected + 0.04 + rng.normal(0, 0.1, 4000), expected, 10.0, range_bias=True,
                                  backend="numpy")  # fmt: skip
-    noise = SimpleNamespace(motion=gs.OdometryMotion((0.1, 0.2, 0.3, 0.4)))
+    motion = gs.OdometryMotion((0.1, 0.2, 0.3, 0.4), 0.01, (0.03, 0.02), (0.01, 0.02, 0.03), 0.05)
+    noise = SimpleNamespace(motion=motion)
     result: Any = SimpleNamespace(fit=fit, incidence=None, motion=noise, data=SimpleNamespace(range_max=10.0))
     file = tmp_path / "parameters.yaml"
     file.write_text(parameters_yaml(result))
     options = from_nav2(file)
     assert options.model == "beam" and options.parameters == fit.parameters and options.parameters.range_bias > 0
-    assert options.range_limits == (None, 10.0) and options.alpha == (0.2,) * 5
+    assert options.range_limits == (None, 10.0) and options.alpha == (0.1, 0.2, 0.3, 0.4, 0.2)
+    assert options.odometry == options.make_motion() == motion and options.ignored == ()
     assert from_nav2({"beam_model": fit.parameters.to_dict()}).parameters == fit.parameters
+
+
+def test_the_noise_that_the_command_fit_wrote() -> None:
+    noise = {"odometry_motion": {"alpha": [0.1, 0.2, 0.3, 0.4], "reverse": 0.0}}
+    assert from_nav2(noise).make_motion() == gs.OdometryMotion((0.1, 0.2, 0.3, 0.4), 0.0)
+    own = from_nav2(noise | {"amcl": {"ros__parameters": {"alpha2": 0.9}}})
+    assert own.alpha == (0.1, 0.9, 0.3, 0.4, 0.2) and own.make_motion() == from_nav2(noise).odometry
+    omni = from_nav2(noise | {"amcl": {"ros__parameters": {"robot_model_type": "nav2_amcl::OmniMotionModel"}}})
+    assert omni.odometry is None and omni.make_motion() == gs.OmniMotion((0.2,) * 5)
+    for values, error in ({"speed": 1}, ValueError), ({"alpha": [1]}, ValueError), ([1], TypeError):
+        with pytest.raises(error, match="source: odometry_motion: "):
+            from_nav2({"odometry_motion": values})
+
+
+def test_one_of_several_nodes_is_chosen() -> None:
+    file = {
+        "/**": {"ros__parameters": {"use_sim_time": True, "z_hit": 0.7, "z_rand": 0.3}},
+        "robot1": {"amcl": {"ros__parameters": {"max_particles": 700}}},
+        "/robot2/amcl": {"ros__parameters": {"max_particles": 800, "z_hit": 0.9}},
+        "other": {"ros__parameters": {"max_particles": 900}},
+    }
+    for node, most, hit in (("robot1/amcl", 700, 0.7), ("/robot2/amcl", 800, 0.9), ("other", 900, 0.7)):
+        options = from_nav2(file, node=node)
+        assert (options.particles[1], options.weights.z_hit, options.ignored) == (most, hit, ())
+    for node in (None, "amcl"):
+        with pytest.raises(ValueError, match=r"node: must name one of \['/robot1/amcl', '/robot2/amcl'\] in source"):
+            from_nav2(file, node=node)
+    with pytest.raises(ValueError, match=r"node: must be a node of source, one of .*'/other'.*, got 'amcl3'"):
+        from_nav2(file, node="amcl3")
+    assert from_nav2({"amcl": file["other"], "robot": {"amcl": file["/**"]}}, node="/amcl").particles[1] == 900
+    assert from_nav2({"/**": file["/**"]}).ignored == ("use_sim_time",)
+    with pytest.raises(ValueError, match="node: must be None where source has the parameters themselves"):
+        from_nav2({"z_hit": 0.5}, node="amcl")
+    with pytest.raises(TypeError, match="node: must be a string"):
+        from_nav2(file, node=1)  # type: ignore[arg-type]
+
+
+def test_a_filter_has_the_options_of_the_file() -> None:
+    values = {"do_beamskip": True, "beam_skip_threshold": 0.4, "beam_skip_distance": 0.5, "max_particles": 900}
+    options = from_nav2(values | {"recovery_alpha_slow": 0.001, "recovery_alpha_fast": 0.1})
+    assert options.beam_skip == 0.4 and options.ignored == ("beam_skip_distance",)
+    grid, scanner = gs.OccupancyGrid([[0] * 20 + [100]], 0.1), gs.Scanner([0.0], range_max=4.0)
+    pf = options.make_filter(options.make_model(grid, scanner, backend="numpy"), seed=3, particles=700)
+    assert pf.motion == options.make_motion() and pf.options.beam_skip == 0.4 and pf.options.recovery == "augmented"
+    assert (pf.options.seed, pf.options.least, pf.options.most) == (3, 700, 700)
+    assert from_nav2({"beam_skip_threshold": 2.0}).beam_skip is None
 
 
 V, T = ValueError, TypeError
@@ -98,6 +149,8 @@ CASES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"laser_model_type": "sonar"}, V,
      "laser_model_type: must be one of 'beam', 'likelihood_field', 'likelihood_field_prob', got 'sonar'"),
     ({"z_hit": 0.0, "z_rand": 0.0}, V, "z_hit + z_max + z_rand: must be > 0, got 0.0"),
+    ({"do_beamskip": True, "beam_skip_threshold": 1.0}, V,
+     "beam_skip_threshold: must be finite and > 0 and < 1, got 1.0"),
     ({"set_initial_pose": True, "initial_pose": 3}, T, "source: initial_pose: must be a mapping, got 3"),
 ]  # fmt: skip
 
@@ -134,6 +187,11 @@ def test_the_node_compiles_and_reads_its_own_parameters() -> None:
     for file in (PACKAGE / "gpusense_localization").glob("*.py"):
         ast.parse(file.read_text())
     assert from_nav2(PACKAGE / "config" / "amcl.yaml").ignored == ()
+
+
+def test_the_readme_names_a_file_that_exists() -> None:
+    (name,) = re.findall(r"parameters:=\$PWD/src/(\S+)", (PACKAGE / "README.md").read_text())
+    assert (PACKAGE.parent / name).is_file()
 
 
 def test_conversions(conversions: ModuleType) -> None:
@@ -199,8 +257,7 @@ def map_message() -> Any:
 
 def test_the_localizer_drives_a_filter(localizer: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     FakeFilter.made = []
-    monkeypatch.setattr(gs, "ParticleFilter", FakeFilter, raising=False)
-    monkeypatch.setattr(gs, "OdometryMotion", lambda alpha: alpha, raising=False)
+    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
     options = from_nav2({"max_particles": 900, "alpha1": 0.3, "recovery_alpha_slow": 0.01, "recovery_alpha_fast": 0.1})
     own = localizer.Localizer(options, backend="numpy")
     assert not own.update(scan_of(90), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
@@ -211,12 +268,31 @@ def test_the_localizer_drives_a_filter(localizer: ModuleType, monkeypatch: pytes
     (made,) = FakeFilter.made
     assert [call[0] for call in made.calls] == ["uniform", "correct", "predict", "correct"]
     assert made.calls[2] == ("predict", (0.0, 0.0, 0.0), (0.3, 0.0, 0.0))
-    assert made.options == dict(motion=(0.3, 0.2, 0.2, 0.2), particles=(500, 900), seed=0, recovery="augmented")
+    assert made.options == dict(
+        motion=gs.OdometryMotion((0.3, 0.2, 0.2, 0.2)), particles=(500, 900), seed=0, recovery="augmented",
+        beam_skip=None,
+    )  # fmt: skip
     np.testing.assert_allclose(localizer.map_to_odometry((1.0, 2.0, 0.5), (0.3, 0.0, 0.0)), own.map_to_odometry())
     for k, count in enumerate((91, 88, 90)):
         assert own.update(scan_of(count), (1.0 + k, 0.0, 0.0), (0.1, 0.0, 0.0))
     assert len(FakeFilter.made) == 2 and FakeFilter.made[1].calls[0][0] == "initialize"
     assert np.isfinite(FakeFilter.made[1].calls[-1][1]).sum() == 90
+    own.set_map(map_message())
+    assert own.update(scan_of(90), (5.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    again = FakeFilter.made[2].calls
+    assert [call[0] for call in again] == ["initialize", "predict", "correct"]
+    np.testing.assert_array_equal(again[0][1]["mean"], (1.0, 2.0, 0.5))
+    assert again[1] == ("predict", (3.0, 0.0, 0.0), (5.0, 0.0, 0.0))
+
+
+def test_a_scan_that_breaks_a_rule_is_skipped(localizer: ModuleType) -> None:
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
+    own.set_map(map_message())
+    wrong = scan_of(60)
+    wrong.range_max = math.inf
+    assert not own.update(wrong, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) and "range_max" in own.problem
+    assert own.filter is None and own.estimate is None
+    assert own.update(scan_of(60), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)) and own.problem is None
 
 
 def test_a_scanner_of_as_many_beams_as_places_may_vary(localizer: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,6 +125,13 @@ def test_models_of_scans_are_calibrated():
     assert LEAST / 6 < found[1] < 1.6 / 6
     with pytest.raises(ValueError, match="scans: must be at least 5"):
         gs.calibrate_temperature(model, white[:4], poses[:4])
+    missing = np.full_like(white, np.nan)
+    missing[:4] = white[:4]
+    with pytest.raises(ValueError, match="scans: at least 5 must have 8 beams that the model uses, got 4 of 30"):
+        gs.calibrate_temperature(model, missing, poses)
+    positions = gs.PositionModel(gs.PositionParameters(sigma=0.1), backend="numpy")
+    with pytest.raises(TypeError, match=r"model: must be a model of scans, got .*PositionModel"):
+        gs.calibrate_temperature(positions, white, poses)
 
 
 def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():

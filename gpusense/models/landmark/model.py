@@ -48,6 +48,7 @@ class LandmarkModel(PointModel):
 
     Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; docs/landmarks.md defines both
     densities. The landmark j is known from ``correspondence``, or chosen by ``association`` (tables 6.4 and 6.5).
+    Signatures of features are ignored where ``sigma_signature`` of the parameters is None, which is the default.
 
     Args:
         landmarks: The map.
@@ -124,7 +125,8 @@ class LandmarkModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN for parts not measured.
+            features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures, which count where
+                ``sigma_signature`` is a number; NaN for parts not measured.
             correspondence: None, or (F,) indices of the landmarks of the features, -1 for a false positive.
             out: The array for the result, in the memory of the poses.
 

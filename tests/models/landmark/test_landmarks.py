@@ -237,6 +237,9 @@ def test_wrong_signatures_are_other_landmarks(backend):
     model = gs.LandmarkModel(landmarks, gs.LandmarkParameters(sigma_signature=0.5), backend=backend)
     which, _ = model.associate([[0, 0, 0]], [[5.0, 0.0, 20.0], [5.0, 0.02, 10.0], [5.0, 0.0, NAN], [5.0, 0.0, 15.0]])
     assert which.tolist() == [[1, 0, 0, -1]]
+    # Without a deviation, which is the default, signatures are ignored.
+    which, _ = gs.LandmarkModel(landmarks, backend=backend).associate([[0, 0, 0]], [[5.0, 0.0, 20.0]])
+    assert which.tolist() == [[0]]
 
 
 @on_every_backend(on_warp=lambda false: False, false=(0.05, 0.0))

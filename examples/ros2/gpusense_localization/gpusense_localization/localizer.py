@@ -22,6 +22,9 @@ class Localizer:
         options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
         backend: The device.
         seed: Seed of the filter.
+
+    Attributes:
+        problem: Why the last scan could not be used; None where it could.
     """
 
     def __init__(self, options: gs.compat.Nav2Options, *, backend: str = "auto", seed: int = 0) -> None:
@@ -32,15 +35,17 @@ class Localizer:
         self._scanner: gs.Scanner | None = None
         self._spread = False
         self.estimate: Any = None
+        self.problem: str | None = None
         self._last: Pose | None = None
         self._start: tuple[np.ndarray, np.ndarray] | None = None
         if options.initial_pose is not None:
             self.start_at(options.initial_pose, np.diag([0.25, 0.25, (math.pi / 12) ** 2]))
 
     def set_map(self, message: Any) -> None:
-        """Take a nav_msgs/OccupancyGrid; the filter begins anew."""
+        """Take a nav_msgs/OccupancyGrid; a filter goes on around its last estimate."""
         self.grid = gs.OccupancyGrid.from_message(message)
-        self.filter = self.estimate = self._last = None
+        if self.filter is not None:
+            self._make(self._scanner)
 
     def start_at(self, pose: Pose, covariance: np.ndarray) -> None:
         """Begin around a pose."""
@@ -51,11 +56,17 @@ class Localizer:
     def update(self, message: Any, odometry: Pose, mount: Pose) -> bool:
         """Take a sensor_msgs/LaserScan at an odometry pose; return whether it counted.
 
-        As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did.
+        As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did. One
+        that breaks a rule of its message, such as a finite range_max, does not count, and ``problem`` says why.
         """
         if self.grid is None:
             return False
-        ranges = self._readings(message, mount)
+        try:
+            scanner, self.problem = gs.Scanner.from_laser_scan(message, mount), None
+        except ValueError as error:
+            self.problem = str(error)
+            return False
+        ranges = self._readings(message, scanner)
         if self._last is not None and not moved_enough(self._last, odometry, self.options.update_min):
             return False
         if self._last is not None:
@@ -73,13 +84,12 @@ class Localizer:
         """Return the (N, 3) particles and their (N,) weights."""
         return host_array(self.filter.particles), host_array(self.filter.weights)
 
-    def _readings(self, message: Any, mount: Pose) -> np.ndarray:
+    def _readings(self, message: Any, scanner: gs.Scanner) -> np.ndarray:
         """Return the readings for the filter's scanner; make the filter where there is none for it.
 
         The first scan's geometry is the scanner. Once a scan has another one, all are spread on common bearings, so
         that a laser whose beams vary needs a second model only.
         """
-        scanner = gs.Scanner.from_laser_scan(message, mount)
         if self.filter is None:
             self._spread = False
             self._make(scanner)
@@ -87,19 +97,13 @@ class Localizer:
             self._spread = True
             self._make(gs.Scanner.uniform(
                 angle_min=-math.pi, angle_increment=2 * math.pi / PLACES, count=PLACES, range_max=scanner.range_max,
-                range_min=scanner.range_min, mount=mount,
+                range_min=scanner.range_min, mount=scanner.mount,
             ))  # fmt: skip
         return spread_readings(message, PLACES) if self._spread else np.array(message.ranges, np.float64)
 
     def _make(self, scanner: gs.Scanner) -> None:
         model = self.options.make_model(self.grid, scanner, backend=self.backend)
-        noise = self.options.alpha
-        motion = gs.OdometryMotion(alpha=noise[:4]) if self.options.motion == "differential" else gs.OmniMotion(noise)
-        recovery = "augmented" if all(self.options.recovery) else None
-        before = self.filter
-        self.filter = gs.ParticleFilter(
-            model, motion=motion, particles=self.options.particles, seed=self.seed, recovery=recovery
-        )
+        before, self.filter = self.filter, self.options.make_filter(model, seed=self.seed)
         self._scanner = scanner
         if before is not None and self.estimate is not None:
             estimate = before.estimate()

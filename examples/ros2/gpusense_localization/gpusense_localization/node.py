@@ -1,8 +1,9 @@
 """The node: scan, odometry and map in; pose, particle cloud and the transform from map to odometry out.
 
-    ros2 run gpusense_localization localize --ros-args -p parameters:=amcl.yaml -p backend:=auto
+    ros2 run gpusense_localization localize --ros-args -p parameters:=FILE -p backend:=auto
 
-``parameters`` is a file for nav2_amcl, or what ``gpusense fit`` wrote. Topics and frames are those of nav2_amcl.
+``parameters`` is a file for nav2_amcl, or what ``gpusense fit`` wrote; ``node`` names one of several in it. Topics and
+frames are those of nav2_amcl.
 """
 
 from __future__ import annotations
@@ -29,9 +30,11 @@ class LocalizationNode(Node):
     def __init__(self) -> None:
         super().__init__("amcl")
         file = self.declare_parameter("parameters", "").value
-        options = gs.compat.from_nav2(file or {"amcl": {"ros__parameters": {}}})
+        chosen = self.declare_parameter("node", "").value or None
+        options = gs.compat.from_nav2(file or {"amcl": {"ros__parameters": {}}}, node=chosen)
         self.localizer = Localizer(options, backend=self.declare_parameter("backend", "auto").value)
         self.options = options
+        self.reported: str | None = None
         self.buffer = Buffer()
         self.listener = TransformListener(self.buffer, self)
         self.broadcaster = TransformBroadcaster(self)
@@ -62,6 +65,10 @@ class LocalizationNode(Node):
         mount = conversions.transform_of(laser.transform)
         if self.localizer.update(message, conversions.transform_of(odometry.transform), mount):
             self.publish_estimate(message)
+        problem = self.localizer.problem
+        if problem is not None and problem != self.reported:
+            self.get_logger().error(f"a scan is skipped, as are others like it: {problem}")
+            self.reported = problem
         if self.localizer.estimate is not None and self.options.tf_broadcast:
             self.publish_transform(message)
 

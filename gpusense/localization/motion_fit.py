@@ -65,7 +65,7 @@ class MotionFit:
         travelled: Sum of the translations of the steps [m].
         turned: Sum of their turns [rad].
         log_errors: (7,) standard errors of the logarithms of alpha1 to alpha4, ``sideways`` and the squares of
-            ``least``; 2.3, a factor of ten, where the log tells nothing.
+            ``least``, if steps err independently; 2.3, a factor of ten, where the log tells nothing.
         undetermined: Names of those that the log does not determine, whose logarithm has an error above 1.15: each is
             the default, or less where the log excludes that much.
 

@@ -10,6 +10,7 @@ from support.command_line import error_of
 
 import gpusense as gs
 from gpusense.commands import cli
+from gpusense.evaluation.steps import read_steps, references_to_learn_from, with_references
 from gpusense.evaluation.trajectory_files import read_tum, write_tum
 
 BEARINGS = np.radians(np.arange(-90, 91, 1.0))
@@ -124,6 +125,14 @@ def test_noise_is_not_learned_from_the_odometry_itself(place, capsys):
     arguments = call(place, "--fit-motion", "--reference", str(place / "true.tum"))
     code, found = summary_of(capsys, arguments)
     assert code == 0 and found["error_95"] < 0.1
+
+
+def test_noise_is_learned_from_all_steps_with_references_at_some(place):
+    steps = with_references(read_steps(place / "raw.log", range_max=20.0), *read_tum(place / "true.tum"))
+    odometry, poses = references_to_learn_from(steps)
+    assert len(odometry) == COUNT and np.isnan(np.array(poses)).any(axis=1).tolist() == [False, True] * (COUNT // 2)
+    fit = gs.fit_odometry_motion(odometry, poses)
+    assert fit.references == COUNT // 2 and fit.steps == COUNT - 2
 
 
 @pytest.mark.parametrize(

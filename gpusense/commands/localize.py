@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -228,7 +229,11 @@ def _motion(args: argparse.Namespace, steps: list[Step], noise: dict[str, Any]) 
             if getattr(args, name) is not None:
                 option = "--" + name.replace("_", "-")
                 raise ValueError(f"--fit-motion: must be given without {option}, which it learns, got both")
-        return fit_odometry_motion(*references_to_learn_from(steps)).motion
+        fit = fit_odometry_motion(*references_to_learn_from(steps))
+        if fit.undetermined:
+            names = ", ".join(fit.undetermined)
+            print(f"gpusense: --fit-motion: the log does not determine {names}: at most the default", file=sys.stderr)
+        return fit.motion
     given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
     return OdometryMotion(**noise | {name: value for name, value in given.items() if value is not None})
 

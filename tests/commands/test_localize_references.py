@@ -123,8 +123,11 @@ def test_times_that_repeat_become_indices(place, capsys, tmp_path):
 def test_noise_is_not_learned_from_the_odometry_itself(place, capsys):
     assert "must have poses that are not the odometry's own" in error_of(call(place, "--fit-motion"), capsys)
     arguments = call(place, "--fit-motion", "--reference", str(place / "true.tum"))
-    code, found = summary_of(capsys, arguments)
-    assert code == 0 and found["error_95"] < 0.1
+    code = cli.main([*arguments, "--json"])
+    out, err = capsys.readouterr()
+    assert code == 0 and json.loads(out)["summary"]["error_95"] < 0.1
+    # Seven references of a robot that always does the same determine little.
+    assert "the log does not determine alpha" in err
 
 
 def test_noise_is_learned_from_all_steps_with_references_at_some(place):

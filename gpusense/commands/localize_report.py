@@ -83,6 +83,8 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     print(f"scans                 {s['scans']}, temperature {s['temperature']}")
     deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
     print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
+    if result["scans"] > 1 and not result["odometry_moves"]:
+        print("odometry              does not move: the log has none, or the robot stands")
     if result["references_repeat_odometry"]:
         print("reference             none: the logged poses are the odometry's own")
     elif 0 < result["references"] < result["scans"]:

@@ -100,9 +100,11 @@ def repeats_odometry(steps: Sequence[Step]) -> bool:
         return False
     references = np.array([step.reference for step in known])
     odometry = np.array([step.odometry for step in known])
-    difference = pose_difference(references[:-1], references[1:]) - pose_difference(odometry[:-1], odometry[1:])
+    moved = pose_difference(odometry[:-1], odometry[1:])
+    difference = pose_difference(references[:-1], references[1:]) - moved
     difference[:, 2] = wrap_angle(difference[:, 2])
-    return bool(np.abs(difference).max() <= _SAME)
+    # A robot that stands has the same steps by any account.
+    return bool(np.abs(moved).max() > _SAME and np.abs(difference).max() <= _SAME)
 
 
 def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Pose]]:

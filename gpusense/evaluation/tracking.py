@@ -135,6 +135,7 @@ def summary(track: Track) -> dict[str, Any]:
         "scans": count,
         "lost": bool(np.mean(tail) > 0.5),
         "scans_lost": int(np.sum(track.lost)),
+        "odometry_moves": len({step.odometry for step in track.steps}) > 1,
         "explained_at_end": _median(track.explained[-len(tail) :]),
         "explained_median": _median(track.explained),
         "temperature": track.temperatures[-1],

@@ -110,6 +110,18 @@ def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path):
     assert code == 1 and found["lost"] and found["explained_at_end"] < 0.8
 
 
+def test_a_log_whose_odometry_does_not_move_is_named(place, capsys, tmp_path):
+    line = (place / "raw.log").read_text().splitlines()[0]
+    (tmp_path / "still.log").write_text("\n".join([line, line, line]))
+    arguments = call(place, "--start", "3", "1.5", "3")
+    assert cli.main(arguments) == 0
+    assert "does not move" not in capsys.readouterr().out
+    arguments[arguments.index("--log") + 1] = str(tmp_path / "still.log")
+    assert cli.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "odometry              does not move" in out and "the odometry's own" not in out
+
+
 def test_times_that_repeat_become_indices(place, capsys, tmp_path):
     text = (place / "raw.log").read_text().replace(" 3.0 robot 3.0", " 2.0 robot 2.0")
     (tmp_path / "same.log").write_text(text)

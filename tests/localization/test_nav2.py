@@ -297,7 +297,7 @@ def test_a_scan_that_breaks_a_rule_is_skipped(localizer: ModuleType) -> None:
 
 def test_a_scanner_of_as_many_beams_as_places_may_vary(localizer: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     FakeFilter.made = []
-    monkeypatch.setattr(gs, "ParticleFilter", FakeFilter, raising=False)
+    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
     own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
     own.set_map(map_message())
     for k in range(2):

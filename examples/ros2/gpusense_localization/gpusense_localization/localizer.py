@@ -57,7 +57,7 @@ class Localizer:
         """Take a sensor_msgs/LaserScan at an odometry pose; return whether it counted.
 
         As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did. One
-        that breaks a rule of its message, such as a finite range_max, does not count, and ``problem`` says why.
+        that breaks a rule, as with a range_max of infinity, does not count, and ``problem`` says why.
         """
         if self.grid is None:
             return False

@@ -18,7 +18,7 @@ class Defaults(NamedTuple):
         stages: Most stages of a correction.
         share: Least effective sample size of a stage, as a share of the particles, where they lie together.
         enough: Effective sample size that is enough for a stage of any number of particles that lie together.
-        share_apart: Least share where they lie apart, so that few places do not win by chance.
+        share_apart: Least share where they lie apart, and among landmarks, so that no peak wins by chance.
         jitter: Share of the difference of two particles by which a drawn one moves between stages.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].

@@ -231,7 +231,8 @@ class ParticleFilter(Beginnings):
         for sensor in (self._sensors[index] for index in given):
             sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
         step, count = self._key()[2], self._cloud.count
-        return options.settings_of_step(self.options, motion, step, count, self._pool, sensors, self._together)
+        one_peak = self._together and not any(self._sensors[index].ambiguous for index in given)
+        return options.settings_of_step(self.options, motion, step, count, self._pool, sensors, one_peak)
 
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""

@@ -121,7 +121,7 @@ def settings_of_step(
     count: int,
     pool: tuple[int, tuple[float, float, float]],
     sensors: Sequence[tuple[float, int]],
-    together: bool,
+    one_peak: bool,
 ) -> np.ndarray:
     """Return the numbers of a step, by the places in ``interface.constants``.
 
@@ -132,14 +132,14 @@ def settings_of_step(
         count: Particles.
         pool: Poses that recovery injects: their number, and how far they are spread in x, y [m] and heading [rad].
         sensors: Temperature and beams of each sensor that is used.
-        together: Whether the particles lie together.
+        one_peak: Whether the particles lie together, and no sensor has several peaks among them.
     """
     s = np.zeros(SETTINGS)
     s[SEED], s[SEED + 1], s[STEP] = *options.words, step
     s[MEAN : DEVIATION + 4], s[REVERSE] = settings_of(motion)
     s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
     s[POOL], s[POOL + 1 : POOL + 4] = pool
-    s[SHARE] = min(DEFAULTS.share, DEFAULTS.enough / count) if together else DEFAULTS.share_apart
+    s[SHARE] = min(DEFAULTS.share, DEFAULTS.enough / count) if one_peak else DEFAULTS.share_apart
     s[THRESHOLD] = options.threshold
     s[STRATIFIED] = _DRAWS[options.resampling]
     # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold. An effective

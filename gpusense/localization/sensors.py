@@ -39,6 +39,8 @@ class Sensor:
         beams: Beams that a scan uses; 0 for other models.
         seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from it.
+        ambiguous: Whether its likelihood may have several peaks among particles that lie together, as of landmarks
+            that may be exchanged.
 
     Raises:
         TypeError: another object.
@@ -51,7 +53,7 @@ class Sensor:
         if isinstance(model, ScanModel) and model.temperature != 1:
             raise ValueError(f"models: must have temperature 1, the filter has its own, got {model.temperature}")
         self.model: Any = model
-        self.calibrates = isinstance(model, ScanModel)
+        self.calibrates, self.ambiguous = isinstance(model, ScanModel), isinstance(model, LandmarkModel)
         self.backend: Backend = model.backend
         self.precision = np.dtype(model.precision)
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0

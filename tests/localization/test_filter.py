@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.interface.constants import SHARE
 from gpusense.localization.adaptive import kld_count
+from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import clustered
+from gpusense.localization.motion import STILL
 
 GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
 SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
@@ -68,6 +71,16 @@ def test_many_particles_take_no_more_stages_than_they_need(backend):
     few, many, apart = state(4000, 0.5), state(20_000, 0.5), state(20_000, 2.0)
     assert few.stages > 1 and many.stages == 1 and apart.stages > 1
     assert 500 < many.effective_sample_size < 0.1 * 20_000
+
+
+def test_landmarks_that_may_be_exchanged_keep_more_particles():
+    model = gs.LandmarkModel(gs.LandmarkMap([[2.0, 2.0], [2.0, 2.6]]), backend="numpy")
+    shares = []
+    for models in (model, gps()):
+        pf = gs.ParticleFilter(models, particles=1000, seed=1)
+        pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.1, 0.1, 0.01]))
+        shares.append(pf._settings(STILL, [0])[SHARE])
+    assert shares == [DEFAULTS.share_apart, DEFAULTS.share]
 
 
 def walls(pose):

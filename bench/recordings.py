@@ -197,24 +197,21 @@ def follow(recording, models, *, limit=None, **options):
 
 def figures(tracks):
     """Return the figures of several tracks of one setting; the first 5 % of a track count for errors only."""
-    times = [t.ms for t in tracks]
-    verdicts = [t.lost for t in tracks]
-    temperatures = [t.temperatures for t in tracks]
-    tracks = [t.with_reference() for t in tracks]
-    late = [slice(len(t.ms) // 20, None) for t in tracks]
+    known = [t.with_reference() for t in tracks]
+    late = [slice(len(t.ms) // 20, None) for t in known]
     reports = [
-        coverage_report(t.differences[s], t.covariances[s], t.ranks[s]) for t, s in zip(tracks, late, strict=True)
+        coverage_report(t.differences[s], t.covariances[s], t.ranks[s]) for t, s in zip(known, late, strict=True)
     ]
-    errors = [np.hypot(*t.differences[:, :2].T) for t in tracks]
+    errors = [np.hypot(*t.differences[:, :2].T) for t in known]
     result = dict(
-        seeds=len(tracks), scans=len(times[0]), references=len(errors[0]),
+        seeds=len(tracks), scans=len(tracks[0].ms), references=len(errors[0]),
         median_cm=100 * float(np.median([np.median(e) for e in errors])),
         p95_cm=100 * float(np.median([np.percentile(e, 95) for e in errors])),
-        heading_deg=float(np.degrees(np.median([np.median(np.abs(t.differences[:, 2])) for t in tracks]))),
+        heading_deg=float(np.degrees(np.median([np.median(np.abs(t.differences[:, 2])) for t in known]))),
         lost=int(sum(np.median(e[-max(len(e) // 10, 1) :]) > 1 for e in errors)),
-        said_lost=float(np.mean([one.mean() for one in verdicts])),
-        temperature=float(np.median([np.median(one) for one in temperatures])),
-        ms=float(np.median([np.median(one) for one in times])),
+        said_lost=float(np.mean([t.lost.mean() for t in tracks])),
+        temperature=float(np.median([np.median(t.temperatures) for t in tracks])),
+        ms=float(np.median([np.median(t.ms) for t in tracks])),
     )  # fmt: skip
     for key in reports[0]:
         result[key] = np.mean([r[key] for r in reports], axis=0).round(4).tolist()

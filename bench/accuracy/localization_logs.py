@@ -73,8 +73,7 @@ def main() -> None:
         recording, motion = recordings.load(name), None
         if args.fit_motion:
             odometry, truth = (
-                np.array([getattr(e, which) for e in recording.events if np.isfinite(e.truth).all()])
-                for which in ("odometry", "truth")
+                np.array([getattr(e, which) for e in recording.events]) for which in ("odometry", "truth")
             )
             motion = gs.fit_odometry_motion(odometry, truth).motion
         for kind in args.models:

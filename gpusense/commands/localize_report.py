@@ -41,7 +41,7 @@ def report(
 
     result = summary(track)
     if args.tum is not None:
-        write_tum(args.tum, _times(track), track.poses)
+        write_tum(args.tum, _times_of(track), track.poses)
     if args.plot is not None:
         _draw(args.plot, pf, track)
     if recording is not None:
@@ -56,22 +56,17 @@ def report(
     for path in (args.tum, args.plot, args.record):
         if path is not None:
             print(f"written: {path}")
-    if args.tum is not None and not _increase(track):
-        print("times of the log do not increase: the trajectory has the indices of the scans in their place")
     return result
 
 
-def _increase(track: Track) -> bool:
-    """Return whether the times of the scans increase, as readers of trajectories demand."""
+def _times_of(track: Track) -> list[float]:
+    """Return the times of the scans [s]; their indices where times do not increase, as readers of files demand."""
     times = [step.scan.time for step in track.steps]
-    return all(one < two for one, two in itertools.pairwise(times))
-
-
-def _times(track: Track) -> list[float]:
-    """Return the times of the scans [s], or their indices where these do not increase."""
-    if _increase(track):
-        return [step.scan.time for step in track.steps]
-    return [float(i) for i in range(len(track.steps))]
+    if all(one < two for one, two in itertools.pairwise(times)):
+        return times
+    rule = "the times of the log do not increase: the trajectory has the indices of the scans in their place"
+    print(f"gpusense: --tum: {rule}", file=sys.stderr)
+    return [float(i) for i in range(len(times))]
 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
@@ -85,12 +80,13 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
     print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
     if result["scans"] > 1 and not result["odometry_moves"]:
         print("odometry              does not move: the log has none, or the robot stands")
-    if result["references_repeat_odometry"]:
-        print("reference             none: the logged poses are the odometry's own")
-    elif 0 < result["references"] < result["scans"]:
+    if 0 < result["references"] < result["scans"]:
         print(f"reference             poses of {result['references']} scans")
     if result["references_repeat_odometry"]:
-        print(f"distance from it      median {s['error_median']} m, 95 % below {s['error_95']} m")
+        print(
+            "reference             none: the logged poses are the odometry's own\n"
+            f"distance from these   median {s['error_median']} m, 95 % below {s['error_95']} m"
+        )
     elif result["error_median"] is not None:
         at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
         print(

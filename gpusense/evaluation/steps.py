@@ -114,7 +114,7 @@ def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Po
         ValueError: there is none, or the references are the odometry's own poses.
     """
     if all(step.reference is None for step in steps):
-        raise ValueError("--fit-motion: must have a log with poses, or a --reference, got neither")
+        raise ValueError("--fit-motion: must have poses of the robot to learn from, got a log without")
     if repeats_odometry(steps):
         raise ValueError("--fit-motion: must have poses that are not the odometry's own, got a log of these")
     none = (np.nan, np.nan, np.nan)

@@ -1,4 +1,4 @@
-"""What a particle filter takes: readings of several arguments, likelihoods to begin from, models."""
+"""Check the arguments of ``ParticleFilter``: ``models``, and the ``readings`` and ``likelihood`` of its methods."""
 
 from __future__ import annotations
 
@@ -46,12 +46,16 @@ def test_a_fix_may_have_its_own_covariance():
 
 
 def test_landmarks_take_features_with_or_without_their_landmarks():
-    model = gs.LandmarkModel(gs.LandmarkMap([[2.0, 2.0], [1.0, 4.0]]), backend="numpy")
+    # Wide enough that a fifth of the particles is effective in one stage.
+    parameters = gs.LandmarkParameters(sigma_range=1.0, sigma_bearing=1.0)
+    model = gs.LandmarkModel(gs.LandmarkMap([[2.0, 2.0], [1.0, 4.0]]), parameters, backend="numpy")
     features = np.array([[1.0, 0.0], [2.0, 1.5]])
-    for reading in (features, (features,), (features, np.array([0, 1]))):
-        pf = filter_of(model)
+    known = np.array([1, 0])
+    for reading, landmarks in ((features, None), ((features,), None), ((features, known), known)):
+        pf = filter_of(model, threshold=1e-9)
+        log_p = model.log_likelihood(pf.host_particles(), features, landmarks)
         pf.correct(reading)
-        assert np.isfinite(pf.estimate().pose).all()
+        np.testing.assert_allclose(pf.host_weights(), gs.normalize_weights(log_p).weights, rtol=1e-5, atol=1e-9)
 
 
 def test_several_scans_are_no_reading():

@@ -130,7 +130,7 @@ class Particles:
         find, *scored = self.sums.highest(self.blocks)
         found, numbers = (scored[0], scored[1]), self.numbers()
         weights = self.sums.weigh(numbers, found, stage.number)
-        weights += self.sums.set_weights(numbers, found, (stage.number, stage.most), (self.weight, self.ends))
+        weights += self.sums.set_weights(numbers, (stage.number, stage.most), (self.weight, self.ends))
         draw = self.draw(stage, stage.drawn) if stage.drawn else ()
         return self.scoring(self._sensors) + find + weights + draw
 

@@ -1,8 +1,8 @@
 """Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
 
 A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group. GPUs take smaller blocks of weights, whose sums are exact; sums of
-poses have the same blocks everywhere.
+number of particles. Small clouds have one group. GPUs take smaller blocks of weights, whose sums are exact. Sums of
+poses have the same blocks everywhere, of which work-items of GPUs take single lanes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.interface.constants import ESTIMATE_SUMS, WEIGHT_SUMS
+from gpusense.interface.constants import ESTIMATE_LANES, ESTIMATE_SUMS, WEIGHT_SUMS
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 
@@ -30,7 +30,8 @@ def block_of(count: int) -> int:
 
 def weight_block(backend: Backend, count: int) -> int:
     """Return the particles of a block of weights."""
-    return block_of(count) if backend.info.kind == "cpu" else block_of(count) // 2
+    block = block_of(count)
+    return block if backend.info.kind == "cpu" else max(block // (5 * _VECTOR), 1) * _VECTOR
 
 
 def fans_of(blocks: int) -> tuple[int, ...]:
@@ -57,9 +58,13 @@ class Sums:
     def __init__(self, backend: Backend, capacity: int) -> None:
         self._backend, blocks = backend, -(-capacity // _LEAST)
         groups = math.isqrt(blocks) + 2
-        self.largest, self.rows = (backend.empty(size * blocks, _DOUBLE) for size in (1, WEIGHT_SUMS))
-        self._highest, self._joined = (backend.empty(size * groups, _DOUBLE) for size in (1, WEIGHT_SUMS))
-        self.totals, self._moments = backend.empty(WEIGHT_SUMS, _DOUBLE), backend.empty(ESTIMATE_SUMS, _DOUBLE)
+        # A block of poses has at least as many particles as the cube root of their number.
+        moments = (math.ceil(capacity ** (2 / 3)) + 2) * ESTIMATE_SUMS
+        self.largest = backend.empty(blocks, _DOUBLE)
+        self.rows = backend.empty(max(WEIGHT_SUMS * blocks, ESTIMATE_LANES * moments), _DOUBLE)
+        self._joined = backend.empty(max(WEIGHT_SUMS * groups, moments), _DOUBLE)
+        self._largest_of_groups, self._highest = backend.empty(groups, _DOUBLE), backend.empty(1, _DOUBLE)
+        self.totals = backend.empty(WEIGHT_SUMS, _DOUBLE)
 
     def launch(self, kernel: str, size: int, **arguments: Any) -> Program:
         """Return a launch of a kernel, in lanes where the device asks for them."""
@@ -71,8 +76,9 @@ class Sums:
         if not groups_of:
             return (), self.largest, blocks
         groups = groups_of[0]
-        program = self.launch("join_scores", groups, scores=self.largest, largest=self._highest, blocks=blocks, fan=fan)
-        return program, self._highest, groups
+        program = self.launch("join_scores", groups, scores=self.largest, largest=self._largest_of_groups,
+                              blocks=blocks, fan=fan)  # fmt: skip
+        return program, self._largest_of_groups, groups
 
     def weigh(self, numbers: dict[str, Any], scored: tuple[Buffer, int], stage: int) -> Program:
         """Return the launches that weigh particles.
@@ -84,25 +90,22 @@ class Sums:
         """
         largest, groups = scored
         blocks = numbers["blocks"]
-        weigh = self.launch("weigh_particles", blocks, largest=largest, groups=groups, sums=self.rows, stage=stage,
-                            **numbers)  # fmt: skip
-        return weigh + self._join(WEIGHT_SUMS, blocks, self.totals)
+        weigh = self.launch("weigh_particles", blocks, largest=largest, groups=groups, sums=self.rows,
+                            highest=self._highest, stage=stage, **numbers)  # fmt: skip
+        return weigh + self._weight_totals(blocks)
 
-    def set_weights(
-        self, numbers: dict[str, Any], scored: tuple[Buffer, int], place: tuple[int, int], out: tuple[Buffer, Buffer]
-    ) -> Program:
-        """Return the launch that sets weights.
+    def set_weights(self, numbers: dict[str, Any], place: tuple[int, int], out: tuple[Buffer, Buffer]) -> Program:
+        """Return the launch that sets weights, after that which weighs.
 
         Args:
             numbers: Arguments by name, as for the weighing.
-            scored: Largest scores of groups, and the number of groups.
             place: The stage, and the most stages.
             out: Receive the weights and their cumulative sums.
         """
-        (largest, groups), (stage, stages), (weight, ends), blocks = scored, place, out, numbers["blocks"]
-        return self.launch("set_weights", blocks, largest=largest, groups=groups, sums=self.rows,
-                           joined=self._joined, totals=self.totals, fan=fans_of(blocks)[0], stage=stage,
-                           stages=stages, weight=weight, ends=ends, **numbers)  # fmt: skip
+        (stage, stages), (weight, ends), blocks = place, out, numbers["blocks"]
+        return self.launch("set_weights", blocks + 1, highest=self._highest, sums=self.rows, joined=self._joined,
+                           totals=self.totals, fan=fans_of(blocks)[0], stage=stage, stages=stages, weight=weight,
+                           ends=ends, **numbers)  # fmt: skip
 
     def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
         """Return the launches that add up the certain copies of residual resampling; the sums of weights are lost.
@@ -116,30 +119,41 @@ class Sums:
         blocks = numbers["blocks"]
         return (
             *self.launch("count_copies", blocks, sums=self.rows, drawn=drawn, stage=stage, **numbers),
-            *self._join(WEIGHT_SUMS, blocks, self.totals),
+            *self._weight_totals(blocks),
             *self.launch("set_copies", blocks, sums=self.rows, joined=self._joined, copies=copies,
                          fan=fans_of(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
     def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
         """Return the launches that write the estimate of a cloud, or those of its second pass."""
-        block = block_of(count)
-        blocks = -(-count // block)
-        return (
-            *self.launch("sum_poses", blocks, poses=poses, weight=weight, estimate=estimate, sums=self.rows,
-                         particles=count, block=block, again=again),
-            *self._join(ESTIMATE_SUMS, blocks, self._moments),
-            *self.launch("finish_estimate", 1, poses=poses, sums=self._moments, estimate=estimate, again=again),
-        )  # fmt: skip
+        block, lanes = block_of(count), ESTIMATE_LANES if self._backend.info.kind == "cpu" else 1
+        blocks, each = -(-count // block), ESTIMATE_LANES // lanes
+        program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
+                              sums=self.rows, particles=count, block=block, lanes=lanes, again=again)  # fmt: skip
+        # The last kernel adds up groups, too, which is slow on GPUs.
+        fans = (each, *fans_of(blocks)) if each > 1 else fans_of(blocks)[:-1]
+        source, target, groups = self.rows, self._joined, blocks * each
+        for fan in fans:
+            launches, groups = self._join(source, target, (groups, ESTIMATE_SUMS), fan)
+            program += launches
+            source, target = target, source
+        return program + self.launch("finish_estimate", 1, poses=poses, sums=source, estimate=estimate,
+                                     groups=groups, again=again)  # fmt: skip
 
-    def _join(self, columns: int, blocks: int, total: Buffer) -> Program:
-        """Return the launches that add up the rows of groups, and of all groups."""
+    def _weight_totals(self, blocks: int) -> Program:
+        """Return the launches that add up the rows of weights of groups, and of all groups."""
         program: Program = ()
-        source, fans = self.rows, fans_of(blocks)
-        for level, fan in enumerate(fans):
-            last = level + 1 == len(fans)
-            joined, groups = total if last else self._joined, -(-blocks // fan)
-            program += self.launch("join_rows", groups * columns, sums=source, joined=joined, rows=blocks,
-                                   columns=columns, fan=fan)  # fmt: skip
-            source, blocks = joined, groups
-        return program
+        source, shape = self.rows, (blocks, WEIGHT_SUMS)
+        *inner, last = fans_of(blocks)
+        for fan in inner:
+            program, rows = self._join(source, self._joined, shape, fan)
+            source, shape = self._joined, (rows, WEIGHT_SUMS)
+        return program + self._join(source, self.totals, shape, last)[0]
+
+    def _join(self, sums: Buffer, joined: Buffer, shape: tuple[int, int], fan: int) -> tuple[Program, int]:
+        """Return the launch that adds up each ``fan`` of (rows, columns) sums, and the number of groups."""
+        rows, columns = shape
+        groups = -(-rows // fan)
+        launches = self.launch("join_rows", groups * columns, sums=sums, joined=joined, rows=rows, columns=columns,
+                               fan=fan)  # fmt: skip
+        return launches, groups

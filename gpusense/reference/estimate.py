@@ -26,9 +26,13 @@ def sum_poses(
     sums: np.ndarray,
     particles: int,
     block: int,
+    lanes: int,
     again: int,
 ) -> None:
-    """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings of each block."""
+    """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings.
+
+    A row of sums takes ``lanes`` lanes of a block.
+    """
     pose, w = poses[: 3 * particles].reshape(-1, 3), weight[:particles]
     reference = estimate[:3] if again else pose[0].copy()
     x, y = pose[:, 0] - reference[0], pose[:, 1] - reference[1]
@@ -37,31 +41,33 @@ def sum_poses(
     columns: tuple[np.ndarray, ...]
     columns = (w, w * x, w * y, w * cosine, w * sine, w * angle, w * x * x, w * x * y, w * x * angle, w * y * y)
     columns = (*columns, w * y * angle, w * angle * angle, np.where(np.abs(angle) > math.pi / 2, w, 0.0))
+    each = ESTIMATE_LANES // lanes
     for b, begin in enumerate(range(0, particles, block)):
         end = min(begin + block, particles)
-        row = sums[b * ESTIMATE_SUMS : (b + 1) * ESTIMATE_SUMS]
+        rows = sums[b * each * ESTIMATE_SUMS : (b + 1) * each * ESTIMATE_SUMS].reshape(each, ESTIMATE_SUMS)
         for k, column in enumerate(columns):
-            lanes = np.zeros((-(-(end - begin) // ESTIMATE_LANES), ESTIMATE_LANES))
-            lanes.reshape(-1)[: end - begin] = column[begin:end]
+            padded = np.zeros((-(-(end - begin) // ESTIMATE_LANES), ESTIMATE_LANES))
+            padded.reshape(-1)[: end - begin] = column[begin:end]
             # One after the other, as on devices.
-            row[k] = np.cumsum(np.cumsum(lanes, axis=0)[-1])[-1]
+            rows[:, k] = np.cumsum(np.cumsum(padded, axis=0)[-1].reshape(each, lanes), axis=1)[:, -1]
 
 
 def finish_estimate(
-    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, again: int
+    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, groups: int, again: int
 ) -> None:
     """Write the mean pose, the covariance about it, and whether headings ask for a second pass; or the second pass."""
-    weight = sums[0] if sums[0] > 0.0 else 1.0
-    x, y, angle = sums[1] / weight, sums[2] / weight, sums[5] / weight
-    mean = 0.0 if again else float(angle_of(sums[3], sums[4]))
+    total = np.cumsum(sums[: groups * ESTIMATE_SUMS].reshape(groups, ESTIMATE_SUMS), axis=0)[-1]
+    weight = total[0] if total[0] > 0.0 else 1.0
+    x, y, angle = total[1] / weight, total[2] / weight, total[5] / weight
+    mean = 0.0 if again else float(angle_of(total[3], total[4]))
     if not again:
         estimate[0], estimate[1], estimate[2] = poses[0] + x, poses[1] + y, wrap_once(poses[2] + mean)
         estimate[9] = weight
-        estimate[WIDE_HEADINGS] = sums[12] > 0.0 or abs(mean) > math.pi / 2
-    estimate[3], estimate[4] = sums[6] / weight - x * x, sums[7] / weight - x * y
-    estimate[5], estimate[6] = sums[8] / weight - x * angle, sums[9] / weight - y * y
-    estimate[7] = sums[10] / weight - y * angle
-    estimate[8] = sums[11] / weight - mean * (2.0 * angle - mean)
+        estimate[WIDE_HEADINGS] = total[12] > 0.0 or abs(mean) > math.pi / 2
+    estimate[3], estimate[4] = total[6] / weight - x * x, total[7] / weight - x * y
+    estimate[5], estimate[6] = total[8] / weight - x * angle, total[9] / weight - y * y
+    estimate[7] = total[10] / weight - y * angle
+    estimate[8] = total[11] / weight - mean * (2.0 * angle - mean)
 
 
 def normalize_weights(

@@ -33,9 +33,9 @@ from gpusense.interface.constants import (
 from gpusense.reference.elementary import exp_of, log_of
 
 
-def largest_of(largest: np.ndarray, groups: int) -> float:
-    """Return the largest score of all groups."""
-    return float(largest[:groups].max())
+def largest_of(largest: np.ndarray, begin: int, end: int) -> float:
+    """Return the largest of the scores from begin to before end."""
+    return float(largest[begin:end].max())
 
 
 def possible_of(totals: np.ndarray, largest: float) -> float:

@@ -51,6 +51,7 @@ def weigh_particles(
     settings: np.ndarray,
     state: np.ndarray,
     sums: np.ndarray,
+    highest: np.ndarray,
     particles: int,
     block: int,
     blocks: int,
@@ -59,7 +60,8 @@ def weigh_particles(
 ) -> None:
     """Sum the integer weights of each block on each rung, their squares, and the weights before."""
     scale, old = settings[SCALE], before[:particles]
-    likelihood = tempered(score[:particles], largest_of(largest, groups), left_of(state, stage))
+    highest[0] = largest_of(largest, 0, groups)
+    likelihood = tempered(score[:particles], highest[0], left_of(state, stage))
     table, starts = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS), np.arange(0, particles, block)
     table[:, 2 * RUNGS] = np.add.reduceat(np.floor(old * scale), starts)
     for rung in reversed(range(RUNGS)):
@@ -70,17 +72,20 @@ def weigh_particles(
 
 
 def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, columns: int, fan: int) -> None:
-    """Add up each ``fan`` rows of sums, one after the other."""
+    """Add up each ``fan`` rows of sums, one after the other; a row becomes the sum of those before it in its group."""
     table = sums[: rows * columns].reshape(rows, columns)
     for group, begin in enumerate(range(0, rows, fan)):
-        joined[group * columns : (group + 1) * columns] = np.cumsum(table[begin : begin + fan], axis=0)[-1]
+        part = table[begin : begin + fan]
+        upto = np.cumsum(part, axis=0)
+        joined[group * columns : (group + 1) * columns] = upto[-1]
+        part[0], part[1:] = 0.0, upto[:-1]
 
 
 def set_weights(
     flags: frozenset[str],
     score: np.ndarray,
     before: np.ndarray,
-    largest: np.ndarray,
+    highest: np.ndarray,
     sums: np.ndarray,
     joined: np.ndarray,
     totals: np.ndarray,
@@ -92,12 +97,11 @@ def set_weights(
     block: int,
     blocks: int,
     fan: int,
-    groups: int,
     stage: int,
     stages: int,
 ) -> None:
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
-    scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, largest_of(largest, groups))
+    scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, highest[0])
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0
     likelihood = tempered(score[:particles], high, left)
     for _ in range(rung, RUNGS - 1):

@@ -16,6 +16,7 @@ from gpusense.backends.recording import Recording
 from gpusense.interface.constants import (
     DRAWN,
     ESTIMATE,
+    ESTIMATE_LANES,
     ESTIMATE_SUMS,
     FIRST,
     SETTINGS,
@@ -173,7 +174,7 @@ class Shard:
             self._choose_rung(totals, left_of(state, stage))
             self._backend.upload(totals, cloud.sums.totals)
             out = cloud.weight, cloud.ends
-            self._backend.run(cloud.sums.set_weights(cloud.numbers(), (cloud.sums.largest, 1), place, out))
+            self._backend.run(cloud.sums.set_weights(cloud.numbers(), place, out))
         yield
         # The kernel knows the number of particles of the shard only: the state is that of the filter.
         self._backend.upload(state, cloud.state)
@@ -277,7 +278,8 @@ class Shard:
         self._backend.upload(estimate, cloud.estimated)
         self._backend.run(
             cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[index], weight=cloud.weight,
-                              estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block, again=1),
+                              estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block,
+                              lanes=ESTIMATE_LANES, again=1),
         )  # fmt: skip
         yield
         return self._read(cloud.sums.rows, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)

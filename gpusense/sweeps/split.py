@@ -190,7 +190,7 @@ class SplitCloud(Cloud):
             for fan in fans_of(len(table)):
                 sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
                 join_rows(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, ESTIMATE_SUMS, fan)
-            finish_estimate(_PLAIN, first, table.reshape(-1), result, again)
+            finish_estimate(_PLAIN, first, table.reshape(-1), result, 1, again)
             if not result[WIDE_HEADINGS]:
                 break
         return result

@@ -30,9 +30,7 @@ kernel void set_copies(global const double *ends, global const double *state, gl
     if (begin >= particles) return;
     const double total = state[stage * STAGE + TOTAL];
     const int end = min(begin + block, particles);
-    double sum = 0.0;
-    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS];
-    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS];
+    double sum = sums[(long)b * WEIGHT_SUMS] + (b < fan ? 0.0 : joined[(long)(b / fan) * WEIGHT_SUMS]);
     for (int n = begin; n < end; n++) {
         sum += copies_of(ends, total, drawn, n);
         copies[n] = sum;

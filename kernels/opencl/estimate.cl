@@ -9,19 +9,22 @@
 #define ESTIMATE_LANES 8
 #define RIGHT_ANGLE 1.5707963267948966
 #define WIDE_HEADINGS 10
+// Groups that are read before any is added.
+#define GROUPS_AT_ONCE 4
 
-// Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings of a block: one work-item
-// takes a block.
+// Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes a
+// number of lanes of a block.
 kernel void sum_poses(global const double *poses, global const double *weight, global const double *estimate,
-                      global double *sums, const int particles, const int block, const int again) {
-    const int b = get_global_id(0), begin = b * block;
+                      global double *sums, const int particles, const int block, const int lanes,
+                      const int again) {
+    const int i = get_global_id(0), each = ESTIMATE_LANES / lanes, begin = i / each * block, first = i % each * lanes;
     if (begin >= particles) return;
     global const double *reference = again ? estimate : poses;
     const double x0 = reference[0], y0 = reference[1], theta0 = reference[2];
     const int end = min(begin + block, particles);
     double total[ESTIMATE_SUMS];
     for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] = 0.0;
-    for (int lane = 0; lane < ESTIMATE_LANES; lane++) {
+    for (int lane = first; lane < first + lanes; lane++) {
         double part[ESTIMATE_SUMS];
         for (int k = 0; k < ESTIMATE_SUMS; k++) part[k] = 0.0;
         for (int n = begin + lane; n < end; n += ESTIMATE_LANES) {
@@ -36,25 +39,44 @@ kernel void sum_poses(global const double *poses, global const double *weight, g
         }
         for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] += part[k];
     }
-    for (int k = 0; k < ESTIMATE_SUMS; k++) sums[(long)b * ESTIMATE_SUMS + k] = total[k];
+    for (int k = 0; k < ESTIMATE_SUMS; k++) sums[(long)i * ESTIMATE_SUMS + k] = total[k];
 }
 
-// Write the mean pose and the covariance about it from the sums of all particles, and whether headings ask for a second
+// Add up the rows of groups, one after the other.
+void add_rows(global const double *sums, const int groups, double *total) {
+    for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] = 0.0;
+    for (int g = 0; g < groups; g += GROUPS_AT_ONCE) {
+        double number[GROUPS_AT_ONCE][ESTIMATE_SUMS];
+#pragma unroll
+        for (int i = 0; i < GROUPS_AT_ONCE; i++)
+#pragma unroll
+            for (int k = 0; k < ESTIMATE_SUMS; k++)
+                number[i][k] = g + i < groups ? sums[(long)(g + i) * ESTIMATE_SUMS + k] : 0.0;
+#pragma unroll
+        for (int i = 0; i < GROUPS_AT_ONCE; i++)
+#pragma unroll
+            for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] += number[i][k];
+    }
+}
+
+// Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a second
 // pass; that pass writes the covariance only. One work-item takes all.
 kernel void finish_estimate(global const double *poses, global const double *sums, global double *estimate,
-                            const int again) {
+                            const int groups, const int again) {
     if (get_global_id(0) > 0) return;
-    const double weight = sums[0] > 0.0 ? sums[0] : 1.0;
-    const double x = sums[1] / weight, y = sums[2] / weight, angle = sums[5] / weight;
-    const double mean = again ? 0.0 : angle_of(sums[3], sums[4]);
+    double total[ESTIMATE_SUMS];
+    add_rows(sums, groups, total);
+    const double weight = total[0] > 0.0 ? total[0] : 1.0;
+    const double x = total[1] / weight, y = total[2] / weight, angle = total[5] / weight;
+    const double mean = again ? 0.0 : angle_of(total[3], total[4]);
     if (!again) {
         estimate[0] = poses[0] + x, estimate[1] = poses[1] + y, estimate[2] = wrap_once(poses[2] + mean);
         estimate[9] = weight;
-        estimate[WIDE_HEADINGS] = sums[12] > 0.0 || fabs(mean) > RIGHT_ANGLE ? 1.0 : 0.0;
+        estimate[WIDE_HEADINGS] = total[12] > 0.0 || fabs(mean) > RIGHT_ANGLE ? 1.0 : 0.0;
     }
-    estimate[3] = sums[6] / weight - x * x, estimate[4] = sums[7] / weight - x * y;
-    estimate[5] = sums[8] / weight - x * angle, estimate[6] = sums[9] / weight - y * y;
-    estimate[7] = sums[10] / weight - y * angle, estimate[8] = sums[11] / weight - mean * (2.0 * angle - mean);
+    estimate[3] = total[6] / weight - x * x, estimate[4] = total[7] / weight - x * y;
+    estimate[5] = total[8] / weight - x * angle, estimate[6] = total[9] / weight - y * y;
+    estimate[7] = total[10] / weight - y * angle, estimate[8] = total[11] / weight - mean * (2.0 * angle - mean);
 }
 
 // Divide weights by their sum, which the estimate holds: one work-item takes a particle.

@@ -28,11 +28,32 @@
 #define FAST 50
 #define INJECTED 51
 
-// Return the largest score of all groups.
-double largest_of(global const double *largest, const int groups) {
-    double high = -INFINITY;
-    for (int g = 0; g < groups; g++) high = largest[g] > high ? largest[g] : high;
-    return high;
+// Return 8 numbers from first on, so that a work-item waits once for all of them; from end on, the missing one.
+double8 eight_at(global const double *values, const int first, const int end, const double missing) {
+    const int count = end - first;
+    values += first;
+    return (double8)(count > 0 ? values[0] : missing, count > 1 ? values[1] : missing, count > 2 ? values[2] : missing,
+                     count > 3 ? values[3] : missing, count > 4 ? values[4] : missing, count > 5 ? values[5] : missing,
+                     count > 6 ? values[6] : missing, count > 7 ? values[7] : missing);
+}
+
+// Return the sum of 8 numbers, rounded down to integers.
+double sum_eight(const double8 numbers) {
+    const double8 a = floor(numbers);
+    return a.s0 + a.s1 + a.s2 + a.s3 + a.s4 + a.s5 + a.s6 + a.s7;
+}
+
+// Return the largest of the scores from begin to before end.
+double largest_of(global const double *largest, const int begin, const int end) {
+    double8 high = -INFINITY;
+    for (int g = begin; g < end; g += 16) {
+        const double8 one = eight_at(largest, g, end, -INFINITY), two = eight_at(largest, g + 8, end, -INFINITY);
+        const double8 higher = one > two ? one : two;
+        high = higher > high ? higher : high;
+    }
+    const double4 four = high.lo > high.hi ? high.lo : high.hi;
+    const double2 two = four.lo > four.hi ? four.lo : four.hi;
+    return two.x > two.y ? two.x : two.y;
 }
 
 // Return the largest score; -inf where all particles with a weight are impossible next to those without one.
@@ -45,10 +66,19 @@ int column_of(const double high, const int rung) {
     return high == -INFINITY ? 2 * RUNGS : rung;
 }
 
-// Return the likelihood of a score relative to the largest, on the last rung; 1 where none is possible or nothing is
-// left. Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
-double tempered(const double score, const double largest, const double left) {
-    return largest == -INFINITY || left == 0.0 ? 1.0 : exp_of(LOWEST * left * (score - largest));
+// Return the sum of a column of all blocks before one: of those in its group, and of the groups before it.
+double sum_before(global const double *sums, global const double *joined, const int b, const int fan, const int column) {
+    const double before = sums[(long)b * WEIGHT_SUMS + column];
+    return b < fan ? before : before + joined[(long)(b / fan) * WEIGHT_SUMS + column];
+}
+
+// Return the likelihoods of 8 scores relative to the largest, on the last rung; 1 where none is possible or nothing is
+// left. Their squares belong to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+double8 tempered(const double8 scores, const double largest, const double left) {
+    if (largest == -INFINITY || left == 0.0) return 1.0;
+    const double8 a = LOWEST * left * (scores - largest);
+    return (double8)(exp_of(a.s0), exp_of(a.s1), exp_of(a.s2), exp_of(a.s3), exp_of(a.s4), exp_of(a.s5), exp_of(a.s6),
+                     exp_of(a.s7));
 }
 
 // Return the part of the temperature that earlier stages have left.
@@ -58,8 +88,10 @@ double left_of(global const double *state, const int stage) {
 
 // Return the first rung with the effective sample size least, or the last rung.
 int rung_of(global const double *totals, global const double *settings, const double least) {
-    int rung = 0;
-    while (rung < RUNGS - 1 && !(totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung])) rung++;
+    int rung = RUNGS - 1;
+    for (int k = RUNGS - 2; k >= 0; k--) {
+        if (totals[k] * totals[k] >= least * settings[SCALE] * totals[RUNGS + k]) rung = k;
+    }
     return rung;
 }
 

@@ -5,6 +5,9 @@
 // sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
 // requires: rungs
 
+// Rows that a work-item reads before it adds any up.
+#define ROWS_AT_ONCE 16
+
 // Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the largest: one
 // work-item takes a block of particles.
 kernel void add_scores(global const real *log_p, global const double *settings, global double *score,
@@ -27,75 +30,85 @@ kernel void add_scores(global const real *log_p, global const double *settings, 
 kernel void join_scores(global const double *scores, global double *largest, const int blocks, const int fan) {
     const int g = get_global_id(0), begin = g * fan;
     if (begin >= blocks) return;
-    largest[g] = largest_of(scores + begin, min(fan, blocks - begin));
+    largest[g] = largest_of(scores, begin, min(begin + fan, blocks));
 }
 
 // Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a block.
+// The first one writes the largest score.
 kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
                             global const double *settings, global const double *state, global double *sums,
-                            const int particles, const int block, const int blocks, const int groups,
-                            const int stage) {
+                            global double *highest, const int particles, const int block, const int blocks,
+                            const int groups, const int stage) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double high = largest_of(largest, groups), left = left_of(state, stage), scale = settings[SCALE];
+    const double high = largest_of(largest, 0, groups), left = left_of(state, stage), scale = settings[SCALE];
     const int end = min(begin + block, particles);
-    // A vector of RUNGS numbers: processors compute four or eight of them at once.
-    double8 weights = 0.0, squares = 0.0;
-    double old = 0.0;
-    for (int n = begin; n < end; n++) {
-        double8 likelihood;
-        likelihood.s7 = tempered(score[n], high, left);
-        likelihood.s6 = likelihood.s7 * likelihood.s7;
-        likelihood.s5 = likelihood.s6 * likelihood.s6;
-        likelihood.s4 = likelihood.s5 * likelihood.s5;
-        likelihood.s3 = likelihood.s4 * likelihood.s4;
-        likelihood.s2 = likelihood.s3 * likelihood.s3;
-        likelihood.s1 = likelihood.s2 * likelihood.s2;
-        likelihood.s0 = likelihood.s1 * likelihood.s1;
-        old += floor(before[n] * scale);
-        const double8 weight = before[n] * likelihood;
-        weights += floor(weight * scale);
-        squares += floor(weight * weight * scale);
+    double weights[RUNGS], squares[RUNGS], old = 0.0;
+    for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
+    for (int n = begin; n < end; n += 8) {
+        const double8 scores = eight_at(score, n, end, -INFINITY), prior = eight_at(before, n, end, 0.0);
+        double8 likelihood = tempered(scores, high, left);
+        old += sum_eight(prior * scale);
+#pragma unroll
+        for (int k = RUNGS - 1; k >= 0; k--) {
+            const double8 weight = prior * likelihood;
+            weights[k] += sum_eight(weight * scale);
+            squares[k] += sum_eight(weight * weight * scale);
+            likelihood *= likelihood;
+        }
     }
     global double *row = sums + (long)b * WEIGHT_SUMS;
-    vstore8(weights, 0, row);
-    vstore8(squares, 0, row + RUNGS);
+    for (int k = 0; k < RUNGS; k++) row[k] = weights[k], row[RUNGS + k] = squares[k];
     row[2 * RUNGS] = old;
+    if (b == 0) highest[0] = high;
 }
 
-// Add up each fan rows of sums, one after the other: one work-item takes a column of a group of rows.
-kernel void join_rows(global const double *sums, global double *joined, const int rows, const int columns,
-                      const int fan) {
+// Add up each fan rows of sums, one after the other; a row becomes the sum of those before it in its group: one work-item
+// takes a column of a group.
+kernel void join_rows(global double *sums, global double *joined, const int rows, const int columns, const int fan) {
     const int i = get_global_id(0), begin = i / columns * fan, end = min(begin + fan, rows);
     if (begin >= rows) return;
+    global double *column = sums + i % columns;
     double total = 0.0;
-    for (int row = begin; row < end; row++) total += sums[(long)row * columns + i % columns];
+    for (int row = begin; row < end; row += ROWS_AT_ONCE) {
+        double number[ROWS_AT_ONCE];
+#pragma unroll
+        for (int k = 0; k < ROWS_AT_ONCE; k++) number[k] = row + k < end ? column[(long)(row + k) * columns] : 0.0;
+#pragma unroll
+        for (int k = 0; k < ROWS_AT_ONCE; k++) {
+            if (row + k < end) column[(long)(row + k) * columns] = total;
+            total += number[k];
+        }
+    }
     joined[i] = total;
 }
 
-// Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
-// writes the stage's state.
-kernel void set_weights(global const double *score, global const double *before, global const double *largest,
+// Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The one after the
+// last block writes the stage's state.
+kernel void set_weights(global const double *score, global const double *before, global const double *highest,
                         global const double *sums, global const double *joined, global const double *totals,
                         global const double *settings, global double *state, global double *weight,
                         global double *ends, const int particles, const int block, const int blocks, const int fan,
-                        const int groups, const int stage, const int stages) {
+                        const int stage, const int stages) {
     const int b = get_global_id(0), begin = b * block;
-    if (begin >= particles) return;
-    const double scale = settings[SCALE], left = left_of(state, stage);
-    const double high = possible_of(totals, largest_of(largest, groups));
+    if (b > blocks) return;
+    const double scale = settings[SCALE], left = left_of(state, stage), high = possible_of(totals, highest[0]);
     const int rung = left > 0.0 ? rung_of(totals, settings, settings[SHARE] * (double)particles) : 0;
-    const int end = min(begin + block, particles), column = column_of(high, rung);
-    double sum = 0.0;
-    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + column];
-    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + column];
-    for (int n = begin; n < end; n++) {
-        double likelihood = tempered(score[n], high, left);
-        for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
-        const double chosen = before[n] * likelihood;
-        weight[n] = chosen;
-        sum += floor(chosen * scale);
-        ends[n] = sum;
+    if (b == blocks) {
+        set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
+        return;
     }
-    if (b == 0) set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
+    const int end = min(begin + block, particles);
+    double sum = sum_before(sums, joined, b, fan, column_of(high, rung));
+    for (int n = begin; n < end; n += 8) {
+        const double8 scores = eight_at(score, n, end, -INFINITY), prior = eight_at(before, n, end, 0.0);
+        double8 likelihood = tempered(scores, high, left);
+        for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
+        const double8 chosen = prior * likelihood, whole = floor(chosen * scale);
+#pragma unroll
+        for (int i = 0; i < 8; i++) {
+            sum += ((const double *)&whole)[i];
+            if (n + i < end) weight[n + i] = ((const double *)&chosen)[i], ends[n + i] = sum;
+        }
+    }
 }

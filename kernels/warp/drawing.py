@@ -72,11 +72,9 @@ def make(name, flags):
         if begin >= particles:
             return
         total = state[stage * STAGE + TOTAL]
-        counted = ZERO + ZERO
-        for g in range(b / fan):
-            counted += joined[g * WEIGHT_SUMS]
-        for i in range(b - b % fan, b):
-            counted += sums[i * WEIGHT_SUMS]
+        counted = sums[b * WEIGHT_SUMS]
+        if b >= fan:
+            counted += joined[b / fan * WEIGHT_SUMS]
         for n in range(begin, wp.min(begin + block, particles)):
             counted += copies_of(ends, total, drawn, n)
             copies[n] = counted

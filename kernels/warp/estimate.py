@@ -11,12 +11,41 @@ import functools
 import warp as wp
 
 from . import elementary, heading, motion
-from .prelude import kernel
+from .prelude import kernel, reader
 
 ESTIMATE_SUMS, ESTIMATE_LANES, WIDE_HEADINGS = (wp.constant(number) for number in (13, 8, 10))
 RIGHT_ANGLE = wp.constant(wp.float64(1.5707963267948966))
 ZERO, ONE, TWO = (wp.constant(wp.float64(number)) for number in (0.0, 1.0, 2.0))
 totals = wp.types.vector(length=13, dtype=wp.float64)
+number_at = reader(wp.float64)
+
+
+# Return a row of sums; zeros from row groups on.
+@wp.func
+def row_at(sums: wp.array(dtype=wp.float64), row: wp.int32, groups: wp.int32):
+    found = totals()
+    if row < groups:
+        for k in range(13):
+            found[k] = number_at(sums, row * ESTIMATE_SUMS + k)
+    return found
+
+
+# Add up the rows of groups, one after the other; four are read before any is added.
+@wp.func
+def add_rows(sums: wp.array(dtype=wp.float64), groups: wp.int32):
+    total = totals()
+    g = int(0)
+    while g < groups:
+        one = row_at(sums, g, groups)
+        two = row_at(sums, g + 1, groups)
+        three = row_at(sums, g + 2, groups)
+        four = row_at(sums, g + 3, groups)
+        total = total + one
+        total = total + two
+        total = total + three
+        total = total + four
+        g += 4
+    return total
 
 
 @functools.cache
@@ -26,8 +55,8 @@ def make(name, flags):
     wrap_once = motion.functions(frozenset()).wrap_once
     angle_of = elementary.functions(frozenset()).angle_of
 
-    # Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings of a block: one
-    # work-item takes a block.
+    # Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes
+    # a number of lanes of a block.
     @kernel
     def sum_poses(
         poses: wp.array(dtype=wp.float64),
@@ -36,10 +65,13 @@ def make(name, flags):
         sums: wp.array(dtype=wp.float64),
         particles: wp.int32,
         block: wp.int32,
+        lanes: wp.int32,
         again: wp.int32,
     ):
-        b = wp.tid()
-        begin = b * block
+        i = wp.tid()
+        each = ESTIMATE_LANES / lanes
+        begin = i / each * block
+        first = i % each * lanes
         if begin >= particles:
             return
         x0 = poses[0]
@@ -50,7 +82,7 @@ def make(name, flags):
             y0 = estimate[1]
             theta0 = estimate[2]
         total = totals()
-        for lane in range(ESTIMATE_LANES):
+        for lane in range(first, first + lanes):
             part = totals()
             for n in range(begin + lane, wp.min(begin + block, particles), ESTIMATE_LANES):
                 w = weight[n]
@@ -74,38 +106,40 @@ def make(name, flags):
             for k in range(13):
                 total[k] += part[k]
         for k in range(13):
-            sums[b * ESTIMATE_SUMS + k] = total[k]
+            sums[i * ESTIMATE_SUMS + k] = total[k]
 
-    # Write the mean pose and the covariance about it from the sums of all particles, and whether headings ask for a
+    # Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a
     # second pass; that pass writes the covariance only. One work-item takes all.
     @kernel
     def finish_estimate(
         poses: wp.array(dtype=wp.float64),
         sums: wp.array(dtype=wp.float64),
         estimate: wp.array(dtype=wp.float64),
+        groups: wp.int32,
         again: wp.int32,
     ):
         i = wp.tid()
         if i > 0:
             return
-        weight = wp.where(sums[0] > ZERO, sums[0], ONE)
-        x = sums[1] / weight
-        y = sums[2] / weight
-        angle = sums[5] / weight
+        total = add_rows(sums, groups)
+        weight = wp.where(total[0] > ZERO, total[0], ONE)
+        x = total[1] / weight
+        y = total[2] / weight
+        angle = total[5] / weight
         mean = ZERO + ZERO
         if again == 0:
-            mean = angle_of(sums[3], sums[4])
+            mean = angle_of(total[3], total[4])
             estimate[0] = poses[0] + x
             estimate[1] = poses[1] + y
             estimate[2] = wrap_once(poses[2] + mean)
             estimate[9] = weight
-            estimate[WIDE_HEADINGS] = wp.where(sums[12] > ZERO or wp.abs(mean) > RIGHT_ANGLE, ONE, ZERO)
-        estimate[3] = sums[6] / weight - x * x
-        estimate[4] = sums[7] / weight - x * y
-        estimate[5] = sums[8] / weight - x * angle
-        estimate[6] = sums[9] / weight - y * y
-        estimate[7] = sums[10] / weight - y * angle
-        estimate[8] = sums[11] / weight - mean * (TWO * angle - mean)
+            estimate[WIDE_HEADINGS] = wp.where(total[12] > ZERO or wp.abs(mean) > RIGHT_ANGLE, ONE, ZERO)
+        estimate[3] = total[6] / weight - x * x
+        estimate[4] = total[7] / weight - x * y
+        estimate[5] = total[8] / weight - x * angle
+        estimate[6] = total[9] / weight - y * y
+        estimate[7] = total[10] / weight - y * angle
+        estimate[8] = total[11] / weight - mean * (TWO * angle - mean)
 
     # Divide weights by their sum, which the estimate holds: one work-item takes a particle.
     @kernel

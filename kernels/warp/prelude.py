@@ -99,6 +99,16 @@ def reader(dtype, count=1):
 
 
 @functools.cache
+def loader(dtype):
+    """Make a function of (array, i) that reads a number, like ``reader``, of an array that the kernel writes."""
+
+    @wp.func_native("return values.data[i];")
+    def load(values: wp.array(dtype=dtype), i: wp.int32) -> dtype: ...
+
+    return load
+
+
+@functools.cache
 def writer(dtype):
     """Make a function of (array, i, value) that writes a number, like ``reader``."""
 

@@ -10,6 +10,7 @@ import math
 import warp as wp
 
 from .elementary import exp_of, log_of
+from .prelude import reader
 
 SHARE, THRESHOLD, SCALE = (wp.constant(place) for place in (19, 20, 21))
 PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED = (wp.constant(place) for place in (22, 23, 24, 25))
@@ -25,12 +26,39 @@ NEVER = wp.constant(wp.float64(-math.inf))
 ZERO, HALF, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1.0))
 
 
-# Return the largest score of all groups.
+eight = wp.types.vector(length=8, dtype=wp.float64)
+number_at = reader(wp.float64)
+
+
+# Return 8 numbers from first on, so that a work-item waits once for all of them; from end on, the missing one.
 @wp.func
-def largest_of(largest: wp.array(dtype=wp.float64), groups: wp.int32):
-    high = largest[0]
-    for g in range(1, groups):
-        high = wp.max(high, largest[g])
+def eight_at(values: wp.array(dtype=wp.float64), first: wp.int32, end: wp.int32, missing: wp.float64):
+    found = eight(missing)
+    for i in range(8):
+        if first + i < end:
+            found[i] = number_at(values, first + i)
+    return found
+
+
+# Return the sum of 8 numbers, rounded down to integers.
+@wp.func
+def sum_eight(numbers: eight):
+    total = wp.floor(numbers[0])
+    for i in range(1, 8):
+        total += wp.floor(numbers[i])
+    return total
+
+
+# Return the largest of the scores from begin to before end.
+@wp.func
+def largest_of(largest: wp.array(dtype=wp.float64), begin: wp.int32, end: wp.int32):
+    high = NEVER + ZERO
+    g = begin + 0
+    while g < end:
+        one = eight_at(largest, g, end, NEVER)
+        two = eight_at(largest, g + 8, end, NEVER)
+        high = wp.max(high, wp.max(wp.max(one), wp.max(two)))
+        g += 16
     return high
 
 
@@ -52,14 +80,26 @@ def column_of(high: wp.float64, rung: wp.int32):
     return column
 
 
-# Return the likelihood of a score relative to the largest, on the last rung; 1 where none is possible or nothing is
-# left. Its square belongs to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+# Return the sum of a column of all blocks before one: of those in its group, and of the groups before it.
 @wp.func
-def tempered(score: wp.float64, largest: wp.float64, left: wp.float64):
-    value = ONE
+def sum_before(
+    sums: wp.array(dtype=wp.float64), joined: wp.array(dtype=wp.float64), b: wp.int32, fan: wp.int32, column: wp.int32
+):
+    total = number_at(sums, b * WEIGHT_SUMS + column)
+    if b >= fan:
+        total += number_at(joined, b / fan * WEIGHT_SUMS + column)
+    return total
+
+
+# Return the likelihoods of 8 scores relative to the largest, on the last rung; 1 where none is possible or nothing is
+# left. Their squares belong to the rung before: an error of 2^-53 grows to 2^-46 on the first rung.
+@wp.func
+def tempered(scores: eight, largest: wp.float64, left: wp.float64):
+    found = eight(ONE)
     if not wp.isinf(largest) and left > ZERO:
-        value = exp_of(LOWEST * left * (score - largest))
-    return value
+        for i in range(8):
+            found[i] = exp_of(LOWEST * left * (scores[i] - largest))
+    return found
 
 
 # Return the part of the temperature that earlier stages have left.
@@ -74,9 +114,12 @@ def left_of(state: wp.array(dtype=wp.float64), stage: wp.int32):
 # Return the first rung with the effective sample size least, or the last rung.
 @wp.func
 def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), least: wp.float64):
-    rung = int(0)
-    while rung < RUNGS - 1 and not (totals[rung] * totals[rung] >= least * settings[SCALE] * totals[RUNGS + rung]):
-        rung += 1
+    rung = RUNGS - 1
+    for i in range(7):
+        k = 6 - i
+        total = number_at(totals, k)
+        if total * total >= least * number_at(settings, SCALE) * number_at(totals, RUNGS + k):
+            rung = k
     return rung
 
 

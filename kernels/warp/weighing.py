@@ -10,7 +10,7 @@ import functools
 
 import warp as wp
 
-from .prelude import kernel, precision
+from .prelude import kernel, loader, precision, writer
 from .rungs import (
     NEVER,
     RUNGS,
@@ -18,17 +18,22 @@ from .rungs import (
     SHARE,
     WEIGHT_SUMS,
     column_of,
+    eight,
+    eight_at,
     largest_of,
     left_of,
     possible_of,
     rung_of,
     set_stage,
+    sum_before,
+    sum_eight,
     tempered,
 )
 
 TEMPERATURE = wp.constant(27)
 ZERO = wp.constant(wp.float64(0.0))
-eight = wp.types.vector(length=8, dtype=wp.float64)
+load, write = loader(wp.float64), writer(wp.float64)
+sixteen = wp.types.vector(length=16, dtype=wp.float64)
 
 
 @functools.cache
@@ -72,15 +77,11 @@ def make(name, flags):
     ):
         g = wp.tid()
         begin = g * fan
-        if begin >= blocks:
-            return
-        high = scores[begin]
-        for b in range(begin + 1, wp.min(begin + fan, blocks)):
-            high = wp.max(high, scores[b])
-        largest[g] = high
+        if begin < blocks:
+            largest[g] = largest_of(scores, begin, wp.min(begin + fan, blocks))
 
     # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a
-    # block.
+    # block. The first one writes the largest score.
     @kernel
     def weigh_particles(
         score: wp.array(dtype=wp.float64),
@@ -89,6 +90,7 @@ def make(name, flags):
         settings: wp.array(dtype=wp.float64),
         state: wp.array(dtype=wp.float64),
         sums: wp.array(dtype=wp.float64),
+        highest: wp.array(dtype=wp.float64),
         particles: wp.int32,
         block: wp.int32,
         blocks: wp.int32,
@@ -99,27 +101,34 @@ def make(name, flags):
         begin = b * block
         if begin >= particles:
             return
-        high = largest_of(largest, groups)
+        high = largest_of(largest, 0, groups)
         left = left_of(state, stage)
         scale = settings[SCALE]
+        end = wp.min(begin + block, particles)
         weights = eight()
         squares = eight()
         old = ZERO + ZERO
-        for n in range(begin, wp.min(begin + block, particles)):
-            likelihood = tempered(score[n], high, left)
-            prior = before[n]
-            old += wp.floor(prior * scale)
+        n = begin + 0
+        while n < end:
+            scores = eight_at(score, n, end, NEVER)
+            prior = eight_at(before, n, end, ZERO)
+            likelihood = tempered(scores, high, left)
+            old += sum_eight(prior * scale)
             for k in range(7, -1, -1):
-                weight = prior * likelihood
-                weights[k] += wp.floor(weight * scale)
-                squares[k] += wp.floor(weight * weight * scale)
-                likelihood = likelihood * likelihood
+                weight = wp.cw_mul(prior, likelihood)
+                weights[k] += sum_eight(weight * scale)
+                squares[k] += sum_eight(wp.cw_mul(weight, weight) * scale)
+                likelihood = wp.cw_mul(likelihood, likelihood)
+            n += 8
         for k in range(8):
             sums[b * WEIGHT_SUMS + k] = weights[k]
             sums[b * WEIGHT_SUMS + RUNGS + k] = squares[k]
         sums[b * WEIGHT_SUMS + 2 * RUNGS] = old
+        if b == 0:
+            highest[0] = high
 
-    # Add up each fan rows of sums, one after the other: one work-item takes a column of a group of rows.
+    # Add up each fan rows of sums, one after the other; a row becomes the sum of those before it in its group: one
+    # work-item takes a column of a group.
     @kernel
     def join_rows(
         sums: wp.array(dtype=wp.float64),
@@ -129,21 +138,32 @@ def make(name, flags):
         fan: wp.int32,
     ):
         i = wp.tid()
-        begin = i / columns * fan
-        if begin >= rows:
+        row = i / columns * fan
+        if row >= rows:
             return
+        end = wp.min(row + fan, rows)
         total = ZERO + ZERO
-        for row in range(begin, wp.min(begin + fan, rows)):
-            total += sums[row * columns + i % columns]
+        while row < end:
+            # All are read before any is added.
+            number = sixteen()
+            place = row * columns + i % columns
+            for k in range(16):
+                if row + k < end:
+                    number[k] = load(sums, place + k * columns)
+            for k in range(16):
+                if row + k < end:
+                    write(sums, place + k * columns, total)
+                total += number[k]
+            row += 16
         joined[i] = total
 
-    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The first
-    # writes the stage's state.
+    # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The one after
+    # the last block writes the stage's state.
     @kernel
     def set_weights(
         score: wp.array(dtype=wp.float64),
         before: wp.array(dtype=wp.float64),
-        largest: wp.array(dtype=wp.float64),
+        highest: wp.array(dtype=wp.float64),
         sums: wp.array(dtype=wp.float64),
         joined: wp.array(dtype=wp.float64),
         totals: wp.array(dtype=wp.float64),
@@ -155,36 +175,37 @@ def make(name, flags):
         block: wp.int32,
         blocks: wp.int32,
         fan: wp.int32,
-        groups: wp.int32,
         stage: wp.int32,
         stages: wp.int32,
     ):
         b = wp.tid()
-        begin = b * block
-        if begin >= particles:
+        if b > blocks:
             return
         scale = settings[SCALE]
         left = left_of(state, stage)
-        high = possible_of(totals, largest_of(largest, groups))
+        high = possible_of(totals, highest[0])
         rung = int(0)
         if left > ZERO:
             rung = rung_of(totals, settings, settings[SHARE] * wp.float64(particles))
-        column = column_of(high, rung)
-        total = ZERO + ZERO
-        for g in range(b / fan):
-            total += joined[g * WEIGHT_SUMS + column]
-        for i in range(b - b % fan, b):
-            total += sums[i * WEIGHT_SUMS + column]
-        for n in range(begin, wp.min(begin + block, particles)):
-            likelihood = tempered(score[n], high, left)
-            for _k in range(rung, RUNGS - 1):
-                likelihood = likelihood * likelihood
-            chosen = before[n] * likelihood
-            weight[n] = chosen
-            total += wp.floor(chosen * scale)
-            ends[n] = total
-        if b == 0:
+        if b == blocks:
             set_stage(totals, settings, state, high, left, rung, particles, stage, stages)
+            return
+        total = sum_before(sums, joined, b, fan, column_of(high, rung))
+        n = b * block
+        end = wp.min(n + block, particles)
+        while n < end:
+            scores = eight_at(score, n, end, NEVER)
+            prior = eight_at(before, n, end, ZERO)
+            likelihood = tempered(scores, high, left)
+            for _k in range(rung, RUNGS - 1):
+                likelihood = wp.cw_mul(likelihood, likelihood)
+            chosen = wp.cw_mul(prior, likelihood)
+            for i in range(8):
+                total += wp.floor(chosen[i] * scale)
+                if n + i < end:
+                    write(weight, n + i, chosen[i])
+                    write(ends, n + i, total)
+            n += 8
 
     kernels = {"add_scores": add_scores, "join_scores": join_scores, "weigh_particles": weigh_particles}
     return (kernels | {"join_rows": join_rows, "set_weights": set_weights})[name]

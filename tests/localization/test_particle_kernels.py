@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -168,7 +170,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
         numbers.update(sizes, blocks=-(-count // block))
         find, *scored = sums.highest(numbers["blocks"])
         program += find + sums.weigh(numbers, scored, stage)
-        program += sums.set_weights(numbers, scored, (stage, 2), (on["weight"], on["ends"]))
+        program += sums.set_weights(numbers, (stage, 2), (on["weight"], on["ends"]))
         if draws == c.RESIDUAL:
             given = {name: numbers[name] for name in ("state", "particles", "block", "blocks")}
             program += sums.copies(dict(given, ends=on["ends"]), on["copies"], count, stage)
@@ -216,6 +218,19 @@ def test_other_draws_have_the_bits_of_the_reference(backend, draws, lanes):
     if draws == c.RESIDUAL:
         # Certain copies of the second stage, in order.
         assert 0 < found["copies"][-1] <= 1500 and (np.diff(found["copies"]) >= 0).all()
+
+
+@pytest.mark.parametrize("count", [1, 37, 1500, 3000])
+def test_estimates_have_the_same_bits_where_work_items_take_single_lanes(backend, count, monkeypatch):
+    device, rng, found = get_backend(backend), np.random.default_rng(2), []
+    sums, poses, weights = Sums(device, count), rng.normal(size=3 * count), rng.exponential(size=count)
+    on = [device.upload(values) for values in (poses, weights, np.zeros(c.ESTIMATE))]
+    for kind, lanes in (("cpu", device.info.lanes), ("gpu", 1)):
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind, lanes=lanes))
+        for again in (0, 1):
+            device.run(sums.estimate(*on, count, again))
+            found.append(device.download(on[2], np.empty(c.ESTIMATE)))
+    assert np.array_equal(found[:2], found[2:])
 
 
 CLOUDS = {

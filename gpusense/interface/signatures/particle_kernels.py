@@ -21,17 +21,17 @@ KERNELS: dict[str, Kernel] = {
         "weighing", "group", "double scores [blocks]", "out double largest [1]", "int blocks", "int fan", group=16,
     ),
     "weigh_particles": kernel(
-        "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SETTINGS, _STATE, f"out {_SUMS}", "int particles",
-        "int block", "int blocks", "int groups", "int stage", group=16,
+        "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SETTINGS, _STATE, f"out {_SUMS}", "out double highest [1]",
+        "int particles", "int block", "int blocks", "int groups", "int stage", group=16,
     ),
     "join_rows": kernel(
-        "weighing", "column", "double sums [columns * rows]", "out double joined [columns]", "int rows", "int columns",
-        "int fan", group=16,
+        "weighing", "column", "out double sums [columns * rows]", "out double joined [columns]", "int rows",
+        "int columns", "int fan", group=16,
     ),
     "set_weights": kernel(
-        "weighing", "group", _SCORE, _BEFORE, _LARGEST, _SUMS, "double joined [17]", "double totals [17]", _SETTINGS,
-        f"out {_STATE}", "out double weight [particles]", "out double ends [particles]", "int particles", "int block",
-        "int blocks", "int fan", "int groups", "int stage", "int stages", group=16,
+        "weighing", "group", _SCORE, _BEFORE, "double highest [1]", _SUMS, "double joined [17]", "double totals [17]",
+        _SETTINGS, f"out {_STATE}", "out double weight [particles]", "out double ends [particles]", "int particles",
+        "int block", "int blocks", "int fan", "int stage", "int stages", group=16,
     ),
     "count_copies": kernel(
         "drawing", "group", "double ends [particles]", _STATE, f"out {_SUMS}", "int particles", "int block",
@@ -49,10 +49,11 @@ KERNELS: dict[str, Kernel] = {
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [11]",
-        "out double sums [particles]", "int particles", "int block", "int again", group=16,
+        "out double sums [13]", "int particles", "int block", "int lanes", "int again", group=16,
     ),
     "finish_estimate": kernel(
-        "estimate", "whole", "double poses [3]", "double sums [13]", "out double estimate [11]", "int again", group=1,
+        "estimate", "whole", "double poses [3]", "double sums [13 * groups]", "out double estimate [11]", "int groups",
+        "int again", group=1,
     ),
     "normalize_weights": kernel(
         "estimate", "pose", "double weight [particles]", "double estimate [11]", "out double share [particles]",

@@ -7,9 +7,10 @@
 // Return the sum of all lanes, one after the other.
 double sum_in_order(const doubles a) { return ((((((a.s0 + a.s1) + a.s2) + a.s3) + a.s4) + a.s5) + a.s6) + a.s7; }
 
-// A work-item takes a block. Lanes without a particle add zeros.
+// A work-item takes all lanes of a block. Lanes without a particle add zeros.
 kernel void sum_poses(global const double *poses, global const double *weight, global const double *estimate,
-                      global double *sums, const int particles, const int block, const int again) {
+                      global double *sums, const int particles, const int block, const int lanes,
+                      const int again) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     global const double *reference = again ? estimate : poses;

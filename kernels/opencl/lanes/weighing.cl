@@ -6,14 +6,14 @@ doubles tempered_lanes(const doubles score, const double largest, const double l
     return largest == -INFINITY || left == 0.0 ? (doubles)1.0 : exp_of_lanes(LOWEST * left * (score - largest));
 }
 
-// A work-item takes a block.
+// A work-item takes a block; the first one writes the largest score.
 kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
                             global const double *settings, global const double *state, global double *sums,
-                            const int particles, const int block, const int blocks, const int groups,
-                            const int stage) {
+                            global double *highest, const int particles, const int block, const int blocks,
+                            const int groups, const int stage) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double high = largest_of(largest, groups), left = left_of(state, stage), scale = settings[SCALE];
+    const double high = largest_of(largest, 0, groups), left = left_of(state, stage), scale = settings[SCALE];
     const int end = min(begin + block, particles);
     doubles weights[RUNGS], squares[RUNGS], old = 0.0;
     for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
@@ -34,23 +34,26 @@ kernel void weigh_particles(global const double *score, global const double *bef
     global double *row = sums + (long)b * WEIGHT_SUMS;
     for (int k = 0; k < RUNGS; k++) row[k] = sum_doubles(weights[k]), row[RUNGS + k] = sum_doubles(squares[k]);
     row[2 * RUNGS] = sum_doubles(old);
+    if (b == 0) highest[0] = high;
 }
 
-// A work-item takes a block, and adds up its weights in the order of the particles.
-kernel void set_weights(global const double *score, global const double *before, global const double *largest,
+// A work-item takes a block, and adds up its weights in the order of the particles. The one after the last block writes
+// the stage's state.
+kernel void set_weights(global const double *score, global const double *before, global const double *highest,
                         global const double *sums, global const double *joined, global const double *totals,
                         global const double *settings, global double *state, global double *weight,
                         global double *ends, const int particles, const int block, const int blocks, const int fan,
-                        const int groups, const int stage, const int stages) {
+                        const int stage, const int stages) {
     const int b = get_global_id(0), begin = b * block;
-    if (begin >= particles) return;
-    const double scale = settings[SCALE], left = left_of(state, stage);
-    const double high = possible_of(totals, largest_of(largest, groups));
+    if (b > blocks) return;
+    const double scale = settings[SCALE], left = left_of(state, stage), high = possible_of(totals, highest[0]);
     const int rung = left > 0.0 ? rung_of(totals, settings, settings[SHARE] * (double)particles) : 0;
-    const int end = min(begin + block, particles), column = column_of(high, rung);
-    double sum = 0.0;
-    for (int g = 0; g < b / fan; g++) sum += joined[(long)g * WEIGHT_SUMS + column];
-    for (int i = b - b % fan; i < b; i++) sum += sums[(long)i * WEIGHT_SUMS + column];
+    if (b == blocks) {
+        set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
+        return;
+    }
+    const int end = min(begin + block, particles);
+    double sum = sum_before(sums, joined, b, fan, column_of(high, rung));
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
         doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, left);
@@ -64,5 +67,4 @@ kernel void set_weights(global const double *score, global const double *before,
         }
         store_doubles(upto, ends, n, count);
     }
-    if (b == 0) set_stage(totals, settings, state, high, left, rung, particles, stage, stages);
 }

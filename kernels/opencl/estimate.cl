@@ -9,8 +9,6 @@
 #define ESTIMATE_LANES 8
 #define RIGHT_ANGLE 1.5707963267948966
 #define WIDE_HEADINGS 10
-// Groups that are read before any is added.
-#define GROUPS_AT_ONCE 4
 
 // Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes a
 // number of lanes of a block.
@@ -42,30 +40,16 @@ kernel void sum_poses(global const double *poses, global const double *weight, g
     for (int k = 0; k < ESTIMATE_SUMS; k++) sums[(long)i * ESTIMATE_SUMS + k] = total[k];
 }
 
-// Add up the rows of groups, one after the other.
-void add_rows(global const double *sums, const int groups, double *total) {
-    for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] = 0.0;
-    for (int g = 0; g < groups; g += GROUPS_AT_ONCE) {
-        double number[GROUPS_AT_ONCE][ESTIMATE_SUMS];
-#pragma unroll
-        for (int i = 0; i < GROUPS_AT_ONCE; i++)
-#pragma unroll
-            for (int k = 0; k < ESTIMATE_SUMS; k++)
-                number[i][k] = g + i < groups ? sums[(long)(g + i) * ESTIMATE_SUMS + k] : 0.0;
-#pragma unroll
-        for (int i = 0; i < GROUPS_AT_ONCE; i++)
-#pragma unroll
-            for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] += number[i][k];
-    }
-}
-
 // Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a second
 // pass; that pass writes the covariance only. One work-item takes all.
 kernel void finish_estimate(global const double *poses, global const double *sums, global double *estimate,
                             const int groups, const int again) {
     if (get_global_id(0) > 0) return;
     double total[ESTIMATE_SUMS];
-    add_rows(sums, groups, total);
+    for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] = 0.0;
+    for (int g = 0; g < groups; g++) {
+        for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] += sums[(long)g * ESTIMATE_SUMS + k];
+    }
     const double weight = total[0] > 0.0 ? total[0] : 1.0;
     const double x = total[1] / weight, y = total[2] / weight, angle = total[5] / weight;
     const double mean = again ? 0.0 : angle_of(total[3], total[4]);

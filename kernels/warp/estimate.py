@@ -11,41 +11,12 @@ import functools
 import warp as wp
 
 from . import elementary, heading, motion
-from .prelude import kernel, reader
+from .prelude import kernel
 
 ESTIMATE_SUMS, ESTIMATE_LANES, WIDE_HEADINGS = (wp.constant(number) for number in (13, 8, 10))
 RIGHT_ANGLE = wp.constant(wp.float64(1.5707963267948966))
 ZERO, ONE, TWO = (wp.constant(wp.float64(number)) for number in (0.0, 1.0, 2.0))
 totals = wp.types.vector(length=13, dtype=wp.float64)
-number_at = reader(wp.float64)
-
-
-# Return a row of sums; zeros from row groups on.
-@wp.func
-def row_at(sums: wp.array(dtype=wp.float64), row: wp.int32, groups: wp.int32):
-    found = totals()
-    if row < groups:
-        for k in range(13):
-            found[k] = number_at(sums, row * ESTIMATE_SUMS + k)
-    return found
-
-
-# Add up the rows of groups, one after the other; four are read before any is added.
-@wp.func
-def add_rows(sums: wp.array(dtype=wp.float64), groups: wp.int32):
-    total = totals()
-    g = int(0)
-    while g < groups:
-        one = row_at(sums, g, groups)
-        two = row_at(sums, g + 1, groups)
-        three = row_at(sums, g + 2, groups)
-        four = row_at(sums, g + 3, groups)
-        total = total + one
-        total = total + two
-        total = total + three
-        total = total + four
-        g += 4
-    return total
 
 
 @functools.cache
@@ -121,7 +92,10 @@ def make(name, flags):
         i = wp.tid()
         if i > 0:
             return
-        total = add_rows(sums, groups)
+        total = totals()
+        for g in range(groups):
+            for k in range(13):
+                total[k] += sums[g * ESTIMATE_SUMS + k]
         weight = wp.where(total[0] > ZERO, total[0], ONE)
         x = total[1] / weight
         y = total[2] / weight

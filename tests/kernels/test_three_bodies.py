@@ -42,6 +42,7 @@ class Purpose:
 ARRAYS = "works on all elements at once"
 FLOOR = "some OpenCL drivers call floor and clamp as functions; Warp and NumPy have their own"
 FLOAT64 = "error_free.cl has the precision of real, which may be float32; Warp and NumPy choose it by the call"
+EIGHT = "a work-item reads eight numbers before it uses any; the reference takes all of them at once"
 TILES = "a work-item of a GPU finds its particle and rays; the reference takes all of them at once"
 QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
@@ -75,6 +76,7 @@ ON_PURPOSE = [
     Purpose("ray", "start_casts", REFERENCE_ONLY, ARRAYS),
     Purpose("rectangles", "reached _runs longest _quadrants", REFERENCE_ONLY, ARRAYS),
     Purpose("relative", "pair_sum_float64", (OPENCL,), FLOAT64),
+    Purpose("rungs", "eight_at sum_eight sum_before", KERNELS_ONLY, EIGHT),
     Purpose("tiles", "tile_place tile_group tile_ray tile_step", KERNELS_ONLY, TILES),
 ]  # fmt: skip
 

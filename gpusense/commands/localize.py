@@ -152,9 +152,15 @@ def _steps(args: argparse.Namespace) -> list[Step]:
     from gpusense.evaluation.steps import read_steps, with_references
     from gpusense.evaluation.trajectory_files import read_tum
 
-    steps = read_steps(
-        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, sensors=args.sensors
-    )
+    try:
+        steps = read_steps(
+            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
+            sensors=args.sensors,
+        )  # fmt: skip
+    except ValueError as error:
+        # The option for a topic has another name.
+        rest = str(error).removeprefix("topic: ")
+        raise (error if rest == str(error) else ValueError(f"--sensors: {rest}")) from None
     if args.reference is None:
         return steps
     steps = with_references(steps, *read_tum(args.reference))

@@ -50,7 +50,8 @@ def report(
         options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
         document = {"options": options, "filter": repr(pf), "summary": result, "scans_chosen": chosen}
-        print_json(document | {"poses": poses, "machine": machine()})
+        times = [step.scan.time for step in track.steps]
+        print_json(document | {"poses": poses, "times": times, "machine": machine()})
         return result
     _print(pf, result, chosen, track)
     for path in (args.tum, args.plot, args.record):

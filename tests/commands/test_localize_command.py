@@ -81,7 +81,7 @@ def test_figures_come_as_json(place, capsys):
     assert cli.main(call(place, "--json", "--limit", "4", "--temperature", "0.2", "--fit-motion")) in (0, 1)
     document = json.loads(capsys.readouterr().out)
     found = document["summary"]
-    assert found["scans"] == 4 and len(document["poses"]) == 4 and found["temperature"] == 0.2
+    assert found["scans"] == 4 and len(document["poses"]) == len(document["times"]) == 4 and found["temperature"] == 0.2
     assert 0 <= found["coverage_50"] <= found["coverage_95"] <= 1 and found["ms_score"] > 0
 
 
@@ -170,6 +170,9 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
     assert len(rows) == 20 and np.hypot(*(rows[-2:, 1:3] - truth[-2][:2]).T).max() < 0.1
     both[both.index("/rear")] = "/top"
     assert "/top" in error_of(both, capsys)
+    neither = call(place, "--global")
+    neither[neither.index("--log") + 1] = str(bag.path)
+    assert "--sensors: must be given, one of /front, /rear" in error_of(neither, capsys)
     one = call(place, "--sensors", "rear")
     assert "log" in error_of(one, capsys)
 

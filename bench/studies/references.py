@@ -1,8 +1,8 @@
 """Count reference poses that their own scans contradict, and what they do to the coverage of the filter's regions.
 
-Errors and coverage are those against reference poses, which are not free of errors. A reference is contradicted where the
-scan is likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates that
-are contradicted by as much, is the control.
+Errors and coverage are those against reference poses, which are not free of errors. A reference is contradicted where the scan is
+likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates that are
+contradicted by as much, is the control.
 
     python bench/studies/references.py --seeds 3 --out bench/results/references_cpu.json
 """
@@ -31,7 +31,8 @@ def gains(recording, model, track):
     found = np.full(len(recording.events), np.nan)
     for k, event in enumerate(recording.events):
         if np.isfinite(event.truth).all():
-            there, here = model.log_likelihood(np.array([event.truth, event.truth + track.differences[k]]), event.ranges)
+            poses = np.array([event.truth, event.truth + track.differences[k]])
+            there, here = model.log_likelihood(poses, event.ranges)
             found[k] = here - there
     return found
 
@@ -60,14 +61,14 @@ def study(name, backend, particles, seeds):
 
 def _line(r):
     both = " | ".join(", ".join(f"{value:.2f}" for value in r["coverage"][which]) for which in ("all", "others"))
-    return (
-        f"| {r['log']} | {r['references']} | {r['contradicted']} | {r['farthest_cm']:.0f} cm, {r['farthest_deg']:.1f} deg | "
-        f"{r['estimates_contradicted']} | {both} |"
-    )
+    farthest = f"{r['farthest_cm']:.0f} cm, {r['farthest_deg']:.1f} deg"
+    counts = f"{r['references']} | {r['contradicted']} | {farthest} | {r['estimates_contradicted']}"
+    return f"| {r['log']} | {counts} | {both} |"
 
 
 _HEAD = (
-    "| log | references | contradicted | farthest | estimates contradicted | coverage 50, 80, 95 %, all | without them |",
+    "| log | references | contradicted | farthest | estimates contradicted | "
+    "coverage 50, 80, 95 %, all | without them |",
     "| --- | --- | --- | --- | --- | --- | --- |",
 )
 

@@ -1,8 +1,8 @@
 """Count reference poses that their own scans contradict, and what they do to the coverage of the filter's regions.
 
-Errors and coverage are those against reference poses, which are not free of errors. A reference is contradicted where the scan is
-likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates that are
-contradicted by as much, is the control.
+Errors and coverage are those against reference poses, which are not free of errors. A reference is contradicted where
+the scan is likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates
+that are contradicted by as much, is the control.
 
     python bench/studies/references.py --seeds 3 --out bench/results/references_cpu.json
 """

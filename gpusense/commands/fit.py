@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
+from gpusense.commands.arguments import add_backend, add_json, add_reference, add_seed, positive_number, whole_number
 from gpusense.commands.fit_so_far import SoFar
 from gpusense.commands.output import print_json, print_table
 from gpusense.evaluation.machine import machine, machine_line
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from gpusense.learning.beam.incidence import IncidenceFit
     from gpusense.learning.beam.result import BeamFit
     from gpusense.localization.motion_fit import MotionFit
+    from gpusense.world.parameters import BeamParameters
 
 NAME = "fit"
 HELP = "Fit the beam model's parameters to a recorded log in a map, or to pairs of readings and expected ranges."
@@ -59,6 +61,8 @@ UNFINISHED = 1
 # Pictures that --out writes.
 _PICTURES = ("readings.png", "density.png", "trace.png", "surface.png")
 _PAIRS_BLOCK = 100
+# A fit with less weight of correct ranges or a larger deviation of them [m] is doubtful.
+_LEAST_HIT, _MOST_DEVIATION = 0.3, 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +70,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
-    add("--log", type=Path, metavar="FILE", help="a log (CARMEN) with corrected poses, plain or .gz; needs --map")
+    add("--log", type=Path, metavar="FILE", help="a log with corrected poses, or any with --reference; needs --map")
+    add_reference(parser)
     add("--pairs", type=Path, metavar="CSV",
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip
@@ -129,12 +134,13 @@ def run(args: argparse.Namespace) -> int:
         print_json(_document(args, result, files))
     else:
         _print(result, files)
+    _doubt(result.fit.parameters)
     return 0 if result.fit.converged else UNFINISHED
 
 
 def _check_sources(args: argparse.Namespace) -> None:
     if args.pairs is not None:
-        for name in ("map", "log"):
+        for name in ("map", "log", "reference"):
             if getattr(args, name) is not None:
                 raise ValueError(f"--{name}: must be left out with --pairs, got {getattr(args, name)}")
         if args.fit_motion:
@@ -163,7 +169,7 @@ def _read(args: argparse.Namespace) -> RangeData:
             raise ValueError(f"--incidence: must have pairs with a third column, the angle, got two in {args.pairs}")
         return data
     grid = read_map(args.map)
-    scans = logged_scans(args.log, range_max=args.range_max, **chosen)
+    scans = logged_scans(args.log, range_max=args.range_max, reference=args.reference, **chosen)
     top = scans[0][1].scanner.range_max
     if range_min >= top:
         raise ValueError(f"--range-min: must be < the log's range_max = {top}, got {range_min}")
@@ -203,12 +209,15 @@ def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
     """Learn the noise of the odometry from the chosen scans; None where it is not asked for."""
-    from gpusense.evaluation.steps import read_steps, references_to_learn_from
+    from gpusense.evaluation.steps import read_steps, references_to_learn_from, with_references
+    from gpusense.evaluation.trajectory_files import read_tum
     from gpusense.localization.motion_fit import fit_odometry_motion
 
     if not args.fit_motion:
         return None
     steps = read_steps(args.log, every=args.every, offset=args.offset, limit=args.limit)
+    if args.reference is not None:
+        steps = with_references(steps, *read_tum(args.reference))
     return fit_odometry_motion(*references_to_learn_from(steps))
 
 
@@ -228,6 +237,16 @@ def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> di
         "files": files,
         "machine": machine(),
     }
+
+
+def _doubt(parameters: BeamParameters) -> None:
+    """Say on standard error where readings are not near the expected ranges."""
+    z_hit, sigma_hit = parameters.z_hit, parameters.sigma_hit
+    if z_hit < _LEAST_HIT or sigma_hit > _MOST_DEVIATION:
+        sys.stderr.write(
+            f"gpusense: few readings are near their expected range (z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m): "
+            "the poses or the map may be wrong\n"
+        )
 
 
 def _print(result: Result, files: list[Path]) -> None:

@@ -11,6 +11,7 @@ from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
+    add_reference,
     number,
     output_path,
     positive_number,
@@ -46,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.epilog = _EPILOG
     add = parser.add_argument
-    add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses, plain or .gz")
+    add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses; any with --reference")
+    add_reference(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
     add("--resolution", type=positive_number, default=0.05, metavar="M", help="side of a cell [m] (default: 0.05)")
     add("--range-limit", type=positive_number, metavar="M",
@@ -69,7 +71,10 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.mapping.build import MapBuilder
     from gpusense.world.map_files import write_map
 
-    scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
+    scans = logged_scans(
+        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
+        reference=args.reference,
+    )  # fmt: skip
     builder = MapBuilder(
         [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans], scans[0][1].scanner,
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,

@@ -12,6 +12,7 @@ from gpusense._util.progress import is_terminal, progress
 from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
+    add_reference,
     add_seed,
     add_temperature,
     not_negative_number,
@@ -77,7 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add("--log", required=True, type=Path, metavar="FILE", help="a log (CARMEN) with corrected poses, plain or .gz")
+    add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses; any with --reference")
+    add_reference(parser)
     add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
     add("--backend", action="append", metavar="DEVICE",
         help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip
@@ -115,7 +117,10 @@ def run(args: argparse.Namespace) -> int:
 
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
-    scans = logged_scans(args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit)
+    scans = logged_scans(
+        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
+        reference=args.reference,
+    )  # fmt: skip
     models = make_models(args, grid, scans)
     scoring, fitness = LogScoring(models, sampler), FitnessOfLog(models[0], seed=args.seed)
     try:

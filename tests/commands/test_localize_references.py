@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from support.command_line import error_of
 
 import gpusense as gs
@@ -37,6 +38,12 @@ def place(tmp_path_factory):
     (folder / "raw.log").write_text("\n".join(lines))
     write_tum(folder / "true.tum", np.arange(0, COUNT, 2), poses[:COUNT:2])
     return folder
+
+
+def centres(grid):
+    """Return the centres of the occupied cells."""
+    rows, cols = np.nonzero(grid.occupied)
+    return (np.column_stack([cols, rows]) + 0.5) * grid.resolution + np.array(grid.origin[:2])
 
 
 def call(place, *more):
@@ -229,3 +236,37 @@ def test_scans_without_beams_leave_the_verdict_to_others(place, capsys, blind, v
     cli.main(arguments)
     text = capsys.readouterr().out
     assert verdict in text and "nan" not in text
+
+
+def test_other_commands_take_the_poses_of_a_trajectory(place, capsys, tmp_path):
+    log, common = ["--log", str(place / "raw.log"), "--range-max", "20"], ["--backend", "numpy", "--json"]
+    reference = ["--reference", str(place / "true.tum")]
+    room = ["--map", str(place / "map.yaml")]
+
+    def document(*arguments):
+        assert cli.main([*arguments, *log, *common]) in (0, 1)
+        out, err = capsys.readouterr()
+        return json.loads(out), err
+
+    score = ["score", *room, "--model", "field", "--particles", "500", "--beams", "60"]
+    good, said = document(*score, *reference)
+    (found,) = good["backends"]
+    assert [row["index"] for row in found["scans"]] == list(range(0, COUNT, 2)) and not said
+    bad, _ = document(*score)
+    assert np.mean([row["rank"] for row in bad["backends"][0]["scans"]]) > 10 * np.mean(
+        [r["rank"] for r in found["scans"]]
+    )
+
+    right, said = document("fit", *room, *reference, "--fit-motion")
+    assert right["fit"]["parameters"]["z_hit"] > 0.95 and right["motion"]["references"] == COUNT // 2
+    assert not said
+    wrong, said = document("fit", *room)
+    assert wrong["fit"]["parameters"]["sigma_hit"] > 0.5 and "few readings are near their expected range" in said
+    assert "--reference: must be left out with --pairs" in error_of(
+        ["fit", "--pairs", "some.csv", "--range-max", "20", *reference], capsys
+    )
+
+    built, _ = document("map", "--out", str(tmp_path / "built.yaml"), "--resolution", "0.1", *reference)
+    assert built["scans"] == COUNT // 2
+    ends, walls = (centres(gs.read_map(path)) for path in (tmp_path / "built.yaml", place / "map.yaml"))
+    assert len(ends) > 50 and np.quantile(cKDTree(walls).query(ends)[0], 0.9) < 0.15

@@ -25,15 +25,6 @@ def add_backend(parser: argparse.ArgumentParser, *, default: str = "auto") -> No
     parser.add_argument("--backend", default=default, metavar="DEVICE", help=f"{BACKEND_HELP} (default: %(default)s)")
 
 
-def add_reference(parser: argparse.ArgumentParser) -> None:
-    """Add ``--reference``, the poses of the scans."""
-    parser.add_argument(
-        "--reference", type=Path, metavar="FILE",
-        help="a TUM trajectory with the poses of the scans, by their times; other scans are left out (default: the "
-        "logged poses)",
-    )  # fmt: skip
-
-
 def add_temperature(parser: argparse.ArgumentParser, automatic: str) -> None:
     """Add ``--temperature``: a number, or ``DEFAULTS.temperature``, which ``automatic`` explains."""
     parser.add_argument(

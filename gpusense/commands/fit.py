@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_reference, add_seed, positive_number, whole_number
+from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
 from gpusense.commands.fit_so_far import SoFar
 from gpusense.commands.output import print_json, print_table
+from gpusense.commands.scans import add_poses, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
     add("--log", type=Path, metavar="FILE", help="a log with corrected poses, or any with --reference; needs --map")
-    add_reference(parser)
+    add_poses(parser)
     add("--pairs", type=Path, metavar="CSV",
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip
@@ -123,9 +124,9 @@ class Result:
 def run(args: argparse.Namespace) -> int:
     """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
-    data, so_far = _read(args), SoFar()
+    motion, data, so_far = _motion(args), _read(args), SoFar()
     try:
-        result = _fit(args, data, so_far)
+        result = _fit(args, data, motion, so_far)
     except KeyboardInterrupt:
         so_far.print(json=args.json)
         raise
@@ -134,13 +135,13 @@ def run(args: argparse.Namespace) -> int:
         print_json(_document(args, result, files))
     else:
         _print(result, files)
-    _doubt(result.fit.parameters)
+    _doubt(result.fit.parameters, "the poses or the map" if args.pairs is None else "the expected ranges")
     return 0 if result.fit.converged else UNFINISHED
 
 
 def _check_sources(args: argparse.Namespace) -> None:
     if args.pairs is not None:
-        for name in ("map", "log", "reference"):
+        for name in ("map", "log", "reference", "topic"):
             if getattr(args, name) is not None:
                 raise ValueError(f"--{name}: must be left out with --pairs, got {getattr(args, name)}")
         if args.fit_motion:
@@ -156,7 +157,6 @@ def _check_sources(args: argparse.Namespace) -> None:
 
 def _read(args: argparse.Namespace) -> RangeData:
     from gpusense.evaluation import range_data
-    from gpusense.evaluation.scoring import logged_scans
     from gpusense.world.map_files import read_map
 
     chosen = {"every": args.every, "offset": args.offset, "limit": args.limit}
@@ -169,7 +169,7 @@ def _read(args: argparse.Namespace) -> RangeData:
             raise ValueError(f"--incidence: must have pairs with a third column, the angle, got two in {args.pairs}")
         return data
     grid = read_map(args.map)
-    scans = logged_scans(args.log, range_max=args.range_max, reference=args.reference, **chosen)
+    scans = read_scans(args)
     top = scans[0][1].scanner.range_max
     if range_min >= top:
         raise ValueError(f"--range-min: must be < the log's range_max = {top}, got {range_min}")
@@ -180,7 +180,7 @@ def _read(args: argparse.Namespace) -> RangeData:
         )  # fmt: skip
 
 
-def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
+def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, so_far: SoFar) -> Result:
     from gpusense.evaluation.held_out import compare_held_out
     from gpusense.learning.beam.fit import fit_beam_parameters
     from gpusense.learning.beam.incidence import fit_incidence_parameters
@@ -204,7 +204,7 @@ def _fit(args: argparse.Namespace, data: RangeData, so_far: SoFar) -> Result:
     compared = []
     if rest is not None:
         compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, incidence=incidence)
-    return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges), _motion(args))
+    return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges), motion)
 
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
@@ -215,7 +215,8 @@ def _motion(args: argparse.Namespace) -> MotionFit | None:
 
     if not args.fit_motion:
         return None
-    steps = read_steps(args.log, every=args.every, offset=args.offset, limit=args.limit)
+    sensors = () if args.topic is None else (args.topic,)
+    steps = read_steps(args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors)
     if args.reference is not None:
         steps = with_references(steps, *read_tum(args.reference))
     return fit_odometry_motion(*references_to_learn_from(steps))
@@ -239,14 +240,12 @@ def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> di
     }
 
 
-def _doubt(parameters: BeamParameters) -> None:
-    """Say on standard error where readings are not near the expected ranges."""
+def _doubt(parameters: BeamParameters, what: str) -> None:
+    """Say on standard error where readings are not near their expected ranges, and what may be wrong."""
     z_hit, sigma_hit = parameters.z_hit, parameters.sigma_hit
     if z_hit < _LEAST_HIT or sigma_hit > _MOST_DEVIATION:
-        sys.stderr.write(
-            f"gpusense: few readings are near their expected range (z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m): "
-            "the poses or the map may be wrong\n"
-        )
+        found = f"z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m"
+        sys.stderr.write(f"gpusense: readings are not near their expected ranges ({found}): {what} may be wrong\n")
 
 
 def _print(result: Result, files: list[Path]) -> None:

@@ -158,8 +158,8 @@ def _steps(args: argparse.Namespace) -> list[Step]:
             sensors=args.sensors,
         )  # fmt: skip
     except ValueError as error:
-        # The option for a topic has another name.
-        rest = str(error).removeprefix("topic: ")
+        # The option has another name than the arguments.
+        rest = str(error).removeprefix("topic: ").removeprefix("sensors: ")
         raise (error if rest == str(error) else ValueError(f"--sensors: {rest}")) from None
     if args.reference is None:
         return steps

@@ -41,7 +41,8 @@ def report(
 
     result = summary(track)
     if args.tum is not None:
-        write_tum(args.tum, _times_of(track), track.poses)
+        times, indices = _times_of(track)
+        write_tum(args.tum, times, track.poses, indices=indices)
     if args.plot is not None:
         _draw(args.plot, pf, track)
     if recording is not None:
@@ -60,14 +61,14 @@ def report(
     return result
 
 
-def _times_of(track: Track) -> list[float]:
-    """Return the times of the scans [s]; their indices where times do not increase, as readers of files demand."""
+def _times_of(track: Track) -> tuple[list[float], bool]:
+    """Return the times of the scans [s]; where they do not increase, as readers of files demand, indices and True."""
     times = [step.scan.time for step in track.steps]
     if all(one < two for one, two in itertools.pairwise(times)):
-        return times
+        return times, False
     rule = "the times of the log do not increase: the trajectory has the indices of the scans in their place"
     print(f"gpusense: --tum: {rule}", file=sys.stderr)
-    return [float(i) for i in range(len(times))]
+    return [float(i) for i in range(len(times))], True
 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:

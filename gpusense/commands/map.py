@@ -11,13 +11,13 @@ from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
-    add_reference,
     number,
     output_path,
     positive_number,
     whole_number,
 )
 from gpusense.commands.output import print_json
+from gpusense.commands.scans import add_poses, read_scans
 from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses; any with --reference")
-    add_reference(parser)
+    add_poses(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
     add("--resolution", type=positive_number, default=0.05, metavar="M", help="side of a cell [m] (default: 0.05)")
     add("--range-limit", type=positive_number, metavar="M",
@@ -67,14 +67,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build and write the map, after Ctrl-C that of the scans so far."""
-    from gpusense.evaluation.scoring import logged_scans
     from gpusense.mapping.build import MapBuilder
     from gpusense.world.map_files import write_map
 
-    scans = logged_scans(
-        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
-        reference=args.reference,
-    )  # fmt: skip
+    scans = read_scans(args)
     builder = MapBuilder(
         [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans], scans[0][1].scanner,
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,

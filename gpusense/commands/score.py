@@ -12,7 +12,6 @@ from gpusense._util.progress import is_terminal, progress
 from gpusense.commands.arguments import (
     BACKEND_HELP,
     add_json,
-    add_reference,
     add_seed,
     add_temperature,
     not_negative_number,
@@ -22,6 +21,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import TableStream
+from gpusense.commands.scans import add_poses, read_scans
 from gpusense.commands.score_report import number_text, print_report
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses; any with --reference")
-    add_reference(parser)
+    add_poses(parser)
     add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
     add("--backend", action="append", metavar="DEVICE",
         help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip
@@ -112,15 +112,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Score the scans and print the results; after Ctrl-C those so far."""
     from gpusense.evaluation.fitness import FitnessOfLog
-    from gpusense.evaluation.scoring import LogScoring, ParticleSampler, logged_scans
+    from gpusense.evaluation.scoring import LogScoring, ParticleSampler
     from gpusense.world.map_files import read_map
 
     sampler = ParticleSampler(args.particles, args.sigma_position, args.sigma_heading, args.seed)
     grid = read_map(args.map)
-    scans = logged_scans(
-        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
-        reference=args.reference,
-    )  # fmt: skip
+    scans = read_scans(args)
     models = make_models(args, grid, scans)
     scoring, fitness = LogScoring(models, sampler), FitnessOfLog(models[0], seed=args.seed)
     try:

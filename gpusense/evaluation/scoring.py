@@ -12,8 +12,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -22,11 +21,9 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
 from gpusense.evaluation.agreement import Agreement, Comparison, Model
-from gpusense.evaluation.steps import read_steps, with_references
-from gpusense.evaluation.trajectory_files import read_tum
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
-from gpusense.logs import Pose, Scan
+from gpusense.logs import Pose, Scan, read_log
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
@@ -186,7 +183,21 @@ def logged_scans(
     every: int = 1,
     offset: int = 0,
     limit: int | None = None,
-    reference: Path | None = None,
+) -> list[tuple[int, Scan]]:
+    """Read scans of a log with poses, as :func:`chosen_scans` reads them and :func:`check_scans` checks them."""
+    chosen = chosen_scans(path, range_max=range_max, every=every, offset=offset, limit=limit)
+    check_scans(chosen, path)
+    return chosen
+
+
+def chosen_scans(
+    path: str | os.PathLike[str],
+    *,
+    range_max: float | None = None,
+    every: int = 1,
+    offset: int = 0,
+    limit: int | None = None,
+    topic: str | None = None,
 ) -> list[tuple[int, Scan]]:
     """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., ``limit`` of them at most.
 
@@ -196,21 +207,32 @@ def logged_scans(
         every: Stride of the scans.
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
-        reference: A TUM trajectory whose poses the scans get, by their times; chosen scans without one are left out.
-            None for the logged poses.
+        topic: Topic of the scans in a bag; None for its only laser.
 
     Raises:
-        ValueError: a file breaks its format, no scan is chosen, or a chosen scan has no pose or another scanner.
-        FileNotFoundError: a file is missing.
+        ValueError: the log breaks its format, or no scan is chosen.
+        FileNotFoundError: the log is missing.
     """
-    steps = read_steps(path, range_max=range_max, every=every, offset=offset, limit=limit)
-    if reference is not None:
-        steps = [step for step in with_references(steps, *read_tum(reference)) if step.reference is not None]
-        return [(step.index, replace(step.scan, pose=step.reference)) for step in steps]
-    for step in steps:
-        if step.reference is None:
-            raise ValueError(f"log: every scan must have a pose, got none at scan {step.index} of {path}")
-    return [(step.index, step.scan) for step in steps]
+    last = None if limit is None else offset + every * limit
+    scans = read_log(path, range_max=range_max, topic=topic)
+    chosen = list(itertools.islice(enumerate(scans), offset, last, every))
+    if not chosen:
+        raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")
+    return chosen
+
+
+def check_scans(scans: Sequence[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
+    """Check that numbered scans of a log have poses and one scanner.
+
+    Raises:
+        ValueError: a scan has no pose, or another scanner.
+    """
+    for index, scan in scans:
+        if scan.pose is None:
+            rule = "every scan must have a pose, of its own or by --reference"
+            raise ValueError(f"log: {rule}, got none at scan {index} of {path}")
+        if scan.scanner != scans[0][1].scanner:
+            raise ValueError(f"log: every scan must come from the same scanner, got another at scan {index} of {path}")
 
 
 class LogScoring:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.evaluation.trajectory_files import poses_at
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
 from gpusense.logs.several import read_lasers
@@ -17,8 +18,7 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 # Logged poses are those of the odometry where no step of one differs from that of the other by more [m, rad].
 _SAME = 1e-4
-# A reference pose lies between two of a trajectory that are no further apart [s], or is one at the same time.
-_FARTHEST, _SAME_TIME = 0.5, 1e-3
+_LEAST_KNOWN = 3
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,11 @@ def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Po
     """Return odometry and reference poses of all steps, to learn the noise of the odometry; NaN without a reference.
 
     Raises:
-        ValueError: there is none, or the references are the odometry's own poses.
+        ValueError: there are fewer than three, or they are the odometry's own poses.
     """
-    if all(step.reference is None for step in steps):
-        raise ValueError("--fit-motion: must have poses of the robot to learn from, got a log without")
+    known = sum(step.reference is not None for step in steps)
+    if known < _LEAST_KNOWN:
+        raise ValueError(f"--fit-motion: must have poses of the robot at {_LEAST_KNOWN} scans at least, got {known}")
     if repeats_odometry(steps):
         raise ValueError("--fit-motion: must have poses that are not the odometry's own, got a log of these")
     none = (np.nan, np.nan, np.nan)
@@ -124,8 +125,6 @@ def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Po
 def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list[Step]:
     """Return steps whose references are those of a trajectory at the times of the scans.
 
-    A pose between two of the trajectory at most half a second apart is interpolated.
-
     Args:
         steps: Steps.
         times: (T,) increasing times of the trajectory [s].
@@ -134,26 +133,5 @@ def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list
     Raises:
         ValueError: no scan has a time of the trajectory.
     """
-    found = [_pose_at(step.scan.time, times, poses) for step in steps]
-    if not any(found):
-        span = f"{times[0]:.3f} to {times[-1]:.3f} s"
-        first, last = steps[0].scan.time, steps[-1].scan.time
-        raise ValueError(f"--reference: must have poses at times of the scans, {first:.3f} to {last:.3f} s, got {span}")
+    found = poses_at([step.scan.time for step in steps], times, poses)
     return [replace(step, reference=pose) for step, pose in zip(steps, found, strict=True)]
-
-
-def _pose_at(time: float, times: Floats, poses: Floats) -> Pose | None:
-    """Return the pose of a trajectory at a time; None where none is near."""
-    after = int(np.searchsorted(times, time))
-    near = [k for k in (after - 1, after) if 0 <= k < len(times)]
-    nearest = min(near, key=lambda k: abs(times[k] - time))
-    if abs(times[nearest] - time) <= _SAME_TIME:
-        x, y, theta = (float(value) for value in poses[nearest])
-        return x, y, theta
-    if len(near) < 2 or times[after] - times[after - 1] > _FARTHEST:
-        return None
-    share = (time - times[after - 1]) / (times[after] - times[after - 1])
-    change = poses[after] - poses[after - 1]
-    change[2] = wrap_angle(change[2])
-    x, y, theta = (float(value) for value in poses[after - 1] + share * change)
-    return x, y, theta

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -12,23 +12,32 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.files import write_whole
+from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.logs import Pose
 
 Floats = NDArray[np.float64]
+# A pose lies between two of a trajectory that are no further apart [s], or is one at the same time.
+_FARTHEST, _SAME_TIME = 0.5, 1e-3
+# Comment of a trajectory with indices of scans in place of times.
+_INDICES = "# indices of scans, not times"
 
 
-def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats]) -> None:
+def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, indices: bool = False) -> None:
     """Write poses as a TUM trajectory.
 
     Args:
         path: The file.
         times: Times [s].
         poses: Poses (x, y [m], theta), as many.
+        indices: Whether the times are indices of scans; a comment says so then.
 
     Raises:
         OSError, ValueError: the file cannot be written.
     """
 
     def write(stream: BinaryIO) -> None:
+        if indices:
+            stream.write(f"{_INDICES}\n".encode())
         for time, (x, y, theta) in zip(times, poses, strict=True):
             z, w = math.sin(theta / 2), math.cos(theta / 2)
             stream.write(f"{time:.6f} {x:.6f} {y:.6f} 0 0 0 {z:.9f} {w:.9f}\n".encode())
@@ -42,8 +51,10 @@ def _numbers(path: Path) -> Iterator[list[float]]:
     Raises:
         ValueError: a line has not eight finite numbers.
     """
-    with path.open(encoding="utf-8") as file:
+    with path.open(encoding="utf-8", errors="backslashreplace") as file:
         for line, text in enumerate(file, 1):
+            if text.strip() == _INDICES:
+                raise ValueError(f"{path}: must have times of scans, got their indices")
             words = text.split("#")[0].split()
             try:
                 numbers = [float(word) for word in words]
@@ -68,8 +79,46 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
     if not (np.diff(rows[:, 0]) > 0).all():
         line = int(np.argmin(np.diff(rows[:, 0]) > 0)) + 1
         raise ValueError(f"{path}: must have increasing times, got {rows[line, 0]} after {rows[line - 1, 0]}")
-    x, y, z, w = rows[:, 4:].T
-    if not (np.hypot(np.hypot(x, y), np.hypot(z, w)) > 0).all():
+    largest = np.abs(rows[:, 4:]).max(axis=1)
+    if not (largest > 0).all():
         raise ValueError(f"{path}: must have quaternions other than 0, got one of 0")
+    x, y, z, w = (rows[:, 4:] / largest[:, None]).T
     theta = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
     return rows[:, 0], np.column_stack([rows[:, 1], rows[:, 2], theta])
+
+
+def poses_at(scans: Sequence[float], times: Floats, poses: Floats) -> list[Pose | None]:
+    """Return the poses of a trajectory at the times of scans; None where none is near.
+
+    A pose between two of the trajectory at most half a second apart is interpolated.
+
+    Args:
+        scans: Times of the scans [s], at least one.
+        times: (T,) increasing times of the trajectory [s].
+        poses: (T, 3) its poses.
+
+    Raises:
+        ValueError: no scan has a time of the trajectory.
+    """
+    found = [_pose_at(time, times, poses) for time in scans]
+    if not any(found):
+        span, wanted = f"{times[0]:.3f} to {times[-1]:.3f} s", f"{scans[0]:.3f} to {scans[-1]:.3f} s"
+        raise ValueError(f"--reference: must have poses at times of the scans, {wanted}, got {span}")
+    return found
+
+
+def _pose_at(time: float, times: Floats, poses: Floats) -> Pose | None:
+    """Return the pose of a trajectory at a time; None where none is near."""
+    after = int(np.searchsorted(times, time))
+    near = [k for k in (after - 1, after) if 0 <= k < len(times)]
+    nearest = min(near, key=lambda k: abs(times[k] - time))
+    if abs(times[nearest] - time) <= _SAME_TIME:
+        x, y, theta = (float(value) for value in poses[nearest])
+        return x, y, theta
+    if len(near) < 2 or times[after] - times[after - 1] > _FARTHEST:
+        return None
+    share = (time - times[after - 1]) / (times[after] - times[after - 1])
+    change = poses[after] - poses[after - 1]
+    change[2] = wrap_angle(change[2])
+    x, y, theta = (float(value) for value in poses[after - 1] + share * change)
+    return x, y, theta

@@ -1,8 +1,8 @@
 """Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
 
 A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group. GPUs take smaller blocks of weights, whose sums are exact. Sums of
-poses have the same blocks everywhere, of which work-items of GPUs take single lanes.
+number of particles. Small clouds have one group. GPUs take smaller blocks of weights, and more of them, since sums of
+weights are exact. Sums of poses have the same blocks everywhere, of which work-items of GPUs take single lanes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.interface.launches import Program, launch
 
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
-# Particles of a vector of float64, the fewest of a block, and the most blocks that one work-item adds up.
+# Particles of a vector of float64, the fewest of a block, and the most blocks of a cloud with one group.
 _VECTOR, _LEAST, MOST_BLOCKS = 8, 8, 128
 
 
@@ -130,7 +130,7 @@ class Sums:
         blocks, each = -(-count // block), ESTIMATE_LANES // lanes
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
                               sums=self.rows, particles=count, block=block, lanes=lanes, again=again)  # fmt: skip
-        # The last kernel adds up groups, too, which is slow on GPUs.
+        # finish_estimate adds up the groups; on GPUs one more join is faster.
         fans = (each, *fans_of(blocks)) if each > 1 else fans_of(blocks)[:-1]
         source, target, groups = self.rows, self._joined, blocks * each
         for fan in fans:

@@ -35,7 +35,8 @@ class Scan:
     odometry: Pose
     """The robot's pose in the odometry frame [m, m, rad]."""
     pose: Pose | None
-    """The laser's corrected pose in the world [m, m, rad], or None if the log has none."""
+    """The robot's corrected pose in the world [m, m, rad]; the laser's in a CARMEN log, which has no mount. None if the
+    log has none."""
 
     def __repr__(self) -> str:
         return f"Scan(time={self.time}, {len(self.ranges)} readings, odometry={self.odometry}, pose={self.pose})"

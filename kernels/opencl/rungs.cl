@@ -28,7 +28,7 @@
 #define FAST 50
 #define INJECTED 51
 
-// Return 8 numbers from first on, so that a work-item waits once for all of them; from end on, the missing one.
+// Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of them.
 double8 eight_at(global const double *values, const int first, const int end, const double missing) {
     const int count = end - first;
     values += first;

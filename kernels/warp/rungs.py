@@ -30,7 +30,7 @@ eight = wp.types.vector(length=8, dtype=wp.float64)
 number_at = reader(wp.float64)
 
 
-# Return 8 numbers from first on, so that a work-item waits once for all of them; from end on, the missing one.
+# Return 8 numbers from first on, and missing in place of those from end on: a work-item waits once for all of them.
 @wp.func
 def eight_at(values: wp.array(dtype=wp.float64), first: wp.int32, end: wp.int32, missing: wp.float64):
     found = eight(missing)

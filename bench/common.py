@@ -25,7 +25,7 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends.base import Backend, Launcher
 from gpusense.backends.proxy import Proxy
-from gpusense.evaluation.scoring import logged_scans
+from gpusense.evaluation.scoring import chosen_scans, with_poses
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
 from gpusense.interface.launches import Launch
 
@@ -142,7 +142,8 @@ def odd_scans(data: Path, name: str, limit: int | None = None) -> tuple[gs.Occup
     """Read the map of 5 cm that was made of a log's even scans, and its odd scans with their logged poses."""
     folder = data / "carmen_logs"
     grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
-    return grid, logged_scans(folder / f"{name}-corrected.log.gz", every=2, offset=1, limit=limit)
+    log = folder / f"{name}-corrected.log.gz"
+    return grid, with_poses(chosen_scans(log, every=2, offset=1, limit=limit), log)
 
 
 # ---- launches

@@ -4,7 +4,7 @@ Errors and coverage are those against reference poses, which are not free of err
 the scan is likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates
 that are contradicted by as much, is the control.
 
-    python bench/studies/references.py --seeds 3 --particles 2000 --out bench/results/references_cpu.json
+    python bench/studies/references.py --seeds 3 --out bench/results/references_cpu.json
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", default="opencl")
     parser.add_argument("--logs", nargs="+", default=list(LOGS), choices=LOGS)
-    parser.add_argument("--particles", type=int, default=5000)
+    parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
     args = parser.parse_args()

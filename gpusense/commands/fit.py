@@ -124,7 +124,7 @@ class Result:
 def run(args: argparse.Namespace) -> int:
     """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
-    motion, data, so_far = _motion(args), _read(args), SoFar()
+    data, motion, so_far = _read(args), _motion(args), SoFar()
     try:
         result = _fit(args, data, motion, so_far)
     except KeyboardInterrupt:

@@ -29,7 +29,7 @@ def read_scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
         ValueError: a file breaks its format, no scan is chosen, or a chosen scan has no pose or another scanner.
         FileNotFoundError: a file is missing.
     """
-    from gpusense.evaluation.scoring import check_scans, chosen_scans
+    from gpusense.evaluation.scoring import chosen_scans, with_poses
     from gpusense.evaluation.trajectory_files import poses_at, read_tum
 
     trajectory = None if args.reference is None else read_tum(args.reference)
@@ -43,5 +43,4 @@ def read_scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
         ]
         if len(scans) < chosen:
             sys.stderr.write(f"gpusense: --reference: has poses of {len(scans)} of {chosen} chosen scans\n")
-    check_scans(scans, args.log)
-    return scans
+    return with_poses(scans, args.log)

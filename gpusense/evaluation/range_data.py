@@ -92,7 +92,7 @@ def data_of_log(
 
     Args:
         grid: The map.
-        scans: Numbered scans of one scanner, each with a pose, as ``scoring.logged_scans`` returns them.
+        scans: Numbered scans of one scanner, each with a pose, as ``scoring.with_poses`` returns them.
         backend: Device that casts the rays.
         range_min: Readings below this are missing [m].
         block: Scans per block.

@@ -176,20 +176,6 @@ def summary(score: BackendScore) -> dict[str, Any]:
     }
 
 
-def logged_scans(
-    path: str | os.PathLike[str],
-    *,
-    range_max: float | None = None,
-    every: int = 1,
-    offset: int = 0,
-    limit: int | None = None,
-) -> list[tuple[int, Scan]]:
-    """Read scans of a log with poses, as :func:`chosen_scans` reads them and :func:`check_scans` checks them."""
-    chosen = chosen_scans(path, range_max=range_max, every=every, offset=offset, limit=limit)
-    check_scans(chosen, path)
-    return chosen
-
-
 def chosen_scans(
     path: str | os.PathLike[str],
     *,
@@ -221,8 +207,8 @@ def chosen_scans(
     return chosen
 
 
-def check_scans(scans: Sequence[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
-    """Check that numbered scans of a log have poses and one scanner.
+def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
+    """Return numbered scans of a log, which must have poses and one scanner.
 
     Raises:
         ValueError: a scan has no pose, or another scanner.
@@ -233,6 +219,7 @@ def check_scans(scans: Sequence[tuple[int, Scan]], path: str | os.PathLike[str])
             raise ValueError(f"log: {rule}, got none at scan {index} of {path}")
         if scan.scanner != scans[0][1].scanner:
             raise ValueError(f"log: every scan must come from the same scanner, got another at scan {index} of {path}")
+    return scans
 
 
 class LogScoring:

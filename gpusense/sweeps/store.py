@@ -84,11 +84,11 @@ class Store:
 
     def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
         """Return the scans of a job that have logged poses; those of the options below a dotted name, if given."""
-        from gpusense.evaluation.scoring import logged_scans
+        from gpusense.evaluation.scoring import chosen_scans, with_poses
 
-        chosen = _chosen(job, group)
+        chosen, path = _chosen(job, group), self.path(job.log)
         key = ("poses", job.log, *chosen.items())
-        return self.keep("logs", key, lambda: logged_scans(self.path(job.log), **chosen))
+        return self.keep("logs", key, lambda: with_poses(chosen_scans(path, **chosen), path))
 
     def keep(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return an object of a kind; make it where it is not kept."""

@@ -25,6 +25,9 @@ RESOURCE = "gpusense"
 _QUIET = "DASK_LOGGING__DISTRIBUTED"
 # Seconds for which the number of workers is believed.
 _FRESH = 2.0
+# Seconds to wait for a finished job's result before asking whether it still exists, and how often.
+_FETCH = 2.0
+_FETCHES = 15
 _ABSENT = "dask: must be installed for this executor: pip install 'gpusense[sweep]'"
 
 
@@ -160,11 +163,33 @@ def _settle(remote: Any, future: Future[Any]) -> None:
     try:
         if remote.cancelled():
             raise CancelledError("the scheduler has lost the job")
-        future.set_result(remote.result(timeout=30))
+        future.set_result(_fetched(remote))
     except distributed.scheduler.KilledWorker as error:
         future.set_exception(WorkerDied(f"workers of the job ended: {error.last_worker}"))
     except BaseException as error:
         future.set_exception(error)
+
+
+def _fetched(remote: Any) -> Any:
+    """Return the result of a finished Dask future.
+
+    The result waits in its worker's memory. Where the worker ends before it is fetched, Dask runs the job again, which
+    may wait behind others for hours, and every other result behind this one.
+
+    Raises:
+        WorkerDied: the result has gone with its worker.
+    """
+    for _ in range(_FETCHES):
+        try:
+            return remote.result(timeout=_FETCH)
+        except TimeoutError:
+            if remote.status == "error":
+                # The job's own.
+                raise
+            if remote.status != "finished":
+                break
+    remote.cancel()
+    raise WorkerDied("the worker ended before its result was fetched")
 
 
 def _plugin(contents: dict[str, Any]) -> Any:

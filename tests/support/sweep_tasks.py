@@ -37,3 +37,13 @@ def slow(job, store):
         file.write(f"{job.seed}\n")
     time.sleep(job.option("seconds"))
     return {"value": job.seed * 0.1}
+
+
+def slow_again(folder):
+    """Write down the process, at once the first time, and after eight seconds when repeated."""
+    runs = Path(folder) / "runs"
+    repeated = runs.exists()
+    with open(runs, "a") as file:
+        file.write(f"{os.getpid()}\n")
+    if repeated:
+        time.sleep(8)

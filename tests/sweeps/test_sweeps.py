@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,13 +16,14 @@ import numpy as np
 import pytest
 from support.room_log import write_room
 from support.split_scene import field, states
+from support.sweep_tasks import slow_again
 
 import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.tracking import Track, follow, start, summary
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
+from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost, WorkerDied
 from gpusense.sweeps.plan import jobs_of
 from gpusense.sweeps.sending import contents_of
 from gpusense.sweeps.tasks import is_timing
@@ -144,6 +147,21 @@ def test_a_killed_worker_loses_nothing(tmp_path, name, request):
     assert (tmp_path / "killed").exists() and ended.done == 6, table["error"]
     assert table["seed"] == list(range(6))
     assert table["value"] == [(seed + 1) / 3 for seed in range(6)]
+
+
+@dask
+def test_a_result_that_ends_with_its_worker_is_not_waited_for(tmp_path, cluster):
+    # Dask fetches results one after another: the first one holds the second in its worker until that has ended.
+    ended = threading.Event()
+    cluster._client.submit(abs, -1).add_done_callback(lambda _: ended.wait(20))
+    result = cluster.submit(slow_again, str(tmp_path))
+    runs = tmp_path / "runs"
+    while not runs.exists() or any(one.status != "finished" for one in cluster._client.futures.values()):
+        time.sleep(0.02)
+    os.kill(int(runs.read_text().split()[0]), signal.SIGKILL)
+    ended.set()
+    with pytest.raises(WorkerDied, match="before its result was fetched"):
+        result.result(timeout=30)
 
 
 def test_a_job_that_kills_its_workers_fails_alone(tmp_path, processes):

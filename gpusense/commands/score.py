@@ -22,7 +22,7 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.output import TableStream
 from gpusense.commands.scans import add_poses, read_scans
-from gpusense.commands.score_report import number_text, print_report
+from gpusense.commands.score_report import number_text, pose_name, print_report
 
 if TYPE_CHECKING:
     from gpusense.evaluation.agreement import Model
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     (scores, agreements), fit = scoring.results(), fitness.result()
     print_report(args, models, scores, agreements, fit, len(scans))
     if args.plot is not None:
-        _draw(args.plot, grid, scores[0])
+        _draw(args.plot, grid, scores[0], pose_name(args))
         if not args.json:
             print(f"drawn: {args.plot}")
     return 0 if fit.fits and all(agreement.same for agreement in agreements) else DIFFERENT
@@ -165,11 +165,11 @@ def _row(backend: str, scan: ScanScore) -> dict[str, str]:
     return dict(zip(_COLUMNS, values, strict=True))
 
 
-def _draw(path: Path, grid: OccupancyGrid, score: BackendScore) -> None:
+def _draw(path: Path, grid: OccupancyGrid, score: BackendScore, pose: str) -> None:
     from gpusense.plots.drawing import save
     from gpusense.plots.scores import scores_figure
 
-    save(scores_figure(grid, score), path)
+    save(scores_figure(grid, score, pose), path)
 
 
 def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> list[Model]:

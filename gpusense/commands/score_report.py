@@ -28,10 +28,18 @@ def print_report(
         more = {"scans_chosen": chosen, "fitness": asdict(fitness) | {"fits": fitness.fits}}
         print_json(_document(args, models, scores, agreements) | more)
         return
-    _print(args, models, scores, agreements)
-    print(f"\nverdict: {_fitness(fitness)}\n\n{machine_line()}")
+    pose = pose_name(args)
+    _print(args, models, scores, pose)
+    for agreement in agreements:
+        print(f"\n{_verdict(agreement, pose)}")
+    print(f"\nverdict: {_fitness(fitness, pose)}\n\n{machine_line()}")
     if len(scores[0].scans) < chosen:
         print(f"\ninterrupted: results of {len(scores[0].scans)} of {chosen} scans")
+
+
+def pose_name(args: argparse.Namespace) -> str:
+    """Return what the report calls the pose of a scan, which is the log's or that of ``--reference``."""
+    return "logged pose" if args.reference is None else "reference pose"
 
 
 def _document(
@@ -51,9 +59,7 @@ def _document(
     }
 
 
-def _print(
-    args: argparse.Namespace, models: list[Model], scores: list[BackendScore], agreements: list[Agreement]
-) -> None:
+def _print(args: argparse.Namespace, models: list[Model], scores: list[BackendScore], pose: str) -> None:
     from gpusense.evaluation.scoring import summary
 
     values = ", ".join(f"{name} {value}" for name, value in models[0].parameters.to_dict().items())
@@ -64,36 +70,34 @@ def _print(
         s = {name: number_text(value) for name, value in summary(score).items()}
         print(
             f"\n{score.device.selection} ({score.device.name}): {s['scans']} scans, {score.particles} particles each\n"
-            f"  rank of the logged pose: median {s['rank_median']}\n"
-            f"  percentile of the logged pose: median {s['percentile_median']}, least {s['percentile_min']}\n"
+            f"  rank of the {pose}: median {s['rank_median']}\n"
+            f"  percentile of the {pose}: median {s['percentile_median']}, least {s['percentile_min']}\n"
             f"  error of the weighted mean: median {s['error_position_median']} m and {s['error_heading_median']} rad, "
             f"90 % below {s['error_position_90']} m and {s['error_heading_90']} rad\n"
             f"  effective sample size: median {s['effective_median']}; scans with every particle at -inf: "
             f"{s['degenerate']}\n  {s['particle_beams_per_second']} particle-beams/s"
         )
-    for agreement in agreements:
-        print(f"\n{_verdict(agreement)}")
 
 
-def _verdict(a: Agreement) -> str:
+def _verdict(a: Agreement, pose: str) -> str:
     if a.same:
         verdict = "the same ranking" if a.same_order == a.scans else "the same ranking to within rounding"
     else:
         verdict = "ANOTHER RANKING"
     return (
         f"{a.left} and {a.right}: {verdict}\n"
-        f"  the logged pose has the same rank in {a.same_rank} of {a.scans} scans, no two particles change places "
+        f"  the {pose} has the same rank in {a.same_rank} of {a.scans} scans, no two particles change places "
         f"in {a.same_order}; least rank correlation {a.spearman:.9f}\n"
         f"  largest difference {a.difference:.3g} nats; particles that change places are at most {a.gap:.3g} nats "
         f"apart; rounding explains {a.allowed:.3g}"
     )
 
 
-def _fitness(fitness: Fitness) -> str:
+def _fitness(fitness: Fitness, pose: str) -> str:
     if fitness.explained is None or fitness.better is None:
         return "none, no scan has a reading to judge by"
     share = (
-        f"the logged poses explain {100 * fitness.explained:.0f} % of the beams of a scan, and are likelier than "
+        f"the {pose}s explain {100 * fitness.explained:.0f} % of the beams of a scan, and are likelier than "
         f"{100 * fitness.better:.0f} % of poses anywhere"
     )
     if fitness.fits:

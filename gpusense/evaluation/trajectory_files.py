@@ -18,6 +18,8 @@ from gpusense.logs import Pose
 Floats = NDArray[np.float64]
 # A pose lies between two of a trajectory that are no further apart [s], or is one at the same time.
 _FARTHEST, _SAME_TIME = 0.5, 1e-3
+# Largest coordinate [m]; those of UTM reach 1e7.
+_LARGEST = 1e9
 # Comment of a trajectory with indices of scans in place of times.
 _INDICES = "# indices of scans, not times"
 
@@ -70,7 +72,8 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
     """Read a TUM trajectory: times (T,) [s] and poses (T, 3), the headings those of the quaternions.
 
     Raises:
-        ValueError: a line has not eight finite numbers, there is none, a quaternion is 0, or times do not increase.
+        ValueError: a line has not eight finite numbers, there is none, a quaternion is 0, a coordinate is over 1e9 m,
+            or times do not increase.
         FileNotFoundError: the file is missing.
     """
     rows = np.array(list(_numbers(path))).reshape(-1, 8)
@@ -79,6 +82,8 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
     if not (np.diff(rows[:, 0]) > 0).all():
         line = int(np.argmin(np.diff(rows[:, 0]) > 0)) + 1
         raise ValueError(f"{path}: must have increasing times, got {rows[line, 0]} after {rows[line - 1, 0]}")
+    if (np.abs(rows[:, 1:3]) > _LARGEST).any():
+        raise ValueError(f"{path}: must have coordinates of at most {_LARGEST:g} m, got {np.abs(rows[:, 1:3]).max():g}")
     largest = np.abs(rows[:, 4:]).max(axis=1)
     if not (largest > 0).all():
         raise ValueError(f"{path}: must have quaternions other than 0, got one of 0")

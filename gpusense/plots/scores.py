@@ -14,27 +14,28 @@ if TYPE_CHECKING:
 LOGGED, MEAN, PERCENTILE = "#8fa3b8", "#e4572e", "#4c78a8"
 
 
-def scores_figure(grid: OccupancyGrid, score: BackendScore) -> Figure:
-    """Draw the map with logged poses and weighted means, and histograms of percentiles and errors.
+def scores_figure(grid: OccupancyGrid, score: BackendScore, pose: str = "logged pose") -> Figure:
+    """Draw the map with the poses of the scans and weighted means, and histograms of percentiles and errors.
 
     Args:
         grid: The map.
         score: Scores of one backend.
+        pose: Name of the pose of a scan.
     """
     figure = new_figure(11.0, 6.0)
     axes = figure.subplot_mosaic([["map", "percentile"], ["map", "error"]], width_ratios=(1.6, 1.0))
     ax, upper, lower = (axes[name] for name in ("map", "percentile", "error"))
     draw_map(ax, grid)
-    logged = [scan.pose for scan in score.scans]
-    ax.plot([p[0] for p in logged], [p[1] for p in logged], ".-", color=LOGGED, lw=0.6, ms=3, label="logged pose")
+    poses = [scan.pose for scan in score.scans]
+    ax.plot([p[0] for p in poses], [p[1] for p in poses], ".-", color=LOGGED, lw=0.6, ms=3, label=pose)
     pairs = [(scan.pose, scan.mean) for scan in score.scans if scan.mean is not None]
-    for pose, mean in pairs:
-        ax.plot([pose[0], mean[0]], [pose[1], mean[1]], color=MEAN, lw=0.8)
+    for true, mean in pairs:
+        ax.plot([true[0], mean[0]], [true[1], mean[1]], color=MEAN, lw=0.8)
     means = [mean for _, mean in pairs]
     ax.plot([p[0] for p in means], [p[1] for p in means], "o", color=MEAN, ms=3, mew=0, label="weighted mean")
     ax.legend(loc="best", fontsize="small")
     upper.hist([scan.percentile for scan in score.scans], bins=30, color=PERCENTILE)
-    upper.set(xlabel="percentile of the logged pose", ylabel="scans")
+    upper.set(xlabel=f"percentile of the {pose}", ylabel="scans")
     errors = [scan.error_position for scan in score.scans if scan.error_position is not None]
     top = max(errors, default=0.0) or 1.0
     low = max(min(errors, default=1e-3), 1e-3, top * 1e-6)

@@ -180,6 +180,7 @@ def test_noise_is_learned_from_all_steps_with_references_at_some(place):
         ("0 1 2 0 0 0 0 nan\n", "line 1 must have eight finite numbers, got '0 1 2 0 0 0 0 nan'"),
         ("0 1 2 0 0 0 0 0\n", "must have quaternions other than 0"),
         ("1 1 2 0 0 0 0 1\n0 1 2 0 0 0 0 1\n", "must have increasing times, got 0.0 after 1.0"),
+        ("0 1 2 0 0 0 0 1\n1 1e300 2 0 0 0 0 1\n", "must have coordinates of at most 1e+09 m, got 1e+300"),
         ("# nothing\n\n", "must have a pose, got none"),
         ("one 1 2 0 0 0 0 1\n", "line 1 must have eight finite numbers"),
         (None, "bad.tum: No such file or directory"),
@@ -253,6 +254,10 @@ def test_other_commands_take_the_poses_of_a_trajectory(place, capsys, tmp_path):
     (found,) = good["backends"]
     assert [row["index"] for row in found["scans"]] == list(range(0, COUNT, 2))
     assert said == f"gpusense: --reference: has poses of {COUNT // 2} of {COUNT} chosen scans\n"
+    for more, name in ((reference, "reference"), ([], "logged")):
+        assert cli.main([*score, *log, "--backend", "numpy", *more]) in (0, 1)
+        text = capsys.readouterr().out
+        assert f"rank of the {name} pose: median" in text and f"the {name} poses explain" in text
     bad, _ = document(*score)
     ranks = [np.mean([row["rank"] for row in one["backends"][0]["scans"]]) for one in (good, bad)]
     assert ranks[1] > 10 * ranks[0]

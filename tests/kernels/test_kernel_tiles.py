@@ -156,6 +156,7 @@ def test_tiles_that_add_up_strands(names: tuple[str, ...], device: Backend) -> N
         assert_near(found, expected.astype(np.float64), 8 * per_beam(expected, np.float32))
 
 
+@pytest.mark.sampled(0.35)
 @pytest.mark.parametrize(("names", "real"), [*zip(TILED, PRECISIONS, strict=True)])
 @pytest.mark.parametrize("name", ["book", "hit", "short", "hardly any rand"])
 def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:

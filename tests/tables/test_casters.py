@@ -45,6 +45,7 @@ CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", KINDS, ids=by_name)
 def test_every_backend_has_the_bits_of_numpy(kind, backend):
     for precision, policies in (("float32", POLICIES), ("float64", POLICIES[::3])):
@@ -53,6 +54,7 @@ def test_every_backend_has_the_bits_of_numpy(kind, backend):
             same_bits(cast(kind, backend, **case), numpy_cast(kind, **case))
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", CROPPED, ids=by_name)
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, monkeypatch):

@@ -14,7 +14,7 @@ from gpusense.evaluation.tolerances import differing
 from gpusense.models.scan import binding
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("case", CASES)
 def test_bound_calls(case, as_gpu, queue, there):
     """They have the bits of ordinary calls with the arrays' and the map's contents at that time; NumPy's arrays too."""

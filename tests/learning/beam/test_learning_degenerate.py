@@ -35,6 +35,7 @@ DATA = {
 }
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize(
     ("name", "method"),
     [

@@ -169,6 +169,7 @@ def test_no_scans_beam_by_beam(backend):
     assert log_p.shape == (0, 4) and parts.shape == (0, 4, 10)
 
 
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize(("count", "nats"), [(1000, 2e-3), (10_000, 1e-2), (100_000, 1e-1)])

@@ -84,7 +84,7 @@ def compare(field: Field, model, poses, ranges, bearings, range_min=0.0) -> None
     np.testing.assert_array_equal(model.log_likelihood(poses, ranges), log_p)
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("place", GRIDS)
@@ -102,7 +102,7 @@ def test_field_in_every_frame(place, precision, interpolation, backend):
     compare(field, model, poses, ranges, BEARINGS, scanner.range_min)
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.35)
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 # The other parameters are host code.
 @on_every_backend(

@@ -177,6 +177,7 @@ def test_turn(kind, on, seed, name, quarters):
     turned_and_mirrored_scores(after, before, PARAMETERS[kind][name], on)
 
 
+@pytest.mark.sampled(0.35)
 @LAWS
 @given(SEEDS, SMOOTH)
 def test_mirror(kind, on, seed, name):

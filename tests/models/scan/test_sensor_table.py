@@ -129,6 +129,7 @@ def test_impossible_scans_are_minus_infinity_and_no_others(backend):
             assert (tabulated.log_likelihood(poses, z)[~impossible.any(axis=1)] == log_p[np.isfinite(log_p)]).all()
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(weights, precision, backend):

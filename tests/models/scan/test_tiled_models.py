@@ -87,7 +87,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("kind", ["all over", "inside"])
 def test_models(kind, ordered, as_gpu, backend):
     grid, scanner, z = world()
@@ -102,6 +102,7 @@ def test_models(kind, ordered, as_gpu, backend):
             )  # fmt: skip
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
 @pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_weights_of_other_programs(model, compat, ordered, as_gpu):
@@ -118,7 +119,7 @@ def test_a_table_of_densities(ordered, as_gpu):
     )
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @on_every_backend(
     method=tuple(CASTERS), kind=("all over", "inside"),
     on_warp=lambda method, kind: (kind, method) in (("all over", "exact"), ("inside", "lookup")),
@@ -135,6 +136,7 @@ def test_casters(method, kind, ordered, as_gpu):
         assert differing(*found) == 0
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 257])
 def test_any_number_of_particles(count, ordered, as_gpu):
     grid, scanner, z = world()
@@ -169,7 +171,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
             assert differing(found, right) == 0
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
     """Many particles, and few enough rays: alone, in scans of other lengths together, and with impossible readings."""

@@ -71,6 +71,7 @@ def cast_tiles(device: Backend, real: type, count: int, rays: int, spread: int, 
     return found[1]["ranges"], expected
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("names", [(), ("ORDERED",)])
 @pytest.mark.parametrize("count", COUNTS)
 def test_tiles_of_ranges(count: int, names: tuple[str, ...], device: Backend) -> None:

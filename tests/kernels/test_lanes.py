@@ -79,6 +79,7 @@ def compiled(device, monkeypatch):
     return found
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 @pytest.mark.parametrize(("particles", "beams"), [(1, 1), (15, 15), (16, 16), (17, 33), (63, 40), (130, 200)])
 def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled):

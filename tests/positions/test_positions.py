@@ -70,6 +70,7 @@ def test_covariance_is_that_of_the_derivatives(case):
     np.testing.assert_allclose(found, gain @ gain.T, rtol=1e-5, atol=1e-7 * np.abs(found).max())
 
 
+@pytest.mark.sampled(0.5)
 @each_case
 def test_ellipses_hold_the_truth_as_often_as_they_say(case):
     """95 % ellipses of noisy fixes; the count lies within 4 sigma of the binomial distribution."""
@@ -160,6 +161,7 @@ def lowest(case, xy, values, sigma, theta, loss, scale, centre):
     return best
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", ["five ranges", "four rays", "five bearings", "four of both"])
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
 def test_the_global_minimum_is_found(name, loss):

@@ -45,6 +45,7 @@ def equal(one, two):
     return all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("options", OPTIONS)
 def test_particles_weights_and_estimates_have_the_bits_of_one_device(backend, options):
     options = {"particles": 400, "seed": 5, **options}

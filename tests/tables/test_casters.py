@@ -110,6 +110,7 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     return device.download(result, np.empty(count, real))
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_dda_is_the_exact_caster_to_the_bit(family, backend):
     """Rays through corners, on edges and along axes, walls that touch at corners, tiny maps, walls at the limit."""
@@ -124,6 +125,7 @@ def test_dda_is_the_exact_caster_to_the_bit(family, backend):
 # ------------------------------------------------------------------------------------------- models, memory, words
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", [*each_caster(36), Bresenham("beluga")], ids=by_name)
 def test_beam_model_is_the_mixture_at_the_casters_ranges(kind, backend):
     grid, poses, bearings = place()

@@ -74,6 +74,7 @@ def calls(backend: Any) -> dict[str, Any]:
 SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "joint", "no feature", "missing")
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", SENSORS)
 def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypatch):
     """Float32 and float64 poses, results and ``out=`` of the same library, in pieces, not finite, and none at all."""

@@ -178,6 +178,7 @@ def test_beacons_of_ten_nanometres(backend: str, precision: str, kind: str, nu: 
     assert_close(found, [oracle.beacon(pose, xy[0], 5.0, p) for pose in poses], precision)
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", BEACONS)
 @pytest.mark.parametrize("distance", [0.0, 2.0, 30.0])
 def test_a_range_integrates_to_1(name: str, distance: float) -> None:

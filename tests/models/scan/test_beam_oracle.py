@@ -85,6 +85,7 @@ def test_mixture_on_a_stiff_grid(weights, precision, backend):
     assert worst[0] <= BOUND, worst
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_reference_mixture_on_a_dense_grid(weights, precision):

@@ -115,6 +115,7 @@ def test_in_a_fresh_process(backend):
     assert done.stdout == hashes(backend), done.stderr
 
 
+@pytest.mark.sampled(0.5)
 def test_any_batches(call):
     whole = call(cloud())
     for places in ([1, 2, 9, 72, 137, 300], [150], range(64, COUNT, 64), [0, COUNT]):
@@ -157,6 +158,7 @@ def test_after_running_out_of_memory(kind, precision, backend):
     same_bits(call(poses), whole)
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("kind", KINDS[1:])
 def test_several_scans_or_one_by_one(kind, precision, backend):

@@ -209,6 +209,7 @@ def test_turn_by_the_yaw_of_a_far_origin(on, seed, yaw):
     near_ranges(replace(before, origin=(1e6, -1e6, yaw), poses=moved).cast(**on), before.cast(**on), FAR_FLOAT64)
 
 
+@pytest.mark.sampled(0.5)
 @LAWS
 @given(SEEDS, NAMES, st.sampled_from([-12, -1, 1, 12]))
 def test_all_lengths_times_a_power_of_two(kind, on, seed, name, power):
@@ -274,6 +275,7 @@ def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer,
     assert (coarse_low <= fine_high + math.sqrt(shorter)).all()
 
 
+@pytest.mark.sampled(0.5)
 @LAWS
 @given(SEEDS, NAMES)
 def test_permuting_beams_and_particles(kind, on, seed, name):

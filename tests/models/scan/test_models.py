@@ -13,6 +13,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.models import run
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("chunk", [1, 7, 64])
 def test_batches_do_not_matter(kind, chunk, backend, monkeypatch):

@@ -78,6 +78,7 @@ def test_a_sonar_hears_the_nearest_ray_that_returns(name, backend):
         assert 0.001 < np.mean(found == RANGE) < 0.95
 
 
+@pytest.mark.sampled(0.5)
 @on_every_backend(
     on_warp=lambda caster: caster in ("bresenham", "lookup"), caster=[name for name in CASTERS if name != "exact"]
 )

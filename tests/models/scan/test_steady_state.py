@@ -128,6 +128,7 @@ def call_of(what: str, device, precision: str):
     return model.log_likelihood, *copied
 
 
+@pytest.mark.sampled(0.5)
 @on_every_backend(
     what=WHATS, precision=("float32", "float64"), path=("processor", "gpu", "gpu in order"),
     on_warp=lambda what, precision, path: precision == "float32" or path == "gpu in order",
@@ -183,6 +184,7 @@ def test_calls_in_pieces_allocate_nothing_either(gpu, as_gpu, monkeypatch):
     assert watch.down == [4 * 128, 4 * 128, 4 * 100]
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("gpu", [False, True])
 @pytest.mark.parametrize("what", ["beam", "field"])
 def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):

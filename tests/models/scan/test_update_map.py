@@ -87,6 +87,7 @@ def test_casters_follow(method, precision, device):
         )
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("specialize", [True, False])
 def test_the_beam_model_follows(specialize, device):
     rng = np.random.default_rng(2)
@@ -100,6 +101,7 @@ def test_the_beam_model_follows(specialize, device):
     )
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 @pytest.mark.parametrize("field", FIELDS.values(), ids=list(FIELDS))

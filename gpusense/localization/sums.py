@@ -126,7 +126,9 @@ class Sums:
 
     def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
         """Return the launches that write the estimate of a cloud, or those of its second pass."""
-        block, lanes = block_of(count), ESTIMATE_LANES if self._backend.info.kind == "cpu" else 1
+        info, block = self._backend.info, block_of(count)
+        # A work-item of a kernel in vectors takes all lanes.
+        lanes = ESTIMATE_LANES if info.kind == "cpu" or info.lanes > 1 else 1
         blocks, each = -(-count // block), ESTIMATE_LANES // lanes
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
                               sums=self.rows, particles=count, block=block, lanes=lanes, again=again)  # fmt: skip

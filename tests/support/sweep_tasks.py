@@ -39,11 +39,11 @@ def slow(job, store):
     return {"value": job.seed * 0.1}
 
 
-def slow_again(folder):
-    """Write down the process, at once the first time, and after eight seconds when repeated."""
-    runs = Path(folder) / "runs"
+def held_again(folder):
+    """Write down the process; when repeated, wait for a file, at most 30 s, as a job behind long ones does."""
+    runs, end = Path(folder) / "runs", time.monotonic() + 30
     repeated = runs.exists()
     with open(runs, "a") as file:
         file.write(f"{os.getpid()}\n")
-    if repeated:
-        time.sleep(8)
+    while repeated and not (Path(folder) / "released").exists() and time.monotonic() < end:
+        time.sleep(0.05)

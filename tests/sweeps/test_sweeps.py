@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from support.room_log import write_room
 from support.split_scene import field, states
-from support.sweep_tasks import slow_again
+from support.sweep_tasks import held_again
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -154,14 +154,16 @@ def test_a_result_that_ends_with_its_worker_is_not_waited_for(tmp_path, cluster)
     # Dask fetches results one after another: the first one holds the second in its worker until that has ended.
     ended = threading.Event()
     cluster._client.submit(abs, -1).add_done_callback(lambda _: ended.wait(20))
-    result = cluster.submit(slow_again, str(tmp_path))
-    runs = tmp_path / "runs"
+    result = cluster.submit(held_again, str(tmp_path))
+    runs, end = tmp_path / "runs", time.monotonic() + 20
     while not runs.exists() or any(one.status != "finished" for one in cluster._client.futures.values()):
+        assert time.monotonic() < end, "the jobs have not finished"
         time.sleep(0.02)
     os.kill(int(runs.read_text().split()[0]), signal.SIGKILL)
     ended.set()
     with pytest.raises(WorkerDied, match="before its result was fetched"):
-        result.result(timeout=30)
+        result.result(timeout=20)
+    (tmp_path / "released").touch()
 
 
 def test_a_job_that_kills_its_workers_fails_alone(tmp_path, processes):

@@ -8,7 +8,7 @@ from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.listing import Device, devices, open_device, short_driver
 from gpusense.backends.registry import SPEED_CLASSES, set_up_child
-from gpusense.backends.selection import Selection, get_backend
+from gpusense.backends.selection import Selection, default_failures, get_backend
 
 __all__ = [
     "SPEED_CLASSES",
@@ -16,6 +16,7 @@ __all__ = [
     "BackendInfo",
     "Device",
     "Selection",
+    "default_failures",
     "devices",
     "get_backend",
     "open_device",

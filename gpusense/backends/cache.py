@@ -1,10 +1,10 @@
 """Compiled kernels and verdicts on drivers, kept on disk: only the first run on a device makes them.
 
-The folder is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else the system's place for caches:
-``~/.cache/gpusense`` on Linux, ``~/Library/Caches/gpusense`` on macOS, and below ``%LOCALAPPDATA%`` on Windows.
-``GPUSENSE_CACHE=off`` switches it off. An entry is one file that is named by a hash of its key, written by rename, and
-begins with a checksum of its contents; the oldest go when the folder holds more than it may. Where the folder cannot be
-written, a private temporary folder takes its place and one line of the log names it. A cache never stops a run.
+Entries lie in gpusense's own folder (see :mod:`gpusense.backends.folders`). An entry is one file that is named by a
+hash of its key and written by rename. It begins with that hash and a checksum of hash and contents, so neither damage
+nor an exchange of two files passes. The oldest entries go when the folder holds more than it may; only a file with the
+name and the head of an entry is deleted. Where the folder is not safe or cannot be written, a private temporary folder
+takes its place and one line of the log names it. A cache never stops a run.
 
 PoCL and Warp keep compiled kernels in folders without checksums. Each process gives them an empty folder (see
 :mod:`gpusense.backends.scratch`), and copies kernels there from entries, and new ones back into entries.
@@ -13,156 +13,152 @@ PoCL and Warp keep compiled kernels in folders without checksums. Each process g
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
-import io
-import logging
 import os
+import re
 import stat
 import tempfile
-import zipfile
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
+from gpusense._util.private import read_regular
 from gpusense._version import __version__
+from gpusense.backends import folders
+from gpusense.backends.folders import Place
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import fingerprint
 
 MAX_BYTES = 256 << 20
 MAX_ENTRIES = 1024
-_MAGIC = b"gpusense entry 2\n"
-_HEAD = len(_MAGIC) + 32
-_LOG = logging.getLogger("gpusense")
+# Of one entry; the largest that was seen has 4 MiB.
+MAX_ENTRY_BYTES = 64 << 20
+_MAGIC = b"gpusense entry 3\n"
+_DIGEST = hashlib.sha256().digest_size
+# The magic, the hash of the key, and the checksum.
+_HEAD = len(_MAGIC) + 2 * _DIGEST
+_NAME = re.compile(r"([0-9a-f]{64})\.gpusense")
+_UNFINISHED = re.compile(r"([0-9a-f]{64})-[a-z0-9_]{8}\.new")
 # Bytes, as most entries have.
 _SMALL = 64 << 10
-# Folders that do not take files.
-_reported: set[str] = set()
+# Seconds after which an unfinished file belongs to a process that was killed.
+_STALE = 3600
 
 
-def cache_folder() -> Path | None:
-    """Return the folder of the cache, or None when it is switched off."""
-    if os.environ.get("GPUSENSE_CACHE", "").lower() in ("off", "0", "false", "no"):
-        return None
-    if chosen := os.environ.get("GPUSENSE_CACHE_DIR"):
-        return Path(chosen)
-    if base := os.environ.get("XDG_CACHE_HOME"):
-        return Path(base) / "gpusense"
-    try:
-        Path.home()
-    except RuntimeError:
-        # The user has no home folder.
-        return temporary_folder()
-    import platformdirs
-
-    return platformdirs.user_cache_path("gpusense", appauthor=False)
-
-
-def temporary_folder() -> Path | None:
-    """Return this user's folder among temporary files, made where it is absent; None where it cannot be trusted."""
-    try:
-        folder = Path(tempfile.gettempdir()) / (f"gpusense-{os.getuid()}" if hasattr(os, "getuid") else "gpusense")
-        folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.lstat()
-    except OSError:
-        return None
-    # Kernels are code: the folder must be owned by this user and writable by this user only.
-    is_owned = stat.S_ISDIR(status.st_mode) and (not hasattr(os, "getuid") or status.st_uid == os.getuid())
-    return folder if is_owned and not status.st_mode & 0o022 else None
-
-
-def _folders() -> Iterator[Path]:
-    """Yield the chosen folder, and the temporary one where the chosen one does not take files."""
-    chosen = cache_folder()
+def _folders() -> Iterator[tuple[Place, Path]]:
+    """Yield the folder in the chosen place, and the one among temporary files where that does not take files."""
+    chosen = folders.chosen_place()
     if chosen is None:
         return
-    yield chosen
-    if str(chosen) in _reported or not _takes_files(str(chosen)):
-        temporary = temporary_folder()
-        if temporary is not None and temporary != chosen:
-            yield temporary
+    temporary = folders.temporary_place()
+    for place in (chosen, temporary) if temporary is not None and temporary.folder != chosen.folder else (chosen,):
+        try:
+            folder = folders.own_folder(place.folder)
+        except OSError as error:
+            folders.report(place, error)
+            continue
+        yield place, folder
+        if str(folder) not in _failed and _takes_files(place, folder):
+            return
+
+
+# Folders that did not take an entry.
+_failed: set[str] = set()
 
 
 @functools.lru_cache(maxsize=64)
-def _takes_files(folder: str) -> bool:
-    """Return whether a folder takes a small file; it is made where it is absent."""
+def _takes_files(place: Place, folder: Path) -> bool:
+    """Return whether a folder takes a small file."""
     try:
-        os.makedirs(folder, mode=0o700, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(_SMALL))
     except OSError as error:
-        _report(folder, error)
+        folders.report(place, error)
         return False
     return True
 
 
-def _report(folder: str, error: OSError) -> None:
-    """Report once that a folder does not take files."""
-    if folder not in _reported:
-        _reported.add(folder)
-        reason = error.strerror or type(error).__name__
-        _LOG.warning("gpusense: the cache folder %s cannot be written: %s", folder, reason)
+def _digest(key: str) -> bytes:
+    return hashlib.sha256(key.encode()).digest()
 
 
 def _file(key: str) -> str:
     """Return the name of an entry's file."""
-    return f"{hashlib.sha256(key.encode()).hexdigest()}.bin"
+    return f"{_digest(key).hex()}.gpusense"
+
+
+def _head(digest: bytes, payload: bytes) -> bytes:
+    """Return the head of an entry: the magic, the hash of its key, and the checksum."""
+    return _MAGIC + digest + hashlib.sha256(digest + payload).digest()
 
 
 def load_entry(key: str) -> bytes | None:
-    """Return the contents of an entry, or None where there is none; a damaged one is removed."""
-    for folder in _folders():
-        path = folder / _file(key)
+    """Return the contents of an entry; None where there is none, it is damaged, or another's file is in its place."""
+    digest = _digest(key)
+    for _, folder in _folders():
         try:
-            data = path.read_bytes()
+            # The least recently used entries are evicted first.
+            data = read_regular(folder / _file(key), MAX_ENTRY_BYTES, touch=True)
         except OSError:
             continue
-        if data[:_HEAD] == _MAGIC + hashlib.sha256(data[_HEAD:]).digest():
-            # The least recently used entries are evicted first.
-            with contextlib.suppress(OSError):
-                os.utime(path)
-            return data[_HEAD:]
-        _remove(path)
+        payload = data[_HEAD:]
+        if data[:_HEAD] == _head(digest, payload):
+            return payload
     return None
 
 
 def store_entry(key: str, payload: bytes) -> None:
     """Keep an entry where a folder takes it; a failure is reported once for each folder."""
-    for folder in _folders():
+    if len(payload) > MAX_ENTRY_BYTES - _HEAD:
+        return
+    for place, folder in _folders():
         try:
-            _write(folder, _file(key), _MAGIC + hashlib.sha256(payload).digest() + payload)
+            _write(folder, _file(key), _head(_digest(key), payload) + payload)
             return
         except OSError as error:
-            _report(str(folder), error)
+            _failed.add(str(folder))
+            folders.report(place, error)
 
 
 def discard_entry(key: str) -> None:
     """Remove an entry."""
-    for folder in _folders():
-        _remove(folder / _file(key))
+    for _, folder in _folders():
+        _evict(folder / _file(key))
 
 
 def _write(folder: Path, name: str, data: bytes) -> None:
-    """Write a file by rename, and evict others where the folder holds too much.
+    """Write an entry by rename, and evict others where the folder holds too much.
 
     Raises:
-        OSError: the folder does not take it.
+        OSError: the folder does not take it, or something else than a file is in its place.
     """
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=folder, suffix=".tmp")
+    with contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISREG(os.lstat(folder / name).st_mode):
+            raise OSError(errno.EEXIST, f"{name} in it is no regular file")
+    handle, temporary = tempfile.mkstemp(dir=folder, prefix=f"{name[:64]}-", suffix=".new")
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         os.replace(temporary, folder / name)
     except BaseException:
-        _remove(Path(temporary))
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
         raise
     _shrink(folder)
 
 
-def _remove(path: Path) -> None:
-    """Remove a file, if that is possible."""
+def _evict(path: Path) -> None:
+    """Remove a file that has the name and the head of an entry, or of one that was begun; leave any other."""
+    name = _NAME.fullmatch(path.name) or _UNFINISHED.fullmatch(path.name)
+    if name is None:
+        return
     with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
+        expected = _MAGIC + bytes.fromhex(name[1])
+        found = read_regular(path, MAX_ENTRY_BYTES, head=len(expected))
+        # A process may be killed before it has written the head.
+        if found == expected or (path.suffix == ".new" and expected.startswith(found)):
+            path.unlink()
 
 
 def _shrink(folder: Path) -> None:
@@ -175,19 +171,21 @@ def _shrink(folder: Path) -> None:
             except OSError:
                 # Another process has removed it.
                 continue
-            if entry.name.endswith(".bin"):
+            if not stat.S_ISREG(status.st_mode):
+                continue
+            if _NAME.fullmatch(entry.name):
                 entries.append((status.st_mtime, status.st_size, entry.path))
-            elif entry.name.endswith(".tmp"):
+            elif _UNFINISHED.fullmatch(entry.name):
                 begun.append((status.st_mtime, entry.path))
     entries.sort(reverse=True)
     total, newest = 0, entries[0][0] if entries else 0.0
     for number, (_, size, path) in enumerate(entries, 1):
         total += size
         if number > MAX_ENTRIES or total > MAX_BYTES:
-            _remove(Path(path))
+            _evict(Path(path))
     for changed, path in begun:
-        if changed < newest - 3600:
-            _remove(Path(path))
+        if changed < newest - _STALE:
+            _evict(Path(path))
 
 
 class ProgramCache:
@@ -214,46 +212,3 @@ class ProgramCache:
     def discard(self, source: str, options: Sequence[str]) -> None:
         """Remove a program that the driver refuses."""
         discard_entry(self.key(source, options))
-
-
-def pack(files: dict[str, bytes]) -> bytes:
-    """Return files, by their paths below some folder, as the contents of one entry."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name in sorted(files):
-            # A fixed date, so that equal files make equal entries.
-            archive.writestr(zipfile.ZipInfo(name), files[name], zipfile.ZIP_DEFLATED, 1)
-    return stream.getvalue()
-
-
-def unpack(payload: bytes) -> dict[str, bytes]:
-    """Return the files of :func:`pack`.
-
-    Raises:
-        ValueError: a path leads out of the folder, or the contents are no packed files.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(payload)) as archive:
-            names = archive.namelist()
-            for name in names:
-                if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-                    raise ValueError(f"entry: must hold paths below its folder, got {name!r}")
-            return {name: archive.read(name) for name in names}
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"entry: must hold packed files, got other contents ({error})") from None
-
-
-def write_files(folder: Path, files: dict[str, bytes]) -> None:
-    """Write files below a folder, each by rename.
-
-    Raises:
-        OSError: the folder does not take them.
-    """
-    for name, data in files.items():
-        path = folder / name
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o700)
-        os.replace(temporary, path)

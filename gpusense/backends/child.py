@@ -1,4 +1,8 @@
-"""Child processes for work with a driver: one that crashes or hangs does no harm to the user's process."""
+"""Child processes for work with a driver: one that crashes or hangs does no harm to the user's process.
+
+A driver may also end its process as if all were well, so a child's end says nothing: its last report repeats a number
+that it was sent.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +11,29 @@ import importlib
 import json
 import os
 import re
+import secrets
 import signal
 import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 # Seconds; a first compilation takes some three on a common processor.
 _LIMIT = 60.0
-_MARK = "gpusense-child "
+MARK = "gpusense-child "
+# Bytes of a child's output that are looked through for reports.
+_MOST_OUTPUT = 16 << 20
 _START = (
     "import sys, json; job = json.loads(sys.stdin.readline()); sys.path[:] = job['path']; "
     "from gpusense.backends.child import main; main(job)"
 )
 # Signals that come from outside: they are no failure of the driver.
 _FOREIGN = tuple(getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
+# Failures of the machine's state and not of the driver.
+PASSING = re.compile(
+    r"No space left|is full|quota|Permission denied|Read-only file|[Oo]ut of memory|MemoryError|allocate|takes \d+ MiB"
+)
 # Lines of a dying process that do not name the cause.
 _NOISE = re.compile(r"^(\s*$|Stack dump|PLEASE submit|\s*#?\d+[.\s]|\d+ warnings? generated|Aborted| +File |Traceback)")
 
@@ -32,7 +43,7 @@ class Outcome:
     """The reports and the end of a child process.
 
     Attributes:
-        said: Its reports, in order.
+        said: Its reports, in order, without the last one.
         failure: The failure in one line; empty where it ended well.
         conclusive: False where something else than the driver may have ended it.
         started: False where the system started no child.
@@ -95,16 +106,17 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
 
     Args:
         arguments: The interpreter's arguments.
-        job: The program reads it from standard input, as one line of JSON.
+        job: The program reads it from standard input, as one line of JSON. Its last report must be ``{"done": token}``
+            with the ``token`` that is added to the job.
         variables: Further variables of its environment.
     """
     # The child starts no children.
     environment = os.environ | {"GPUSENSE_PROOF": "off"} | (variables or {})
     command = [sys.executable, *arguments]
-    limit = time_limit()
+    limit, token = time_limit(), secrets.token_hex(16)
     with contextlib.ExitStack() as stack:
         try:
-            out, errors = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
+            out, errors = (stack.enter_context(_output()) for _ in range(2))
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=environment, start_new_session=True
             )
@@ -112,18 +124,36 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
             return Outcome([], f"no child process can be started: {error}", conclusive=False, started=False)
         try:
             with contextlib.suppress(BrokenPipeError):
-                process.communicate(json.dumps(job).encode() + b"\n", timeout=limit)
+                process.communicate(json.dumps({**job, "token": token}).encode() + b"\n", timeout=limit)
             code: int | None = process.returncode
         except subprocess.TimeoutExpired:
             code = None
         finally:
             _end(process)
         said = _read_reports(out)
+        answered = said[-1:] == [{"done": token}]
+        if answered:
+            del said[-1]
         if code == 0:
-            return Outcome(said)
+            return Outcome(said, "" if answered else "ends the process with exit code 0, without an answer")
         if code is None:
             return Outcome(said, f"hangs: no answer in {limit:g} s")
-        return Outcome(said, _describe(code, _last_words(errors)), conclusive=-code not in _FOREIGN)
+        failure = _describe(code, _last_words(errors))
+        return Outcome(said, failure, conclusive=-code not in _FOREIGN and not PASSING.search(failure))
+
+
+def _output() -> IO[bytes]:
+    """Return a file without a name for the output of a child, in memory where no folder takes one.
+
+    Raises:
+        OSError: there is none.
+    """
+    try:
+        return tempfile.TemporaryFile()
+    except OSError:
+        if not hasattr(os, "memfd_create"):
+            raise
+        return os.fdopen(os.memfd_create("gpusense-child"), "w+b")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -137,13 +167,13 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _read_reports(file: BinaryIO) -> list[dict[str, Any]]:
+def _read_reports(file: IO[bytes]) -> list[dict[str, Any]]:
     """Return the reports in a child's output."""
     file.seek(0)
-    lines = file.read(1 << 20).decode("utf-8", "replace").splitlines()
+    lines = file.read(_MOST_OUTPUT).decode("utf-8", "replace").splitlines()
     reports = []
     for line in lines:
-        _, mark, text = line.partition(_MARK)
+        _, mark, text = line.partition(MARK)
         if mark:
             # The last line of a child that was killed may be cut off.
             with contextlib.suppress(ValueError):
@@ -151,7 +181,7 @@ def _read_reports(file: BinaryIO) -> list[dict[str, Any]]:
     return reports
 
 
-def _last_words(file: BinaryIO) -> str:
+def _last_words(file: IO[bytes]) -> str:
     """Return the line of standard error that best names the cause of a process's end."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - (1 << 16), 0))
@@ -181,8 +211,9 @@ def main(job: dict[str, Any]) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def report(values: dict[str, Any]) -> None:
-        sys.stdout.write(f"\n{_MARK}{json.dumps(values)}\n")
+        sys.stdout.write(f"\n{MARK}{json.dumps(values)}\n")
         sys.stdout.flush()
 
     module, _, name = job["do"].partition(":")
     getattr(importlib.import_module(module), name)(job, report)
+    report({"done": job["token"]})

@@ -67,7 +67,7 @@ def devices(*, anew: bool = False) -> list[Device]:
 def present(entry: Entry) -> tuple[list[Device], list[Device]]:
     """Return the devices of a backend, on which there need be no verdict yet, and its absent parts."""
     library, absent = _absence(entry)
-    return ([] if library is None else [_device(info, library) for info, _ in library.list_devices()]), absent
+    return ([] if library is None else [_device(info, library) for info, _ in _listed(library)[0]]), absent
 
 
 def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
@@ -90,7 +90,7 @@ def verdict_on(info: BackendInfo, handle: Any, library: Library, *, anew: bool =
     if not BY_NAME[info.backend].compiles or library.is_simulator(info):
         return proof.trust(info)
     if trouble := library.trouble(handle):
-        return proof.unusable(trouble)
+        return proof.unusable(trouble, passing=True)
     return proof.verdict_on(info, setup=library.child_setup(), anew=anew)
 
 
@@ -116,7 +116,7 @@ def _devices_of(entry: Entry, *, anew: bool) -> list[Device]:
     library, absent = _absence(entry, anew=anew)
     if library is None:
         return absent
-    rows = [(info, verdict_on(info, handle, library, anew=anew)) for info, handle in library.list_devices()]
+    rows = [(info, verdict_on(info, handle, library, anew=anew)) for info, handle in _listed(library)[0]]
     return [*(_device(info, library, verdict) for info, verdict in rows), *absent]
 
 
@@ -124,13 +124,33 @@ def _absence(entry: Entry, *, anew: bool = False) -> tuple[Library | None, list[
     """Return the library of a backend, and its absent parts: itself, drivers, devices."""
     library, reason = registry.load(entry)
     if library is None:
-        return None, [_absent(entry, f"{entry.name} (absent)", "cpu", f"{reason}: {entry.install}")]
+        remedy = registry.remedy(entry) or f"pip install --force-reinstall {entry.install.split()[2]}"
+        return None, [_absent(entry, f"{entry.name} (absent)", "cpu", f"{reason}: {remedy}")]
     if anew:
         library.renew()
+    listed, failure = _listed(library)
+    if failure:
+        return library, [_absent(entry, f"{entry.name} (no device)", "cpu", failure)]
     absent = [_absent(entry, *part) for part in library.absent()]
-    if not absent and not library.list_devices():
-        absent.append(_absent(entry, f"{entry.name} (no device)", "cpu", f"{library.no_device()}: {entry.install}"))
+    if not absent and not listed:
+        reason = library.no_device(registry.remedy(entry))
+        absent.append(_absent(entry, f"{entry.name} (no device)", "cpu", reason))
     return library, absent
+
+
+def _listed(library: Library) -> tuple[list[tuple[BackendInfo, Any]], str]:
+    """Return the devices of a library, and why it cannot list any; the reason is empty where it can."""
+    try:
+        return library.list_devices(), ""
+    except Exception as error:
+        # A library's own errors have any class.
+        return [], f"its devices cannot be listed: {one_line(error)}"
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error in one line: its text, with its class where that says more."""
+    text = " ".join(str(error).split())
+    return text if text and isinstance(error, (OSError, ValueError)) else f"{type(error).__name__}: {text}".rstrip(": ")
 
 
 def _absent(entry: Entry, name: str, kind: str, reason: str) -> Device:

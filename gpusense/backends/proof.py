@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gpusense._version import __version__
-from gpusense.backends import child
+from gpusense.backends import child, notices
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.processor import fingerprint
@@ -40,10 +40,6 @@ _REMEDIES = (
         "set GPUSENSE_PROOF_SECONDS higher if the machine is slow, or choose another device with GPUSENSE_BACKEND",
     ),
 )
-# Failures of the machine's state and not of the driver: their verdicts are not kept.
-_PASSING = re.compile(
-    r"No space left|is full|quota|Permission denied|Read-only file|[Oo]ut of memory|MemoryError|allocate|takes \d+ MiB"
-)
 _OTHERWISE = "update the driver, or choose another device with GPUSENSE_BACKEND (for example warp:cpu or numpy)"
 
 
@@ -58,6 +54,7 @@ class Verdict:
         reason: The failures, empty where nothing failed.
         remedy: The remedy for them.
         rate: Calls of a scan per second, by which devices of one class are compared; 0 where it was not measured.
+        passing: Whether the failure is one of the machine's state, without a proof; such a verdict is not kept.
     """
 
     usable: bool
@@ -66,6 +63,7 @@ class Verdict:
     reason: str = ""
     remedy: str = ""
     rate: float = 0.0
+    passing: bool = False
 
 
 _lock = threading.RLock()
@@ -77,9 +75,9 @@ def trust(info: BackendInfo) -> Verdict:
     return Verdict(True, info.lanes, info.float64)
 
 
-def unusable(reason: str) -> Verdict:
+def unusable(reason: str, *, passing: bool = False) -> Verdict:
     """Return the verdict on a device that no model can run on."""
-    return Verdict(False, 1, False, reason, remedy_for(reason))
+    return Verdict(False, 1, False, reason, remedy_for(reason), passing=passing)
 
 
 def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> Verdict:
@@ -106,7 +104,7 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
             if conclusive:
                 store_entry(key, json.dumps(dataclasses.asdict(verdict)).encode())
             if verdict.reason:
-                _LOG.warning("gpusense: %s", summary(info, verdict))
+                notices.warn(summary(info, verdict))
         _known[key] = verdict
         return verdict
 
@@ -161,12 +159,12 @@ def _prove(info: BackendInfo, setup: Any) -> tuple[Verdict, bool]:
     while True:
         outcome = child.run({"do": _PROVE, "info": dataclasses.asdict(info), "setup": setup})
         if not outcome.started:
-            _LOG.warning("gpusense: %s is trusted without a proof: %s", name_of(info), outcome.failure)
+            notices.warn(f"{name_of(info)} is trusted without a proof: {outcome.failure}")
             return _verdict(info, failures, outcome), False
         failed, failure = _failure(outcome)
         if not failed:
             return _verdict(info, failures, outcome), conclusive
-        conclusive &= outcome.conclusive and not _PASSING.search(failure)
+        conclusive &= outcome.conclusive and not child.PASSING.search(failure)
         lanes = f" of {info.lanes}" if failed == VECTORS else ""
         failures.append(f"{failed}{lanes} {failure}")
         if failed == FLOAT64:

@@ -7,7 +7,9 @@ An entry holds the facts about a backend before its library is loaded. The modul
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import importlib.util
+import platform
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -130,9 +132,13 @@ class Library(ABC):
         """Return the parts of the library that this machine lacks, such as drivers that cannot be loaded."""
         return []
 
-    def no_device(self) -> str:
-        """Return why there is no device."""
-        return "no driver offers a device"
+    def no_device(self, install: str) -> str:
+        """Return why there is no device, with the remedy.
+
+        Args:
+            install: The command that installs what is absent; empty where all is installed.
+        """
+        return f"no driver offers a device: {install or 'install or update the driver of its vendor'}"
 
     def is_simulator(self, info: BackendInfo) -> bool:
         """Return whether a device checks or emulates: it computes correctly, but is too slow to be chosen unasked."""
@@ -180,7 +186,26 @@ def load(entry: Entry) -> tuple[Library | None, str]:
     try:
         return importlib.import_module(entry.module).LIBRARY, ""
     except (ImportError, OSError) as error:
-        return None, f"{entry.package} does not load ({error})"
+        return None, f"{entry.package} does not load ({' '.join(str(error).split())})"
+
+
+def remedy(entry: Entry) -> str:
+    """Return the command that installs what a backend needs and is absent; empty where all is installed."""
+    absent = [name for name in entry.install.split()[2:] if not _is_installed(name) and _has_wheel(name)]
+    return f"pip install {' '.join(absent)}" if absent else ""
+
+
+def _is_installed(distribution: str) -> bool:
+    """Return whether a distribution is installed, by the name under which pip knows it."""
+    try:
+        return bool(importlib.metadata.version(distribution))
+    except importlib.metadata.PackageNotFoundError:
+        return False
+
+
+def _has_wheel(distribution: str) -> bool:
+    """Return whether pip can install a distribution on this machine."""
+    return distribution != "pocl-binary-distribution" or (sys.platform, platform.machine()) == ("linux", "x86_64")
 
 
 def set_up_child(name: str, setup: Any) -> None:

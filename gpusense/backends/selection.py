@@ -3,7 +3,10 @@
 Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (platform and device number),
 ``"opencl:<part of a device's or driver's name>"``, ``"warp"``, ``"warp:cpu"``, ``"warp:cuda:0"``. A queue of pyopencl
 selects its device, and a backend that works on that queue. ``"auto"`` is the value of ``$GPUSENSE_BACKEND``, and else
-the fastest device that is proved (see :mod:`gpusense.backends.proof`).
+the fastest device that is proved and opens (see :mod:`gpusense.backends.proof`, :mod:`gpusense.backends.chain`).
+
+A selection string is looked up once. A forked process, and a change of the variables on which devices depend, make it
+look anew.
 """
 
 from __future__ import annotations
@@ -17,12 +20,12 @@ import weakref
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from gpusense._util.checks import show
-from gpusense.backends import listing, proof, registry
+from gpusense.backends import listing, notices, proof, registry
 from gpusense.backends.base import Backend
+from gpusense.backends.chain import Chain, best_of
 from gpusense.backends.info import ProcessBound
 from gpusense.backends.listing import Device, short_driver
-from gpusense.backends.proof import Verdict
-from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry, Library
+from gpusense.backends.registry import BY_NAME, ENTRIES, Entry, Library
 
 if TYPE_CHECKING:
     import pyopencl
@@ -30,15 +33,23 @@ if TYPE_CHECKING:
 # The values of ``backend=``.
 Selection: TypeAlias = "str | Backend | pyopencl.CommandQueue"
 
-# The factor by which a device must be faster than one of its class that is listed before it, to be chosen instead.
-NOTICED = 1.1
 # The environment variable that holds the meaning of "auto".
 VARIABLE = "GPUSENSE_BACKEND"
+# All variables on which the devices that are present and usable depend.
+VARIABLES = (
+    VARIABLE, "GPUSENSE_PROOF", "GPUSENSE_CACHE", "GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "TMPDIR", "POCL_DEVICES",
+    "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "OPENCL_VENDOR_PATH", "CUDA_VISIBLE_DEVICES",
+)  # fmt: skip
+# As the dictionary of ``os.environ`` has them.
+_KEYS = tuple(map(getattr(os.environ, "encodekey", str), VARIABLES))
 
 _LOCK = threading.Lock()
 # By the key of a queue, which its backend keeps alive.
 _BACKENDS_OF_QUEUES: weakref.WeakValueDictionary[int, Backend] = weakref.WeakValueDictionary()
 _OPENED: weakref.WeakSet[ProcessBound] = weakref.WeakSet()
+# The circumstances of the last look, and the backends by their selection strings.
+_looks: tuple[tuple[Any, ...], dict[str, Backend]] = ((), {})
+_passed_over: list[tuple[str, str]] = []
 
 
 def get_backend(selection: Selection = "auto") -> Backend:
@@ -50,7 +61,7 @@ def get_backend(selection: Selection = "auto") -> Backend:
     Raises:
         TypeError: the selection is neither a string nor a queue.
         ValueError: the selection names nothing, or a device that is absent or unusable, or is a queue that is not an
-            in-order queue. No other device is taken in its place.
+            in-order queue. No other device is taken in its place, but for ``"auto"``.
         RuntimeError: the device was opened before this process was forked.
 
     Example:
@@ -61,16 +72,55 @@ def get_backend(selection: Selection = "auto") -> Backend:
         >>> get_backend(backend) is backend
         True
     """
-    if isinstance(selection, Backend):
-        return selection
-    if not isinstance(selection, str):
-        return _opened_queue(selection)
-    if selection == "auto" and (chosen := os.environ.get(VARIABLE)):
+    if isinstance(selection, str):
+        key, found = _looks
+        if key == _circumstances() and (backend := found.get(selection)) is not None:
+            return backend
+        return _look(selection)
+    return selection if isinstance(selection, Backend) else _opened_queue(selection)
+
+
+def default_failures() -> list[tuple[str, str]]:
+    """Return the devices that ``"auto"`` passed over when it was last looked up: selection strings and reasons."""
+    return list(_passed_over)
+
+
+def forget() -> None:
+    """Forget the meaning of selection strings; they are looked up anew, and devices may be opened again."""
+    global _looks
+    with _LOCK:
+        _looks = ((), {})
+        _passed_over.clear()
+        _open.cache_clear()
+
+
+def _circumstances() -> tuple[Any, ...]:
+    """Return what the meaning of a selection string depends on: the process, and variables of the environment.
+
+    To look up a variable that is not set takes ``os.environ`` more than a microsecond, its dictionary a tenth of one.
+    """
+    values = getattr(os.environ, "_data", None)
+    if not isinstance(values, dict):
+        return os.getpid(), *map(os.environ.get, VARIABLES)
+    return os.getpid(), *map(values.get, _KEYS)
+
+
+def _look(selection: str) -> Backend:
+    """Look up the backend of a user's selection string, and keep it."""
+    global _looks
+    now = _circumstances()
+    if selection == "auto" and (chosen := os.environ.get(VARIABLE)) and chosen != "auto":
         try:
-            return _opened(chosen)
+            backend = _opened(chosen)
         except ValueError as error:
             raise ValueError(f"{VARIABLE}: {error}") from None
-    return _opened(selection)
+    else:
+        backend = _opened(selection)
+    with _LOCK:
+        if _looks[0] != now:
+            _looks = (now, {})
+        _looks[1][selection] = backend
+    return backend
 
 
 def _opened(selection: str) -> Backend:
@@ -80,9 +130,33 @@ def _opened(selection: str) -> Backend:
         for opened in _OPENED:
             if selection.partition(":")[0] in ("auto", opened.info.backend):
                 opened.check_process()
-        backend = _open(_find(selection))
+        backend = _open_fastest() if selection == "auto" else _open(_find(selection))
         if isinstance(backend, ProcessBound):
             _OPENED.add(backend)
+    return backend
+
+
+def _open_fastest() -> Backend:
+    """Open the fastest device that opens, and report those that were passed over.
+
+    Raises:
+        ValueError: there is none, not even NumPy.
+    """
+    chain = Chain()
+    with notices.held() as lines:
+        for device in chain:
+            try:
+                backend = _open(device.selection)
+            except Exception as error:
+                # Drivers have errors of every class.
+                chain.fail(device, error)
+            else:
+                chain.report(device, lines)
+                break
+        else:
+            reasons = "; ".join(failure.line for failure in chain.failures)
+            raise ValueError(f"backend: no device is usable, got 'auto': {reasons}")
+    _passed_over[:] = [(failure.selection, failure.reason) for failure in chain.failures]
     return backend
 
 
@@ -151,8 +225,6 @@ def _open_queue(queue: Any, library: Library) -> Backend:
 def _find(selection: str) -> str:
     """Return the listed selection string of the one device that a user's selection means."""
     head, colon, rest = selection.partition(":")
-    if selection == "auto":
-        return _fastest()
     entry = BY_NAME.get(head)
     if entry is None or (colon and not (rest and entry.has_parts)):
         forms = [repr(form) for form in ("auto", *(form for one in ENTRIES for form in one.selections))]
@@ -173,7 +245,7 @@ def _choose(entry: Entry, rest: str, present: list[Device], selection: str) -> s
         if not real:
             raise ValueError(f"backend: only simulators are present and must be named, got {show(selection)}")
         # Where none is usable, opening the first one says why.
-        return (_best(real) or real[0]).selection
+        return (best_of(real) or real[0]).selection
     if entry.by_name:
         matches = _named(rest, present)
     else:
@@ -198,42 +270,3 @@ def _named(part: str, present: list[Device]) -> list[Device]:
         return (word in device.name.lower()) + (word in driver)
 
     return sorted((device for device in present if matches(device)), key=matches, reverse=True)
-
-
-def _fastest() -> str:
-    """Return the device of the fastest class that is proved; a slower class's library is not loaded before it must."""
-    candidates: list[Device] = []
-    for entry in sorted(ENTRIES, key=lambda one: one.best):
-        best = _best(candidates)
-        if best is not None and BY_NAME[best.backend].speed[best.kind] < entry.best:
-            return best.selection
-        candidates += [device for device in listing.present(entry)[0] if device.kind != "simulator"]
-    best = _best(candidates)
-    if best is None:
-        raise ValueError("backend: no device is usable, got 'auto'")
-    return best.selection
-
-
-def _best(candidates: list[Device]) -> Device | None:
-    """Return the usable device of the fastest class, and of several there the one that scores scans fastest.
-
-    The rates were measured with the proofs. A device that is faster by less than ``NOTICED`` is not chosen, so that
-    runs do not change between devices.
-    """
-    for row in SPEED_CLASSES:
-        best, most = None, 0.0
-        for device in candidates:
-            if (device.backend, device.kind) != row:
-                continue
-            verdict = _verdict_of(device)
-            if verdict.usable and (best is None or verdict.rate > NOTICED * most):
-                best, most = device, verdict.rate
-        if best is not None:
-            return best
-    return None
-
-
-def _verdict_of(device: Device) -> Verdict:
-    """Return the verdict on a device that is present."""
-    library, info, handle = listing.lookup(device.selection)
-    return listing.verdict_on(info, handle, library)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from gpusense.commands.arguments import add_json
@@ -22,6 +22,8 @@ The column 'selection' is the value for --backend of the other commands and for 
 Before a device is used for the first time, a child process runs kernels of each family on it and compares them with
 NumPy's results, which takes some seconds. Families that fail are not used, and the reason is printed here. 'lanes' are
 the particles or beams per work-item, followed by the processor that the driver compiles for.
+'auto' opens devices in the order of their speed, and takes the first that works; NumPy is the last. One that does not
+open is listed as unusable. The exit code is 0 whatever is found.
 
 example:
   gpusense devices
@@ -44,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
 
     listed = devices(anew=args.prove)
     auto, auto_error = _auto()
+    listed = _with_failures(listed)
     if args.json:
         documents = [asdict(device) | {"auto": device.available and device.selection == auto} for device in listed]
         print_json({"auto": auto, "auto_error": auto_error, "devices": documents, "machine": machine()})
@@ -58,6 +61,19 @@ def run(args: argparse.Namespace) -> int:
     print("", *notes, sep="\n")
     print(f"* is the device of 'auto'\n{machine_line()}" if auto else f"'auto' does not work: {auto_error}")
     return 0
+
+
+def _with_failures(listed: list[Device]) -> list[Device]:
+    """Return the devices, of which those that ``"auto"`` has tried in vain are unusable, for the reason that it met."""
+    from gpusense.backends import default_failures
+
+    reasons = {selection: reason for selection, reason in default_failures() if selection}
+    return [
+        replace(device, available=False, reason=reasons[device.selection])
+        if device.available and device.selection in reasons
+        else device
+        for device in listed
+    ]
 
 
 def _status(device: Device) -> str:

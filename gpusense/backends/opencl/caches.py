@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import logging
 import sqlite3
 import sys
 import threading
@@ -16,6 +15,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pyopencl as cl
+
+from gpusense.backends import notices
 
 # Whether pyopencl's caches are off; once it is imported it has no other switch.
 _SWITCH = "_PYOPENCL_NO_CACHE"
@@ -32,7 +33,7 @@ def _open_database() -> None:
         importlib.import_module("pyopencl.invoker")
     except (ImportError, OSError, sqlite3.Error) as error:
         setattr(cl, _SWITCH, True)
-        logging.getLogger("gpusense").warning("gpusense: pyopencl's cache cannot be used and is left out: %s", error)
+        notices.warn(f"pyopencl's cache cannot be used and is left out: {error}")
         error.__traceback__ = None
     finally:
         sys.unraisablehook = hook

@@ -7,21 +7,39 @@ import pyopencl as cl
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.opencl import drivers, pocl, pocl_kernels
 
+# The devices that this process lists, in which drivers stay loaded.
+_listed: list[tuple[BackendInfo, cl.Device]] = []
+
 
 def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
     """Return all OpenCL devices of this machine, simulators included, in the order of the platforms."""
-    listed = []
+    if not _listed:
+        try:
+            platforms = drivers.platforms()
+        except RuntimeError:
+            return []
+        found = []
+        for p, platform in enumerate(platforms):
+            found += [(_describe(f"opencl:{p}:{d}", one), one) for d, one in enumerate(_devices_of(platform))]
+        _listed[:] = found
+    return list(_listed)
+
+
+def _devices_of(platform: cl.Platform) -> list[cl.Device]:
+    """Return the devices of a platform; none where its driver offers none."""
+    try:
+        return list(platform.get_devices())
+    except cl.Error:
+        return []
+
+
+def hides_pocl() -> bool:
+    """Return whether PoCL is loaded and offers no device."""
     try:
         platforms = drivers.platforms()
     except RuntimeError:
-        return []
-    for p, platform in enumerate(platforms):
-        try:
-            devices = platform.get_devices()
-        except cl.Error:
-            continue
-        listed += [(_describe(f"opencl:{p}:{d}", device), device) for d, device in enumerate(devices)]
-    return listed
+        return False
+    return any(pocl.NAME in platform.name and not _devices_of(platform) for platform in platforms)
 
 
 def _describe(selection: str, device: cl.Device) -> BackendInfo:
@@ -46,6 +64,8 @@ def trouble_of(device: cl.Device) -> str:
         return ""
     if absent := pocl.lacking_for(device):
         return f"PoCL's library for this processor uses {', '.join(absent)}, which it lacks"
+    if drivers.pocl_came_first() and (unsafe := pocl_kernels.trouble_of_own_folder()):
+        return unsafe
     try:
         pocl_kernels.pocl_kernels()
     except OSError as error:

@@ -1,25 +1,16 @@
-"""The OpenCL drivers of this machine that the loader loads, and their folders.
+"""The OpenCL drivers of this machine that the loader loads.
 
-A driver is a library that an ``.icd`` file names. The loader inside pyopencl's wheel reads the system's files,
-``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``, and those beside pyopencl, where PoCL's wheel has its own. It loads all
-drivers when it is asked for the first time, so a driver that dies at that point ends the process whatever device was
-wanted. Hence a child loads them first, and a driver that it does not survive is left out.
-
-Intel's runtime for processors comes as a wheel too, but its ``.icd`` file names a folder that exists on no user's
-machine. A new ``.icd`` file takes its place: while the loader loads, the variable names a folder with this file and the
-system's. Loading the library by its path would need another loader; writing beside pyopencl would change files that
-another package owns.
+The loader loads all drivers when it is asked for the first time, so a driver that dies at that point ends the process
+whatever device was wanted. Hence a child loads them first, and a driver that it does not survive is left out. While the
+loader loads, a variable names the folder of the drivers' files (see :mod:`gpusense.backends.opencl.driver_files`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
-import logging
 import os
 import re
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,18 +19,18 @@ from pathlib import Path
 import pyopencl as cl
 
 from gpusense._version import __version__
-from gpusense.backends import child
+from gpusense.backends import child, notices
 from gpusense.backends.cache import discard_entry, load_entry, store_entry
-from gpusense.backends.opencl import pocl_kernels
+from gpusense.backends.opencl import driver_files, pocl_kernels
+from gpusense.backends.opencl.driver_files import Driver
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
-_SYSTEM = "/etc/OpenCL/vendors"
-_INTEL = ("intel-opencl-rt", "libintelocl.so")
 # Asks the loader for all devices. The child runs nothing else, so that it starts in some 20 ms.
 _LOAD = """
 import ctypes, json, sys
-loader = ctypes.CDLL(json.loads(sys.stdin.readline())["loader"])
+job = json.loads(sys.stdin.readline())
+loader = ctypes.CDLL(job["loader"])
 number = ctypes.c_uint()
 if loader.clGetPlatformIDs(0, None, ctypes.byref(number)) == 0:
     platforms = (ctypes.c_void_p * number.value)()
@@ -47,21 +38,10 @@ if loader.clGetPlatformIDs(0, None, ctypes.byref(number)) == 0:
     for platform in platforms:
         every = ctypes.c_ulong(0xFFFFFFFF)
         loader.clGetDeviceIDs(ctypes.c_void_p(platform), every, 0, None, ctypes.byref(number))
+print("", job["mark"] + json.dumps({"done": job["token"]}), sep=chr(10))
 """
-_LOG = logging.getLogger("gpusense")
-
-
-@dataclass(frozen=True)
-class Driver:
-    """A driver as its ``.icd`` file has it.
-
-    Attributes:
-        file: The file; Intel's library itself where the file is made here.
-        library: The library that the loader loads.
-    """
-
-    file: Path
-    library: str
+# Beginnings of the names of variables that decide how drivers load.
+_NAMES = ("OCL_", "OPENCL_", "POCL_")
 
 
 @dataclass(frozen=True)
@@ -83,6 +63,13 @@ _lock = threading.RLock()
 # The choice of this process: a parent's, or that of a trial. Once drivers are loaded it does not change.
 _choice: Choice | None = None
 _loaded = False
+# Whether the program had loaded PoCL before.
+_pocl_came_first = False
+
+
+def pocl_came_first() -> bool:
+    """Return whether PoCL was loaded before this module loaded drivers, and so may have chosen its folder itself."""
+    return _pocl_came_first
 
 
 def platforms() -> list[cl.Platform]:
@@ -91,10 +78,11 @@ def platforms() -> list[cl.Platform]:
     Raises:
         RuntimeError: no combination of drivers can be loaded.
     """
-    global _loaded
+    global _loaded, _pocl_came_first
     with _lock:
         if _loaded:
             return _ask()
+        _pocl_came_first = bool(_mapped("/libpocl"))
         chosen = choice()
         if chosen.failure:
             raise RuntimeError(f"OpenCL's drivers {chosen.failure}")
@@ -136,26 +124,35 @@ def renew() -> None:
 
 def _chosen(*, anew: bool = False) -> Choice:
     """Return the choice by the kept verdict, or by a child's where there is none or it is made ``anew``."""
-    present = _registered()
-    intel = _intel(present)
-    drivers = (*present, intel) if intel is not None else tuple(present)
-    wanted = drivers if intel is not None else None
+    drivers, by_itself = driver_files.installed()
+    wanted = None if by_itself else drivers
     if not child.can_start() or not _loader():
         return Choice(wanted)
     key = _key(drivers)
     if anew:
         discard_entry(key)
-    payload = load_entry(key)
-    if payload is None:
+    kept = _kept(key)
+    if kept is None:
         chosen, conclusive = _tried(drivers, wanted)
         if conclusive:
             store_entry(key, json.dumps({"left_out": chosen.left_out, "failure": chosen.failure}).encode())
         for name, reason in chosen.left_out:
-            _LOG.warning("gpusense: the OpenCL driver %s is left out: it %s", name, reason)
+            notices.warn(f"the OpenCL driver {name} is left out: it {reason}")
         return chosen
-    verdict = json.loads(payload)
-    left_out = tuple((name, reason) for name, reason in verdict["left_out"])
-    return Choice(_without(drivers, left_out) if left_out else wanted, left_out, verdict["failure"])
+    left_out, failure = kept
+    return Choice(_without(drivers, left_out) if left_out else wanted, left_out, failure)
+
+
+def _kept(key: str) -> tuple[tuple[tuple[str, str], ...], str] | None:
+    """Return the drivers that are left out and the failure by the kept verdict; None where it is absent or damaged."""
+    payload = load_entry(key)
+    if payload is None:
+        return None
+    try:
+        verdict = json.loads(payload)
+        return tuple((str(name), str(reason)) for name, reason in verdict["left_out"]), str(verdict["failure"])
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def as_job() -> list[tuple[str, str]] | None:
@@ -195,13 +192,18 @@ def _try(drivers: tuple[Driver, ...] | None) -> child.Outcome:
         variables = _variables(drivers, kernels=False)
     except OSError:
         return child.Outcome([], "no folder takes files", conclusive=False)
-    return child.run_text(["-I", "-S", "-c", _LOAD], {"loader": _loader()}, variables)
+    return child.run_text(["-I", "-S", "-c", _LOAD], {"loader": _loader(), "mark": child.MARK}, variables)
 
 
 def _loader() -> str:
     """Return the file of the loader that pyopencl uses; empty where it is not known."""
+    return _mapped("/libOpenCL")
+
+
+def _mapped(word: str) -> str:
+    """Return the first file with a word in its path that this process has mapped; empty where there is none."""
     with contextlib.suppress(OSError), open("/proc/self/maps", encoding="utf-8", errors="replace") as file:
-        return next((line.split(maxsplit=5)[-1].strip() for line in file if "/libOpenCL" in line), "")
+        return next((line.split(maxsplit=5)[-1].strip() for line in file if word in line), "")
     return ""
 
 
@@ -214,54 +216,12 @@ def _without(drivers: tuple[Driver, ...], left_out: tuple[tuple[str, str], ...])
 def _key(drivers: tuple[Driver, ...]) -> str:
     """Return the key of the verdict: drivers, their files, and everything else that decides how they load."""
     parts = ["drivers", __version__, cl.VERSION_TEXT, fingerprint()]
-    parts += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(("OCL_", "OPENCL_"))]
+    parts += [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(_NAMES)]
     for driver in drivers:
         with contextlib.suppress(OSError):
             status = os.stat(driver.library if os.path.isabs(driver.library) else driver.file)
             parts.append(f"{driver.file} {driver.library} {status.st_size} {status.st_mtime_ns}")
     return "\n".join(parts)
-
-
-def _registered() -> list[Driver]:
-    """Return the drivers that the loader finds by itself, the system's first."""
-    place = _place()
-    beside = Path(cl.__file__).parent / ".libs"
-    if place.is_file():
-        # A single file or library stands for all drivers.
-        return [Driver(place, _library(place) if place.suffix == ".icd" else str(place))]
-    files = [*sorted(place.glob("*.icd")), *sorted(beside.glob("*.icd"))]
-    drivers = [Driver(file, _library(file)) for file in files]
-    return [driver for driver in drivers if driver.library]
-
-
-def _place() -> Path:
-    """Return the folder of the system's ``.icd`` files, or the one driver that a variable names."""
-    return Path(os.environ.get("OCL_ICD_VENDORS") or os.environ.get("OPENCL_VENDOR_PATH") or _SYSTEM)
-
-
-def _library(file: Path) -> str:
-    """Return the library that an ``.icd`` file names, by its path where it lies beside the file."""
-    try:
-        name = file.read_text(encoding="utf-8", errors="replace").strip().splitlines()[0].strip()
-    except (OSError, IndexError):
-        return ""
-    near = file.parent / name
-    return str(near) if not os.path.isabs(name) and near.is_file() else name
-
-
-def _intel(present: list[Driver]) -> Driver | None:
-    """Return Intel's runtime where its wheel is installed and no ``.icd`` file names it."""
-    if not sys.platform.startswith("linux") or _place().is_file():
-        # A variable that names one driver is obeyed.
-        return None
-    if any(re.search(r"libintelocl\.so", driver.library) for driver in present):
-        return None
-    try:
-        files = importlib.metadata.files(_INTEL[0]) or []
-    except importlib.metadata.PackageNotFoundError:
-        return None
-    library = next((Path(str(file.locate())).resolve() for file in files if file.name == _INTEL[1]), None)
-    return Driver(library, str(library)) if library is not None and library.is_file() else None
 
 
 def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> dict[str, str]:
@@ -272,17 +232,29 @@ def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> d
     """
     variables = {}
     with contextlib.suppress(OSError):
-        variables["POCL_CACHE_DIR"] = str(pocl_kernels.pocl_kernels().folder if kernels else scratch_folder() / "try")
+        variables["POCL_CACHE_DIR"] = str(_pocl_folder(kernels=kernels))
     if drivers is None:
         return variables
     names = "-".join(f"{i}{driver.file.stem}" for i, driver in enumerate(drivers)) or "none"
-    folder = scratch_folder() / "vendors" / re.sub(r"\W", "_", names)[:100]
+    folder = scratch_folder(executable=False) / "vendors" / re.sub(r"\W", "_", names)[:100]
     folder.mkdir(parents=True, exist_ok=True)
     for i, driver in enumerate(drivers):
         # The loader takes files in the order of the folder. The number keeps files of one name apart.
         (folder / f"{i}-{driver.file.stem}.icd").write_text(driver.library + "\n", encoding="utf-8")
     # With this home the loader finds nothing beside pyopencl; those drivers are in the folder too.
     return variables | {"OCL_ICD_VENDORS": str(folder), "PYOPENCL_HOME": str(folder)}
+
+
+def _pocl_folder(*, kernels: bool) -> Path:
+    """Return the folder for PoCL; where no code may run it takes part in no run, and keeps PoCL out of other folders.
+
+    Raises:
+        OSError: no folder takes files.
+    """
+    if kernels:
+        with contextlib.suppress(OSError):
+            return pocl_kernels.pocl_kernels().folder
+    return scratch_folder(executable=False) / "try"
 
 
 @contextlib.contextmanager

@@ -15,6 +15,8 @@ from gpusense.backends.opencl.backend import OpenCLBackend
 from gpusense.backends.proof import remedy_for
 from gpusense.backends.registry import Absent, Library
 
+# Variables that hide drivers and devices.
+HIDING = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH", "OCL_ICD_FILENAMES", "POCL_DEVICES")
 # Words in the names of devices that check or emulate.
 SIMULATORS = ("oclgrind", "simulator", "emulat", "fpga")
 
@@ -32,15 +34,21 @@ class OpenCLLibrary(Library):
 
     def absent(self) -> list[Absent]:
         """See Library.absent."""
-        return [
-            Absent(name, "cpu", f"it {failure}; {remedy_for(failure)}") for name, failure in devices.absent_drivers()
-        ]
+        failed = devices.absent_drivers()
+        absent = [Absent(name, "cpu", f"it {failure}; {remedy_for(failure)}") for name, failure in failed]
+        if (chosen := os.environ.get("POCL_DEVICES")) and devices.hides_pocl():
+            reason = f"PoCL offers no device with POCL_DEVICES={chosen}: unset this variable"
+            absent.append(Absent("PoCL (no device)", "cpu", reason))
+        return absent
 
-    def no_device(self) -> str:
-        """See Library.no_device; the variable that hides drivers is named where it is set."""
-        folder = os.environ.get("OCL_ICD_VENDORS")
-        hidden = f" (drivers are looked for in OCL_ICD_VENDORS={folder} alone)" if folder else ""
-        return f"{super().no_device()}{hidden}"
+    def no_device(self, install: str) -> str:
+        """See Library.no_device; variables that hide drivers are named where they are set."""
+        hiding = [f"{name}={os.environ[name]}" for name in HIDING if os.environ.get(name)]
+        if not hiding:
+            return super().no_device(install)
+        which = "this variable" if len(hiding) == 1 else "these variables"
+        remedy = f"unset {which}, or {install}" if install else f"unset {which}"
+        return f"no driver offers a device with {', '.join(hiding)}: {remedy}"
 
     def is_simulator(self, info: BackendInfo) -> bool:
         """See Library.is_simulator."""

@@ -27,6 +27,8 @@ from gpusense.backends.processor import instruction_sets
 
 if TYPE_CHECKING:
     import pyopencl as cl
+# The platform's name.
+NAME = "Portable Computing Language"
 
 
 class Library(NamedTuple):
@@ -74,7 +76,7 @@ _FITTING = (5, 0)
 
 def is_pocl(device: cl.Device) -> bool:
     """Return whether PoCL is a device's driver."""
-    return "Portable Computing Language" in device.platform.name
+    return NAME in device.platform.name
 
 
 def chosen_library(flags: Set[str]) -> Library:

@@ -16,7 +16,9 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
+from gpusense._util.private import UnsafeFolderError, check_private
+from gpusense.backends.cache import load_entry, store_entry
+from gpusense.backends.packing import pack, unpack, write_files
 from gpusense.backends.scratch import scratch_folder
 
 # Files that PoCL reads again: programs, and kernels for one size of groups.
@@ -105,6 +107,24 @@ class PoclKernels:
             for path in (self.folder / folder).rglob("*"):
                 if path.suffix in _ENDINGS and not path.name.startswith("temp"):
                     yield path.relative_to(self.folder).as_posix()
+
+
+def trouble_of_own_folder() -> str:
+    """Return why the folder is not safe that PoCL chooses by itself; empty where it is, or is absent."""
+    if chosen := os.environ.get("POCL_CACHE_DIR"):
+        folder = chosen
+    elif base := os.environ.get("XDG_CACHE_HOME"):
+        folder = f"{base}/pocl/kcache"
+    else:
+        folder = f"{os.environ['HOME']}/.cache/pocl/kcache" if os.environ.get("HOME") else "/tmp/pocl/kcache"
+    try:
+        check_private(Path(os.path.realpath(folder)))
+    except UnsafeFolderError as error:
+        return f"PoCL was used before gpusense and loads kernels from {folder}: {error}; set POCL_CACHE_DIR to another"
+    except OSError:
+        # Nothing can be loaded from there.
+        return ""
+    return ""
 
 
 @functools.cache

@@ -15,7 +15,9 @@ from typing import Any
 import warp as wp
 
 from gpusense._version import __version__
-from gpusense.backends.cache import load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends import notices
+from gpusense.backends.cache import load_entry, store_entry
+from gpusense.backends.packing import pack, unpack, write_files
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
@@ -36,20 +38,29 @@ def initialize() -> None:
             wp.init()
         except OSError as error:
             folder = _folder()
-            _LOG.warning("gpusense: Warp keeps its kernels in %s, as its own folder cannot be made: %s", folder, error)
+            notices.warn(f"Warp keeps its kernels in {folder}, as its own folder cannot be made: {error}")
             wp.config.kernel_cache_dir = str(folder)
             wp.init()
 
 
 def _folder() -> Path:
-    """Return this process's folder for Warp's kernels.
+    """Return this process's folder for Warp's kernels, which Warp reads and does not map as code.
 
     Raises:
         OSError: no folder takes files.
     """
-    folder = scratch_folder() / "warp"
+    folder = scratch_folder(executable=False) / "warp"
     folder.mkdir(exist_ok=True)
     return folder
+
+
+def trouble() -> str:
+    """Return why no kernel can be compiled; empty where one can."""
+    try:
+        _folder()
+    except OSError as error:
+        return str(error)
+    return ""
 
 
 @contextlib.contextmanager

@@ -1,0 +1,153 @@
+"""Folders in which other users cannot replace files, and bounded reads of regular files.
+
+Code that is loaded from a folder is as trustworthy as whoever can write there. That is the owner of the folder, those
+whom its mode lets write, and those who can rename one of the folders above it. Systems without owners, such as Windows,
+keep the folders of users apart by other rules; there only the kind of a folder is checked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+
+# Permission of the group and of others to write.
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_HAS_OWNERS = hasattr(os, "geteuid")
+
+
+class UnsafeFolderError(PermissionError):
+    """A folder that another user could change; the text names the folder and the rule."""
+
+
+def make_folders(folder: Path) -> None:
+    """Make a folder and those above it, each for this user alone where it is absent.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    for path in reversed([folder, *folder.parents]):
+        if not os.path.lexists(path):
+            try:
+                path.mkdir(mode=0o700)
+            except FileExistsError:
+                # Another process has made it.
+                continue
+
+
+def check_private(folder: Path) -> None:
+    """Check that only this user can change the files of a folder, or put another folder in its place.
+
+    Args:
+        folder: An absolute path without symbolic links above it, as of ``os.path.realpath``.
+
+    Raises:
+        UnsafeFolderError: it is no real directory, is not this user's, lets others write, or a folder above it lets
+            others rename what is in there.
+        OSError: it is absent.
+    """
+    status = os.lstat(folder)
+    if not stat.S_ISDIR(status.st_mode):
+        kind = "a symbolic link" if stat.S_ISLNK(status.st_mode) else "another kind of file"
+        raise UnsafeFolderError(f"{folder} must be a real directory, got {kind}")
+    if not _HAS_OWNERS:
+        return
+    if status.st_uid != os.geteuid():
+        raise UnsafeFolderError(f"{folder} must be owned by this user ({os.geteuid()}), got owner {status.st_uid}")
+    if status.st_mode & _OTHERS_WRITE:
+        mode = stat.S_IMODE(status.st_mode)
+        raise UnsafeFolderError(f"{folder} must be writable by its owner only (mode 0700), got mode {mode:04o}")
+    for parent in folder.parents:
+        _check_parent(parent)
+
+
+def _check_parent(folder: Path) -> None:
+    """Check that only this user and root can rename what other users do not own in a folder.
+
+    Raises:
+        UnsafeFolderError: others can.
+    """
+    status = os.stat(folder)
+    if not _is_trusted(status.st_uid):
+        owner = f"this user ({os.geteuid()}) or root, got owner {status.st_uid}"
+        raise UnsafeFolderError(f"{folder}, in which it lies, must be owned by {owner}")
+    if not status.st_mode & _OTHERS_WRITE or status.st_mode & stat.S_ISVTX:
+        return
+    if status.st_mode & stat.S_IWOTH or not _is_group_of_one(status.st_gid):
+        mode = stat.S_IMODE(status.st_mode)
+        raise UnsafeFolderError(
+            f"{folder}, in which it lies, must not be writable by others unless it is sticky, got mode {mode:04o}"
+        )
+
+
+def _is_trusted(owner: int) -> bool:
+    """Return whether a user may do as this one: it is this user, or root.
+
+    Within a user namespace the owners outside of it, root among them, appear as one user that has no processes.
+    """
+    if owner in (0, os.geteuid()):
+        return True
+    try:
+        with open("/proc/sys/kernel/overflowuid", encoding="ascii") as file:
+            outside = int(file.read())
+        with open("/proc/self/uid_map", encoding="ascii") as file:
+            ranges = [tuple(map(int, line.split())) for line in file]
+    except (OSError, ValueError):
+        return False
+    return owner == outside and not any(first <= owner < first + count for first, _, count in ranges)
+
+
+def _is_group_of_one(group: int) -> bool:
+    """Return whether a group is root's, or the one of this user's name that many systems make for each user."""
+    if group == 0:
+        return True
+    import grp
+    import pwd
+
+    try:
+        user, found = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
+    except KeyError:
+        return False
+    return found.gr_name == user.pw_name and user.pw_gid == group and set(found.gr_mem) <= {user.pw_name}
+
+
+def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None = None) -> bytes:
+    """Read a regular file of this user; anything else in its place is not opened, or not read.
+
+    Args:
+        path: The file. A symbolic link is not followed, and a FIFO is not waited for.
+        most: The most bytes that it may have.
+        touch: Whether to set its times to now, where that is possible.
+        head: The number of bytes to read, from the beginning; all of them by default.
+
+    Raises:
+        OSError: it is absent, is no regular file of this user, or is larger.
+    """
+    # Opening some devices has effects, so the kind is looked at before; and after, as only that is the file's own.
+    _check_regular(os.lstat(path), path, most)
+    flags = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+    with os.fdopen(os.open(path, os.O_RDONLY | flags), "rb") as file:
+        _check_regular(os.fstat(file.fileno()), path, most)
+        if touch and os.utime in os.supports_fd:
+            # A file system that is read-only keeps the times.
+            with contextlib.suppress(OSError):
+                os.utime(file.fileno())
+        data = file.read(most + 1 if head is None else head)
+    if len(data) > most:
+        raise OSError(f"{path} must have at most {most} bytes, got more")
+    return data
+
+
+def _check_regular(status: os.stat_result, path: Path, most: int) -> None:
+    """Check the kind, the owner and the size of a file.
+
+    Raises:
+        OSError: it is no regular file of this user, or is larger than ``most`` bytes.
+    """
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(f"{path} must be a regular file, got another kind")
+    if _HAS_OWNERS and status.st_uid != os.geteuid():
+        raise OSError(f"{path} must be owned by this user ({os.geteuid()}), got owner {status.st_uid}")
+    if status.st_size > most:
+        raise OSError(f"{path} must have at most {most} bytes, got {status.st_size}")

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gpusense._util import checks
-from gpusense._util.files import read_mapping
+from gpusense._util.documents import read_mapping
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.tasks import TASKS, check_options
 

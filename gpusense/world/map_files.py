@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense._util.files import read_mapping
+from gpusense._util.documents import read_mapping
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import open_raster
 from gpusense.world.wean_map import read_probabilities

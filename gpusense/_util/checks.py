@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import numbers
 import os
 import reprlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -197,6 +198,37 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
             f"{name}: must not require gradients, which are not computed here, got a "
             f"{type(array).__module__}.{type(array).__name__} that does: pass {name}.detach()"
         ) from error
+
+
+def nested(name: str, value: object, *, deepest: int, most: int) -> int:
+    """Count the values in mappings, lists and tuples within each other, each time that they occur.
+
+    The keys of mappings count, too. A text counts once more for every 64 characters.
+
+    Args:
+        name: Name of the argument.
+        value: The caller's value.
+        deepest: Most levels.
+        most: Most values.
+
+    Raises:
+        ValueError: There are more levels, as in a list that contains itself, or more values.
+    """
+    count = 0
+    inner: list[Iterator[Any]] = [iter([value])]
+    while inner:
+        for one in inner[-1]:
+            count += 1 + (len(one) >> 6 if isinstance(one, str) else 0)
+            if count > most:
+                raise ValueError(f"{name}: must hold at most {most} values, got more")
+            if isinstance(one, (Mapping, list, tuple)):
+                if len(inner) > deepest:
+                    raise ValueError(f"{name}: must be nested at most {deepest} deep, got more")
+                inner.append(itertools.chain.from_iterable(one.items()) if isinstance(one, Mapping) else iter(one))
+                break
+        else:
+            inner.pop()
+    return count
 
 
 def path(name: str, value: object) -> Path:

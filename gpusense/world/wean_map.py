@@ -14,7 +14,7 @@ import numpy as np
 from gpusense._util.lines import numbered_lines
 from gpusense.world.grid import OccupancyGrid
 
-_RESOLUTION, _MOST_CELLS = 0.1, 1 << 28
+_RESOLUTION, _MOST_CELLS, _LONGEST_FIELD = 0.1, 1 << 28, 64
 _SPECIFICATION, _SIZE = b"robot_specifications->", b"global_map[0]:"
 
 
@@ -26,9 +26,10 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
     """
     resolution, columns = _RESOLUTION, []
     for number, line in numbered_lines(file):
-        fields, where = line.split(), f"{file}:{number}"
-        if not fields or fields[0].startswith(_SIZE):
+        where = f"{file}:{number}"
+        if not line.strip() or line.lstrip().startswith(_SIZE):
             continue
+        fields = _fields(where, line)
         if fields[0].startswith(_SPECIFICATION):
             if fields[0] == _SPECIFICATION + b"resolution":
                 resolution = _resolution(where, fields)
@@ -41,6 +42,20 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
     if not columns:
         raise ValueError(f"{file}: must have a line of numbers for each x, got none")
     return OccupancyGrid(np.stack(columns, axis=1), resolution, occupied_threshold=occupied_threshold)
+
+
+def _fields(where: str, line: bytes) -> list[bytes]:
+    """Return the fields of a line, which are short: as an array, all are as long as the longest.
+
+    Raises:
+        ValueError: A field is longer than any number.
+    """
+    fields = line.split()
+    longest = max(fields, key=len)
+    if len(longest) > _LONGEST_FIELD:
+        text = longest[:40].decode(errors="replace")
+        raise ValueError(f"{where}: must have fields of at most {_LONGEST_FIELD} bytes, got {text!r}...")
+    return fields
 
 
 def _cells(where: str, fields: list[bytes]) -> np.ndarray:

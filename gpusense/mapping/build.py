@@ -47,7 +47,7 @@ def build_map(
     A large map is built in bands of rows, so that it takes little more memory than its result, a byte a cell.
 
     Args:
-        scans: (S, K) readings [m]; missing readings say nothing. A ray may span 1 048 576 cells along an axis.
+        scans: (S, K) readings [m]; missing readings say nothing. A ray may span 524 288 cells along an axis.
         poses: (S, 3) poses of the robot in the world [m, m, rad].
         scanner: The scanner's geometry.
         resolution: Side of a cell [m], 1e-4 to 1e3.

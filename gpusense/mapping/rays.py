@@ -15,8 +15,8 @@ from gpusense.world.windows import LONGEST_SIDE, Window
 
 # Scans whose rays are counted in one launch.
 SCANS = 1024
-LONGEST_RAY = 1 << 20
-"""Most cells that a ray may span along an axis of the map; models have the same limit."""
+LONGEST_RAY = 1 << 19
+"""Most cells that a ray may span along an axis of the map: products of lengths in 1/4096 cell fit in 64 bits."""
 
 
 @dataclass(frozen=True)

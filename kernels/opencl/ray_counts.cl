@@ -17,6 +17,13 @@ bool has_left(const int cell, const int step, const int cells) {
     return step > 0 ? cell >= cells : cell < 0;
 }
 
+// Return how many boundaries of an axis a ray crosses before it has come as far as another boundary on the other axis.
+// Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
+long crossed_before(const int first, const long size, const long reached, const long other, const int ties) {
+    const long room = reached * size - first * other - (1 - ties);
+    return room < 0 ? 0 : room / (UNIT * other) + 1;
+}
+
 // Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
 kernel void count_rays(global const int2 *start_cell, global const int2 *start_inside, global const int2 *end_cell,
                        global const int2 *end_inside, global const int *hit, global int *hits, global int *misses,
@@ -30,8 +37,20 @@ kernel void count_rays(global const int2 *start_cell, global const int2 *start_i
     const int step_x = span_x >= 0 ? 1 : -1, step_y = span_y >= 0 ? 1 : -1;
     const long size_x = step_x * span_x, size_y = step_y * span_y;
     int left_x = step_x * across.x, left_y = step_y * across.y;
+    const int first_x = to_boundary(begin.x, step_x), first_y = to_boundary(begin.y, step_y);
+    // The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    const int need_x = max(step_x > 0 ? -col : col - (cols - 1), 0), need_y = max(step_y > 0 ? -row : row - (rows - 1), 0);
+    if (need_x > left_x || need_y > left_y) return;
+    long done_x = need_x, done_y = 0;
+    if (need_x > 0) done_y = min(crossed_before(first_y, size_y, first_x + (done_x - 1) * UNIT, size_x, 0), (long)left_y);
+    if (done_y < need_y) {
+        done_y = need_y;
+        done_x = min(crossed_before(first_x, size_x, first_y + (done_y - 1) * UNIT, size_y, 1), (long)left_x);
+    }
+    col += step_x * (int)done_x, row += step_y * (int)done_y;
+    left_x -= (int)done_x, left_y -= (int)done_y;
     // Negative where the next boundary is one in x.
-    long lead = to_boundary(begin.x, step_x) * size_y - to_boundary(begin.y, step_y) * size_x;
+    long lead = (first_x + done_x * UNIT) * size_y - (first_y + done_y * UNIT) * size_x;
     while (!has_left(col, step_x, cols) && !has_left(row, step_y, rows)) {
         const bool at_end = left_x + left_y == 0;
         if (col >= 0 && col < cols && row >= 0 && row < rows)

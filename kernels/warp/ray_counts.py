@@ -26,6 +26,17 @@ def has_left(cell: wp.int32, step: wp.int32, cells: wp.int32):
     return wp.where(step > 0, cell >= cells, cell < 0)
 
 
+# Return how many boundaries of an axis a ray crosses before it has come as far as another boundary on the other axis.
+# Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
+@wp.func
+def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp.int64, ties: wp.int32):
+    room = reached * size - wp.int64(first) * other - wp.int64(1 - ties)
+    crossed = wp.int64(0)
+    if room >= wp.int64(0):
+        crossed = room / (wp.int64(UNIT) * other) + wp.int64(1)
+    return crossed
+
+
 # Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
 @kernel
 def count_rays(
@@ -56,8 +67,29 @@ def count_rays(
     size_y = wp.int64(step_y) * span_y
     left_x = step_x * across.x
     left_y = step_y * across.y
+    first_x = to_boundary(begin.x, step_x)
+    first_y = to_boundary(begin.y, step_y)
+    # The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    need_x = wp.max(wp.where(step_x > 0, -col, col - (cols - 1)), 0)
+    need_y = wp.max(wp.where(step_y > 0, -row, row - (rows - 1)), 0)
+    if need_x > left_x or need_y > left_y:
+        return
+    done_x = wp.int64(need_x)
+    done_y = wp.int64(0)
+    if need_x > 0:
+        reached = wp.int64(first_x) + (done_x - wp.int64(1)) * wp.int64(UNIT)
+        done_y = wp.min(crossed_before(first_y, size_y, reached, size_x, 0), wp.int64(left_y))
+    if done_y < wp.int64(need_y):
+        done_y = wp.int64(need_y)
+        reached = wp.int64(first_y) + (done_y - wp.int64(1)) * wp.int64(UNIT)
+        done_x = wp.min(crossed_before(first_x, size_x, reached, size_y, 1), wp.int64(left_x))
+    col += step_x * wp.int32(done_x)
+    row += step_y * wp.int32(done_y)
+    left_x -= wp.int32(done_x)
+    left_y -= wp.int32(done_y)
     # Negative where the next boundary is one in x.
-    lead = wp.int64(to_boundary(begin.x, step_x)) * size_y - wp.int64(to_boundary(begin.y, step_y)) * size_x
+    lead = (wp.int64(first_x) + done_x * wp.int64(UNIT)) * size_y
+    lead -= (wp.int64(first_y) + done_y * wp.int64(UNIT)) * size_x
     while left_x + left_y > 0 and not has_left(col, step_x, cols) and not has_left(row, step_y, rows):
         if col >= 0 and col < cols and row >= 0 and row < rows:
             wp.atomic_add(misses, row * cols + col, 1)

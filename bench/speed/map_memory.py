@@ -95,8 +95,9 @@ print(json.dumps([seconds, spent, peak / grid.cells.size, hashlib.sha256(grid.ce
 
 def figures(tree: Path, task: list[Any]) -> list[Any]:
     """Return seconds, seconds of the processors, bytes a cell and the checksum of one run."""
-    environment = os.environ | {"PYTHONPATH": str(tree)}
-    command = [sys.executable, "-W", "ignore", "-c", _CHILD, json.dumps(task)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(tree), os.environ.get("PYTHONPATH"))))}
+    # Modules of the working directory are not imported.
+    command = [sys.executable, "-P", "-W", "ignore", "-c", _CHILD, json.dumps(task)]
     done = subprocess.run(command, env=environment, cwd=task[-1], capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{tree}: {done.stderr[-2000:]}")

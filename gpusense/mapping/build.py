@@ -11,14 +11,16 @@ from gpusense._util import checks
 from gpusense._util.memory import check_room
 from gpusense.backends import Selection, get_backend
 from gpusense.mapping.counts import BandCounts, bands
-from gpusense.mapping.rays import SCANS, Survey, batches, check_lengths, extent
+from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths, extent
 from gpusense.world.grid import OccupancyGrid, check_origin, check_resolution, grid_of_checked
 from gpusense.world.scanner import Scanner
 from gpusense.world.sweep import check_motion
-from gpusense.world.windows import LONGEST_SIDE
+from gpusense.world.windows import LONGEST_SIDE, Window
 
 BAND_CELLS = 1 << 22
 """Most cells of a band of rows, whose counts are on the device at once."""
+# Scans of at most so many readings keep their rays from the look for the map's extent.
+_KEPT_RAYS = 1 << 20
 
 
 def build_map(
@@ -142,10 +144,13 @@ class MapBuilder:
         # Without a frame, boxes are in metres until all are known.
         frame = OccupancyGrid([[0]], 1.0 if placed is None else resolution, (0, 0, 0) if placed is None else placed[0])
         boxes = np.empty((len(self._survey.poses), 4))
+        self._kept: dict[bytes, RayEnds] = {}
         for part in batches(np.arange(len(boxes)), self._each):
             ends = self._survey.rays(part)
             check_lengths(ends, resolution, int(part[0]))
             boxes[part] = ends.boxes(len(part), frame)
+            if len(boxes) * self._survey.scanner.count <= _KEPT_RAYS:
+                self._kept[part.tobytes()] = ends
         if placed is None:
             placed = extent(boxes, resolution)
             boxes = (boxes - np.tile(placed[0][:2], 2)) / resolution
@@ -154,21 +159,23 @@ class MapBuilder:
 
     def steps(self) -> Iterator[float]:
         """Count rays, some scans at a time, and yield the share of the work that is done."""
-        chosen = [
-            np.flatnonzero((self._rows[:, 1] >= band.row - 1) & (self._rows[:, 0] <= band.row + band.rows + 1))
-            for band in self._bands
-        ]
-        total, done = max(sum(map(len, chosen)), 1), 0
-        for band, scans in zip(self._bands, chosen, strict=True):
+        chosen = [batches(self._scans_of(band), self._each) for band in self._bands]
+        total, done = max(sum(len(part) for parts in chosen for part in parts), 1), 0
+        for band, parts in zip(self._bands, chosen, strict=True):
             self._counts = BandCounts(self._backend, self._frame, self._shape, band)
-            for part in batches(scans, self._each):
-                self._counts.add(self._survey.rays(part))
+            for part in parts:
+                self._counts.add(self._kept.pop(part.tobytes(), None) or self._survey.rays(part))
                 done += len(part)
                 if done < total:
                     yield done / total
             self._write(self._counts, self._cells)
             self._rays, self._counts, self._finished = self._rays + self._counts.rays, None, self._finished + 1
         yield 1.0
+
+    def _scans_of(self, band: Window) -> np.ndarray:
+        """Return the indices of the scans with rays that meet a band."""
+        low, high = self._rows.T
+        return np.flatnonzero((high >= band.row - 1) & (low <= band.row + band.rows + 1))
 
     def _write(self, counts: BandCounts, cells: np.ndarray) -> None:
         """Write the occupancies of a band."""
@@ -178,6 +185,11 @@ class MapBuilder:
     def rays(self) -> int:
         """Rays that have been counted; those beside the map are not."""
         return self._rays + (0 if self._counts is None else self._counts.rays)
+
+    @property
+    def parts(self) -> int:
+        """Number of launches, each of some scans and a band."""
+        return sum(-(-len(self._scans_of(band)) // self._each) for band in self._bands)
 
     @property
     def bands(self) -> int:

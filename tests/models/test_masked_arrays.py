@@ -10,6 +10,7 @@ from support.model_world import BEARINGS, RANGE, cloud, make, room, same_bits, s
 
 import gpusense as gs
 from gpusense._util import masks
+from gpusense.learning.discrete.counts import count_pairs
 
 GRID = room()
 POSES = cloud(GRID, 12)
@@ -60,8 +61,9 @@ def learned(readings):
     return np.array(list(fit.parameters.to_dict().values()))
 
 
-def table(readings):
-    return gs.DiscreteBeamModel.learn(readings, np.full(len(readings), 2.5), RANGE, bins=5).probabilities
+def counted(readings):
+    counts = count_pairs(readings, np.full(len(readings), 2.5), RANGE, 5)
+    return np.array([counts.missing, *counts.counts])
 
 
 TWICE = np.stack([RANGES, RANGES[::-1]])
@@ -89,7 +91,7 @@ READINGS = {
         lambda z: gs.pose_likelihood(make("field", GRID, "numpy"), z, resolution=1.0, headings=4).log_p, RANGES, MASK
     ),
     "learning": (learned, RANGES, MASK),
-    "learning a table": (table, RANGES, MASK),
+    "learning a table": (counted, RANGES, MASK),
     "a log's scan": (lambda z: gs.Scan(0.0, z, SCANNER, (0, 0, 0), None).ranges, RANGES, MASK),
     "position": (
         lambda z: gs.PositionModel(gs.PositionParameters(sigma=0.3), backend="numpy").log_likelihood(POSES, z),
